@@ -1,0 +1,1 @@
+"""Learn 6-DoF pose detectors from unlabelled images by analysis-by-synthesis with curiosity."""

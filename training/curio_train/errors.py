@@ -1,0 +1,64 @@
+"""Everything that training raises on purpose.
+
+    CurioError
+    ├── UsageError            the call is wrong: exit status 2
+    │   └── ResumeMismatch    a run continued with another configuration
+    └── WorkError             the work failed: exit status 1
+        ├── DataError         a data folder, an image, an annotation
+        ├── MeshError         a mesh file
+        ├── CameraError       intrinsics
+        ├── RendererError     Mitsuba, Dr.Jit, libLLVM, OptiX
+        ├── CheckpointError   a run folder or what is in it
+        ├── TrainingError     the optimisation itself
+        └── ExportError       ONNX, parity, the model folder
+
+A text says what was found, what was expected, where (file, field, flag) and what to do.
+"""
+
+
+class CurioError(Exception):
+    """Base of all errors of this package."""
+
+    exit_status = 1
+
+
+class UsageError(CurioError):
+    """The command or call cannot be carried out as written."""
+
+    exit_status = 2
+
+
+class ResumeMismatch(UsageError):
+    """A run is continued with a configuration that differs from the one it was started with."""
+
+
+class WorkError(CurioError):
+    """The call was right, the work failed."""
+
+
+class DataError(WorkError):
+    """A data folder, image or annotation is missing or malformed."""
+
+
+class MeshError(WorkError):
+    """A mesh file is missing, empty, malformed or of an impossible size."""
+
+
+class CameraError(WorkError):
+    """Camera intrinsics are missing, singular or do not fit the image."""
+
+
+class RendererError(WorkError):
+    """The renderer cannot start or was given what it cannot render."""
+
+
+class CheckpointError(WorkError):
+    """A run folder or checkpoint cannot be read or written."""
+
+
+class TrainingError(WorkError):
+    """The optimisation broke down."""
+
+
+class ExportError(WorkError):
+    """The model could not be exported as promised."""

@@ -1,0 +1,130 @@
+"""The scene code: named physical quantities, one description for heads, renderer, metrics, export and tables.
+
+A scene code is a mapping from field name to tensor: ``[batch, num_slots, size]`` for per-object fields and
+``[batch, size]`` for per-scene ones. Nobody slices a vector by number; everybody asks the layout.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+Activation = Literal["linear", "tanh", "sigmoid", "perspective"]
+SceneCode = Mapping[str, Tensor]
+
+TRANSLATION = "translation_m"
+ROTATION_6D = "rotation_6d"
+YAW = "yaw_ij"
+COLOR = "color"
+CONFIDENCE = "confidence"
+LIGHT = "light"
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field of the scene code.
+
+    Attributes:
+        name: Also the output's name in the exported graph, where it is exported as it is.
+        size: Values an object, or a scene.
+        per_object: False for what a scene has once, such as light.
+        unit: "m", "image_width", "1".
+        frame: "camera", "world", "image", or "" where none applies.
+        activation: From the head's raw output to the physical value, see :meth:`activate`.
+        lower: Smallest value of each component, or empty where unbounded.
+        upper: Largest value of each component, or empty where unbounded.
+    """
+
+    name: str
+    size: int
+    per_object: bool = True
+    unit: str = "1"
+    frame: str = ""
+    activation: Activation = "linear"
+    lower: tuple[float, ...] = ()
+    upper: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse a range that does not fit the size."""
+        if len(self.lower) != len(self.upper) or (self.lower and len(self.lower) != self.size):
+            raise ValueError(f"field {self.name}: {len(self.lower)} lower and {len(self.upper)} upper bounds for size {self.size}")
+        if not self.lower and self.activation != "linear":
+            raise ValueError(f"field {self.name}: activation {self.activation} needs a range")
+
+    @property
+    def span(self) -> tuple[float, ...]:
+        """Width of the range of each component; 1 where unbounded. Metrics divide by it (Eq. 1 with w = 1)."""
+        return tuple(u - low for low, u in zip(self.lower, self.upper, strict=True)) or (1.0,) * self.size
+
+    def activate(self, raw: Tensor) -> Tensor:
+        """Raw head output ``[..., size]`` to physical values of the same shape.
+
+        * ``linear``: 0 is the middle of the range and ±1 its ends, without a bound (the paper's heads);
+        * ``tanh``, ``sigmoid``: bounded by the range;
+        * ``perspective``: position as (x/z, y/z, z) with z in the logarithm, bounded softly by tanh, returned as
+          (x, y, z). Its range is given in (x/z, y/z, z).
+        """
+        if not self.lower:
+            return raw
+        lower, upper = raw.new_tensor(self.lower), raw.new_tensor(self.upper)
+        if self.activation == "linear":
+            return (lower + upper) / 2 + raw * (upper - lower) / 2
+        if self.activation == "tanh":
+            return (lower + upper) / 2 + torch.tanh(raw) * (upper - lower) / 2
+        if self.activation == "sigmoid":
+            return lower + torch.sigmoid(raw) * (upper - lower)
+        slope = (lower + upper)[:2] / 2 + torch.tanh(raw[..., :2]) * (upper - lower)[:2] / 2
+        log_near, log_far = lower[2].log(), upper[2].log()
+        depth = ((log_near + log_far) / 2 + torch.tanh(raw[..., 2:]) * (log_far - log_near) / 2).exp()
+        return torch.cat([slope * depth, depth], dim=-1)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The fields of a world's scene code and the number of its object slots."""
+
+    fields: tuple[Field, ...]
+    num_slots: int = 1
+
+    def __getitem__(self, name: str) -> Field:
+        """The field of that name.
+
+        Raises:
+            KeyError: There is none.
+        """
+        for field in self.fields:
+            if field.name == name:
+                return field
+        raise KeyError(f"no field {name!r} in the scene code; it has {[f.name for f in self.fields]}")
+
+    def __contains__(self, name: str) -> bool:
+        return any(field.name == name for field in self.fields)
+
+    def shape(self, field: Field, batch: int) -> tuple[int, ...]:
+        """Shape of that field's tensor for ``batch`` images."""
+        return (batch, self.num_slots, field.size) if field.per_object else (batch, field.size)
+
+    def check(self, code: SceneCode) -> None:
+        """Refuse a code whose names or shapes differ from this layout.
+
+        Raises:
+            ValueError: Says which.
+        """
+        if set(code) != {field.name for field in self.fields}:
+            raise ValueError(f"scene code has {sorted(code)}, the layout {sorted(f.name for f in self.fields)}")
+        for field in self.fields:
+            found = tuple(code[field.name].shape)
+            if found != self.shape(field, found[0]):
+                raise ValueError(f"{field.name} has shape {found}, expected {self.shape(field, found[0])}")
+
+
+def detach(code: SceneCode) -> dict[str, Tensor]:
+    """The same values, cut from the graph."""
+    return {name: value.detach() for name, value in code.items()}
+
+
+def index(code: SceneCode, rows: Tensor | slice) -> dict[str, Tensor]:
+    """The code of some images of the batch."""
+    return {name: value[rows] for name, value in code.items()}

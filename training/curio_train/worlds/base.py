@@ -1,0 +1,96 @@
+"""What every world is: a scene code, a distribution of scenes, and a differentiable renderer.
+
+A new world is one file: a subclass of :class:`World` and a line in ``worlds/__init__.py``.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from torch import Tensor
+
+from curio_train.scene_code import Layout, SceneCode
+
+Split = Literal["train", "validation", "test"]
+
+
+@dataclass(frozen=True)
+class ObjectKind:
+    """What the exported model must know of a kind of object.
+
+    Attributes:
+        name: For people and clients.
+        slots: Which rows of the per-object fields belong to this kind.
+        diameter_m: Largest distance of two points of the object (image widths in 2D worlds).
+        box_corners_m: [8, 3], object frame.
+        mesh_sha256: Of the mesh file, or empty.
+        symmetries: Discrete ones, each [4, 4], the identity left out.
+        symmetry_axes: Continuous ones, each (unit axis [3], point on it in metres [3]).
+    """
+
+    name: str
+    slots: tuple[int, ...]
+    diameter_m: float
+    box_corners_m: np.ndarray
+    mesh_sha256: str = ""
+    symmetries: Sequence[np.ndarray] = ()
+    symmetry_axes: Sequence[tuple[np.ndarray, np.ndarray]] = ()
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Images for one step.
+
+    Attributes:
+        images: [batch, 3, height, width], float sRGB in [0, 1].
+        backgrounds: What the re-rendering is composited over, same shape; None: the world's own background.
+        code: The true scene code, for supervision and scoring alone; None where nobody may know it.
+    """
+
+    images: Tensor
+    backgrounds: Tensor | None = None
+    code: SceneCode | None = None
+
+
+class ImageSource(ABC):
+    """Unlabelled (or, when asked for, labelled) training images.
+
+    Batches are a pure function of the step, so a resumed run sees what an uninterrupted one would have seen.
+    """
+
+    @abstractmethod
+    def batch(self, step: int, size: int) -> Batch:
+        """The images of one step."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The canonical pinhole camera: K* [3, 3] in pixels (pixel centres at integers), None in 2D worlds."""
+
+    width: int
+    height: int
+    matrix: np.ndarray | None = field(default=None)
+
+
+class World(ABC):
+    """A family of scenes that can be described, drawn at random, and rendered."""
+
+    name: str
+    layout: Layout
+    camera: Camera
+    objects: tuple[ObjectKind, ...]
+
+    @abstractmethod
+    def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:
+        """Draw ``count`` scene codes from the world's own distribution; the same seed gives the same codes."""
+
+    @abstractmethod
+    def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
+        """Images [batch, 3, height, width] in sRGB of a batch of codes, differentiable in every field."""
+
+    @abstractmethod
+    def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> ImageSource:
+        """Images of a split. Without ``with_code`` no label file is opened and ``Batch.code`` is None."""
