@@ -1,0 +1,191 @@
+from curio_proto.v1 import model_spec_pb2 as _model_spec_pb2
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class PixelFormat(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    PIXEL_FORMAT_UNSPECIFIED: _ClassVar[PixelFormat]
+    PIXEL_FORMAT_RGB8: _ClassVar[PixelFormat]
+    PIXEL_FORMAT_BGR8: _ClassVar[PixelFormat]
+    PIXEL_FORMAT_GRAY8: _ClassVar[PixelFormat]
+
+class RegionStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    REGION_STATUS_UNSPECIFIED: _ClassVar[RegionStatus]
+    REGION_STATUS_DETECTED: _ClassVar[RegionStatus]
+    REGION_STATUS_NO_OBJECT: _ClassVar[RegionStatus]
+    REGION_STATUS_OUTSIDE_FRAME: _ClassVar[RegionStatus]
+PIXEL_FORMAT_UNSPECIFIED: PixelFormat
+PIXEL_FORMAT_RGB8: PixelFormat
+PIXEL_FORMAT_BGR8: PixelFormat
+PIXEL_FORMAT_GRAY8: PixelFormat
+REGION_STATUS_UNSPECIFIED: RegionStatus
+REGION_STATUS_DETECTED: RegionStatus
+REGION_STATUS_NO_OBJECT: RegionStatus
+REGION_STATUS_OUTSIDE_FRAME: RegionStatus
+
+class ModelSelector(_message.Message):
+    __slots__ = ("name", "version")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    version: int
+    def __init__(self, name: _Optional[str] = ..., version: _Optional[int] = ...) -> None: ...
+
+class RawImage(_message.Message):
+    __slots__ = ("format", "width", "height", "stride", "data")
+    FORMAT_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    STRIDE_FIELD_NUMBER: _ClassVar[int]
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    format: PixelFormat
+    width: int
+    height: int
+    stride: int
+    data: bytes
+    def __init__(self, format: _Optional[_Union[PixelFormat, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., stride: _Optional[int] = ..., data: _Optional[bytes] = ...) -> None: ...
+
+class Camera(_message.Message):
+    __slots__ = ("camera_matrix", "distortion")
+    CAMERA_MATRIX_FIELD_NUMBER: _ClassVar[int]
+    DISTORTION_FIELD_NUMBER: _ClassVar[int]
+    camera_matrix: _containers.RepeatedScalarFieldContainer[float]
+    distortion: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, camera_matrix: _Optional[_Iterable[float]] = ..., distortion: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Region(_message.Message):
+    __slots__ = ("x", "y", "width", "height")
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    x: float
+    y: float
+    width: float
+    height: float
+    def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., width: _Optional[float] = ..., height: _Optional[float] = ...) -> None: ...
+
+class DetectRequest(_message.Message):
+    __slots__ = ("request_id", "models", "encoded", "raw", "camera", "regions", "min_confidence", "max_detections", "apply_exif_rotation")
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
+    MODELS_FIELD_NUMBER: _ClassVar[int]
+    ENCODED_FIELD_NUMBER: _ClassVar[int]
+    RAW_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    REGIONS_FIELD_NUMBER: _ClassVar[int]
+    MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    MAX_DETECTIONS_FIELD_NUMBER: _ClassVar[int]
+    APPLY_EXIF_ROTATION_FIELD_NUMBER: _ClassVar[int]
+    request_id: str
+    models: _containers.RepeatedCompositeFieldContainer[ModelSelector]
+    encoded: bytes
+    raw: RawImage
+    camera: Camera
+    regions: _containers.RepeatedCompositeFieldContainer[Region]
+    min_confidence: float
+    max_detections: int
+    apply_exif_rotation: bool
+    def __init__(self, request_id: _Optional[str] = ..., models: _Optional[_Iterable[_Union[ModelSelector, _Mapping]]] = ..., encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., regions: _Optional[_Iterable[_Union[Region, _Mapping]]] = ..., min_confidence: _Optional[float] = ..., max_detections: _Optional[int] = ..., apply_exif_rotation: bool = ...) -> None: ...
+
+class Detection(_message.Message):
+    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px")
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    TRANSLATION_M_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_6D_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    QUATERNION_XYZW_FIELD_NUMBER: _ClassVar[int]
+    COLOR_FIELD_NUMBER: _ClassVar[int]
+    BOX_PX_FIELD_NUMBER: _ClassVar[int]
+    object: str
+    confidence: float
+    translation_m: _containers.RepeatedScalarFieldContainer[float]
+    rotation_6d: _containers.RepeatedScalarFieldContainer[float]
+    rotation: _containers.RepeatedScalarFieldContainer[float]
+    quaternion_xyzw: _containers.RepeatedScalarFieldContainer[float]
+    color: _containers.RepeatedScalarFieldContainer[float]
+    box_px: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class RegionResult(_message.Message):
+    __slots__ = ("model", "model_version", "region", "status", "detections", "light")
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    REGION_FIELD_NUMBER: _ClassVar[int]
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    DETECTIONS_FIELD_NUMBER: _ClassVar[int]
+    LIGHT_FIELD_NUMBER: _ClassVar[int]
+    model: str
+    model_version: int
+    region: int
+    status: RegionStatus
+    detections: _containers.RepeatedCompositeFieldContainer[Detection]
+    light: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, model: _Optional[str] = ..., model_version: _Optional[int] = ..., region: _Optional[int] = ..., status: _Optional[_Union[RegionStatus, str]] = ..., detections: _Optional[_Iterable[_Union[Detection, _Mapping]]] = ..., light: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Milliseconds(_message.Message):
+    __slots__ = ("queue", "decode", "inference")
+    QUEUE_FIELD_NUMBER: _ClassVar[int]
+    DECODE_FIELD_NUMBER: _ClassVar[int]
+    INFERENCE_FIELD_NUMBER: _ClassVar[int]
+    queue: float
+    decode: float
+    inference: float
+    def __init__(self, queue: _Optional[float] = ..., decode: _Optional[float] = ..., inference: _Optional[float] = ...) -> None: ...
+
+class DetectResponse(_message.Message):
+    __slots__ = ("request_id", "width", "height", "results", "milliseconds")
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    RESULTS_FIELD_NUMBER: _ClassVar[int]
+    MILLISECONDS_FIELD_NUMBER: _ClassVar[int]
+    request_id: str
+    width: int
+    height: int
+    results: _containers.RepeatedCompositeFieldContainer[RegionResult]
+    milliseconds: Milliseconds
+    def __init__(self, request_id: _Optional[str] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., results: _Optional[_Iterable[_Union[RegionResult, _Mapping]]] = ..., milliseconds: _Optional[_Union[Milliseconds, _Mapping]] = ...) -> None: ...
+
+class ListModelsRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class ModelInfo(_message.Message):
+    __slots__ = ("name", "versions", "world", "objects")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    VERSIONS_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FIELD_NUMBER: _ClassVar[int]
+    OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    versions: _containers.RepeatedScalarFieldContainer[int]
+    world: str
+    objects: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, name: _Optional[str] = ..., versions: _Optional[_Iterable[int]] = ..., world: _Optional[str] = ..., objects: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class ListModelsResponse(_message.Message):
+    __slots__ = ("models",)
+    MODELS_FIELD_NUMBER: _ClassVar[int]
+    models: _containers.RepeatedCompositeFieldContainer[ModelInfo]
+    def __init__(self, models: _Optional[_Iterable[_Union[ModelInfo, _Mapping]]] = ...) -> None: ...
+
+class GetModelRequest(_message.Message):
+    __slots__ = ("model",)
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    model: ModelSelector
+    def __init__(self, model: _Optional[_Union[ModelSelector, _Mapping]] = ...) -> None: ...
+
+class GetModelResponse(_message.Message):
+    __slots__ = ("spec", "version")
+    SPEC_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    spec: _model_spec_pb2.ModelSpec
+    version: int
+    def __init__(self, spec: _Optional[_Union[_model_spec_pb2.ModelSpec, _Mapping]] = ..., version: _Optional[int] = ...) -> None: ...
