@@ -1,0 +1,70 @@
+# setup · demo · test · check · bench · proto: each brings the environment up to date first, which costs nothing when it is.
+
+PYTHON ?= python3
+# Any pip requirement, also with options: TORCH="torch==2.13.0 --index-url …" for a build without CUDA.
+TORCH ?= torch==2.13.0
+
+BIN := .venv/bin
+READY := .venv/.ready
+PROTOS := $(shell cd proto && find curio_proto -name '*.proto' | sort)
+PROTOC := $(BIN)/python -m grpc_tools.protoc -Iproto
+BENCHMARKS := $(filter-out benchmarks/demo.py,$(wildcard benchmarks/*.py))
+
+# Every recipe is one bash script that stops at the first failure.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+.PHONY: setup demo test check bench proto
+
+setup: $(READY)
+
+$(READY): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
+		echo "setup: found $$($(PYTHON) --version 2>&1), need Python 3.11 or newer: make setup PYTHON=python3.11" >&2; exit 1; }
+	# Dr.Jit loads the newest libLLVM of the system and aborts the whole process where that is older than 17.
+	usable_llvm() { [[ -n "$${DRJIT_LIBLLVM_PATH:-}" ]] ||
+		compgen -G '/usr/lib/*-linux-gnu/libLLVM*.so.*' | grep -E 'libLLVM(-|\.so\.)(1[7-9]|[2-9][0-9])' > /dev/null; }
+	if ! usable_llvm; then
+		echo "setup: installing libllvm19, which the renderer compiles its kernels with"
+		apt="env DEBIAN_FRONTEND=noninteractive apt-get -qq"; (( EUID == 0 )) || apt="sudo -n $$apt"
+		{ $$apt update && $$apt install -y --no-install-recommends libllvm19 > /dev/null && usable_llvm; } || {
+			echo "setup: no libLLVM of version 17 or newer, and it could not be installed from here. Type" >&2
+			echo "    sudo apt-get update && sudo apt-get install -y libllvm19" >&2
+			echo "or set DRJIT_LIBLLVM_PATH to a libLLVM.so of that age, then run make again." >&2; exit 1; }
+	fi
+	echo "setup: installing into .venv (a few minutes the first time)"
+	[[ -x $(BIN)/pip ]] || $(PYTHON) -m venv .venv || {
+		echo "setup: python's venv module is missing or incomplete: sudo apt-get install -y python3-venv, then run make again." >&2; exit 1; }
+	# torch first and then held fast: an open requirement would pull the newest CUDA build.
+	$(BIN)/pip install --quiet $(TORCH)
+	$(BIN)/pip freeze --quiet | grep -E '^torch[ =]' > .venv/torch.txt
+	$(BIN)/pip install --quiet --constraint .venv/torch.txt --editable '.[train,dev]'
+	touch $@
+
+demo: $(READY)
+	@$(BIN)/python benchmarks/demo.py
+
+# Two threads: the tests train tiny networks, which more threads make slower.
+test: $(READY)
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-2} $(BIN)/pytest
+
+check: $(READY)
+	@$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	fresh=$$(mktemp -d); trap 'rm -r "$$fresh"' EXIT
+	$(PROTOC) --python_out="$$fresh" --pyi_out="$$fresh" --grpc_python_out="$$fresh" $(PROTOS)
+	diff -r -x '*.proto' -x __init__.py -x __pycache__ "$$fresh/curio_proto" proto/curio_proto || {
+		echo "check: the generated code above is not what the .proto files give: make proto, then commit" >&2; exit 1; }
+
+proto: $(READY)
+	@$(PROTOC) --python_out=proto --pyi_out=proto --grpc_python_out=proto $(PROTOS)
+
+# One script a figure; the last line of each is its result.
+bench: $(READY)
+	@for script in $(BENCHMARKS); do
+		name=$$(basename "$$script" .py)
+		echo "bench: $$name" >&2
+		$(BIN)/python "$$script" --json | tee /dev/stderr | tail -n 1 > "docs/results/$$name.json"
+	done
