@@ -1,0 +1,36 @@
+"""From the latent code to the scene code (paper, appendix, table "Parameter MLP network")."""
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from curio_train.scene_code import Layout
+
+
+def _branch(num_in: int, hidden: int, size: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(num_in, hidden), nn.ReLU(), nn.Linear(hidden, size))
+
+
+class Heads(nn.Module):
+    """A trunk shared by all objects, then a branch for each field of the layout.
+
+    The trunk's output is cut into one row an object slot, so that each slot has its own features of the image; the
+    branches' weights are shared among the slots. Fields of the whole scene, such as light, branch off the latent code
+    itself. Circles gives the paper's smallest count, 4,387 parameters.
+    """
+
+    def __init__(self, layout: Layout, latent: int = 64, row: int = 32, hidden: int = 64) -> None:
+        super().__init__()
+        self.layout = layout
+        self.row = row
+        self.trunk = nn.Sequential(nn.Linear(latent, row * layout.num_slots), nn.ReLU())
+        self.branches = nn.ModuleDict(
+            {field.name: _branch(row if field.per_object else latent, hidden, field.size) for field in layout.fields}
+        )
+
+    def forward(self, latent: Float[Tensor, "batch latent"]) -> dict[str, Tensor]:
+        """The scene code: [batch, slots, size] for each object field, [batch, size] for each scene field."""
+        rows = self.trunk(latent).unflatten(1, (self.layout.num_slots, self.row))
+        return {
+            field.name: field.activate(self.branches[field.name](rows if field.per_object else latent))
+            for field in self.layout.fields
+        }
