@@ -1,0 +1,168 @@
+"""Rotations and rigid transforms in torch, batch first.
+
+Frames and handedness: everything is right-handed; the camera frame is OpenCV's (x right, y down, z forward), the world
+frame of the ground-plane scenes has y up. A transform is named target_from_source and is the pair
+``rotation [*batch, 3, 3], translation_m [*batch, 3]``; a point goes ``rotation @ point + translation_m``.
+
+6D rotations are Zhou et al. 2019 ("On the Continuity of Rotation Representations in Neural Networks"), the first two
+**columns** of the matrix, column after column. (PyTorch3D stores rows.)
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+# Below this length a vector has no direction one could trust. Gradients of a direction grow as 1 / length, so it also
+# bounds them.
+_SHORTEST = 1e-6
+
+
+class Pose(NamedTuple):
+    """One target_from_source transform in numpy, as files and metrics hold it.
+
+    Attributes:
+        rotation: [3, 3].
+        translation_m: [3].
+    """
+
+    rotation: np.ndarray
+    translation_m: np.ndarray
+
+
+def _unit(vector: Tensor, fallback: Tensor) -> Tensor:
+    """``vector / |vector|``, or ``fallback`` without a gradient where the vector has no direction.
+
+    ``where`` is applied to the input and not to the result, because a NaN in the branch not taken would still reach the
+    gradient. Dividing by the largest component first keeps the squares of huge vectors finite.
+    """
+    largest = vector.detach().abs().amax(dim=-1, keepdim=True)
+    safe = torch.where(largest > _SHORTEST, vector / largest.clamp(min=_SHORTEST), fallback)
+    return safe / safe.square().sum(dim=-1, keepdim=True).sqrt()
+
+
+def _any_perpendicular(unit: Tensor) -> Tensor:
+    """Some vector perpendicular to each unit vector, never short."""
+    x, y, z = unit.detach().unbind(-1)
+    zero = torch.zeros_like(x)
+    use_x = (x.abs() > z.abs()).unsqueeze(-1)
+    return torch.where(use_x, torch.stack([-y, x, zero], dim=-1), torch.stack([zero, -z, y], dim=-1))
+
+
+def matrix_from_rotation_6d(rotation_6d: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrix of a 6D rotation by Gram–Schmidt, Zhou et al. 2019, section B.
+
+    Any finite input gives a rotation with finite gradients: a first column without a direction becomes the x axis, a
+    second one without a direction of its own (zero, or along the first) becomes some perpendicular.
+    """
+    first, second = rotation_6d[..., :3], rotation_6d[..., 3:]
+    x = _unit(first, torch.eye(3, dtype=first.dtype, device=first.device)[0].expand_as(first))
+    # The second column is brought to length 1 first, so that "along the first" means the same at every scale.
+    second = _unit(second, _any_perpendicular(x))
+    y = _unit(second - (x * second).sum(dim=-1, keepdim=True) * x, _any_perpendicular(x))
+    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
+
+
+def rotation_6d_from_matrix(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 6"]:
+    """The first two columns, column after column."""
+    return torch.cat([rotation[..., 0], rotation[..., 1]], dim=-1)
+
+
+def matrix_from_yaw(yaw_ij: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation about the world's y axis (up, right-handed) by atan2(j, i); the length of (i, j) means nothing.
+
+    (0, 0) is no rotation; gradients are finite there too.
+    """
+    forward = torch.eye(2, dtype=yaw_ij.dtype, device=yaw_ij.device)[0].expand_as(yaw_ij)
+    cos, sin = _unit(yaw_ij, forward).unbind(-1)
+    zero, one = torch.zeros_like(cos), torch.ones_like(cos)
+    rows = [cos, zero, sin, zero, one, zero, -sin, zero, cos]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def direction_from_hemisphere(light: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+    """Unit vector above the ground (world frame, y up) of the two numbers (x / y, z / y).
+
+    Every pair of real numbers is a direction above the horizon, and straight up is (0, 0).
+    """
+    x, z = light.unbind(-1)
+    vector = torch.stack([x, torch.ones_like(x), z], dim=-1)
+    return vector / torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
+
+
+def random_rotations(count: int, generator: np.random.Generator) -> Float[Tensor, "count 3 3"]:
+    """Rotations uniform on SO(3): unit quaternions of normally distributed components (Shoemake 1992)."""
+    quaternions = generator.standard_normal((count, 4))
+    return torch.from_numpy(Rotation.from_quat(quaternions).as_matrix()).to(torch.float32)
+
+
+def rotation_between(
+    source: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "... 3 3"]:
+    """The smallest rotation that turns the direction ``source`` into ``target`` (Rodrigues).
+
+    Opposite directions leave the axis open; there the result is not a rotation. Lengths do not matter.
+    """
+    source = source / torch.linalg.vector_norm(source, dim=-1, keepdim=True)
+    target = target / torch.linalg.vector_norm(target, dim=-1, keepdim=True)
+    cos = (source * target).sum(dim=-1)[..., None, None]
+    outer = target.unsqueeze(-1) * source.unsqueeze(-2)
+    skew = outer - outer.transpose(-1, -2)
+    identity = torch.eye(3, dtype=source.dtype, device=source.device)
+    return identity + skew + skew @ skew / (1 + cos).clamp(min=_SHORTEST)
+
+
+def rotation_angle_deg(a: Float[Tensor, "*#batch 3 3"], b: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "..."]:
+    """Angle of the rotation between two, in [0, 180] degrees.
+
+    atan2 of sine and cosine is exact at both ends, where the usual arccos((trace - 1) / 2) loses half its digits.
+    """
+    between = a.transpose(-1, -2) @ b
+    skew = between - between.transpose(-1, -2)
+    twice_sin = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1).norm(dim=-1)
+    twice_cos = between.diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1
+    return torch.rad2deg(torch.atan2(twice_sin, twice_cos))
+
+
+def transform_points(
+    rotation: Float[Tensor, "*#batch 3 3"],
+    translation_m: Float[Tensor, "*#batch 3"],
+    points: Float[Tensor, "*#batch n 3"],
+) -> Float[Tensor, "... n 3"]:
+    """Points of the source frame in the target frame; leading dimensions broadcast."""
+    return points @ rotation.transpose(-1, -2) + translation_m.unsqueeze(-2)
+
+
+def invert(
+    rotation: Float[Tensor, "*batch 3 3"], translation_m: Float[Tensor, "*batch 3"]
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
+    """source_from_target of a target_from_source."""
+    transposed = rotation.transpose(-1, -2)
+    return transposed, -(transposed @ translation_m.unsqueeze(-1)).squeeze(-1)
+
+
+def compose(
+    a_from_b: tuple[Float[Tensor, "*#batch 3 3"], Float[Tensor, "*#batch 3"]],
+    b_from_c: tuple[Float[Tensor, "*#batch 3 3"], Float[Tensor, "*#batch 3"]],
+) -> tuple[Float[Tensor, "... 3 3"], Float[Tensor, "... 3"]]:
+    """a_from_c."""
+    rotation, translation_m = a_from_b
+    return rotation @ b_from_c[0], (rotation @ b_from_c[1].unsqueeze(-1)).squeeze(-1) + translation_m
+
+
+def camera_looking_at(
+    eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"]
+) -> tuple[Float[Tensor, "... 3 3"], Float[Tensor, "... 3"]]:
+    """cam_from_world of an OpenCV camera at ``eye`` (world frame, y up) that looks at ``target`` without roll.
+
+    Looking straight up or down, where "without roll" means nothing, the image's x axis is the world's.
+    """
+    forward = target - eye
+    forward = forward / torch.linalg.vector_norm(forward, dim=-1, keepdim=True)
+    down = forward.new_tensor([0.0, -1.0, 0.0]).expand_as(forward)
+    right = _unit(torch.linalg.cross(down, forward), forward.new_tensor([1.0, 0.0, 0.0]).expand_as(forward))
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-2)
+    return rotation, -(rotation @ eye.unsqueeze(-1)).squeeze(-1)
