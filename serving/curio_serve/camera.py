@@ -1,0 +1,141 @@
+"""Pinhole cameras: what a frame's intrinsics have to be, and rays and pixels.
+
+OpenCV's frame: x right, y down, z forward. Pixel centres lie at integer coordinates, so a change of size by s means
+p' + 1/2 = s (p + 1/2).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from curio_serve.errors import CameraError
+
+Array = np.ndarray
+_DISTORTION_SIZES = (0, 4, 5, 8)
+_MIN_FOCAL_WIDTHS, _MAX_FOCAL_WIDTHS = 0.1, 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeCamera:
+    """Intrinsics of the camera that took a frame.
+
+    Attributes:
+        matrix: K, float [3, 3], pixels.
+        distortion: OpenCV's k1, k2, p1, p2, k3 (none, 4, 5 or 8 values).
+        size: (width, height) in pixels that K belongs to, where known.
+
+    Raises:
+        CameraError: Not finite, singular, not a pinhole matrix, or an impossible focal length or principal point.
+    """
+
+    matrix: Array
+    distortion: tuple[float, ...] = ()
+    size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without the frame."""
+        matrix = np.asarray(self.matrix, float)
+        object.__setattr__(self, "matrix", matrix)
+        _check_matrix(matrix)
+        if len(self.distortion) not in _DISTORTION_SIZES or not np.isfinite(self.distortion).all():
+            raise CameraError(
+                f"distortion has {len(self.distortion)} values {list(self.distortion)}; expected none, 4, 5 or 8 "
+                "finite ones in OpenCV's order k1, k2, p1, p2, k3"
+            )
+        if self.size is not None:
+            self.check_frame(*self.size)
+
+    @cached_property
+    def coefficients(self) -> Array | None:
+        """Distortion as OpenCV takes it, or None where there is none."""
+        return np.array(self.distortion) if any(self.distortion) else None
+
+    def check_frame(self, width: int, height: int) -> None:
+        """Refuse a frame this camera cannot have taken.
+
+        Raises:
+            CameraError: Another size than K belongs to, a principal point outside, an implausible focal length.
+        """
+        if self.size is not None and self.size != (width, height):
+            raise CameraError(
+                f"K belongs to frames of {self.size[0]}x{self.size[1]}, this one has {width}x{height}; "
+                "calibrate at the size you use, or scale K with the image"
+            )
+        (fx, _, cx), (_, fy, cy), _ = self.matrix
+        if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+            raise CameraError(
+                f"the principal point ({cx:g}, {cy:g}) lies outside the frame of {width}x{height} pixels; "
+                "is this K of another size or of another camera?"
+            )
+        for name, focal, side in (("fx", fx, width), ("fy", fy, height)):
+            if not _MIN_FOCAL_WIDTHS <= focal / max(width, height) <= _MAX_FOCAL_WIDTHS:
+                raise CameraError(
+                    f"{name} = {focal:g} px is implausible for {side} pixels "
+                    f"(field of view {np.degrees(2 * np.arctan2(side, 2 * focal)):.3g} degrees); K must be in pixels"
+                )
+
+    def turned(self, quarter_turns: int, width: int, height: int) -> "PinholeCamera":
+        """The camera of a frame after clockwise quarter turns of its pixels.
+
+        A turn takes (x, y) to (height - 1 - y, x). The tangential coefficients act as the vector (p2, p1), which turns
+        with the picture: Brown's model adds r² q + 2 (q·x) x for q = (p2, p1).
+
+        Args:
+            quarter_turns: How many.
+            width: Of the frame before turning.
+            height: Of the frame before turning.
+        """
+        camera = self
+        for _ in range(quarter_turns % 4):
+            (fx, _, cx), (_, fy, cy), _ = camera.matrix
+            matrix = np.array([[fy, 0, height - 1 - cy], [0, fx, cx], [0, 0, 1]])
+            distortion = camera.distortion
+            if distortion:
+                k1, k2, p1, p2, *rest = distortion
+                distortion = (k1, k2, p2, -p1, *rest)
+            width, height = height, width
+            camera = PinholeCamera(matrix, distortion, camera.size and (width, height))
+        return camera
+
+    def ray(self, x: float, y: float) -> Array:
+        """Unit direction [3] in the camera frame of what is seen at a pixel."""
+        point = np.array([[[x, y]]])
+        if self.coefficients is not None:
+            x, y = cv2.undistortPoints(point, self.matrix, self.coefficients)[0, 0]
+            direction = np.array([x, y, 1.0])
+        else:
+            direction = np.linalg.solve(self.matrix, [x, y, 1.0])
+        return direction / np.linalg.norm(direction)
+
+    def project(self, points: Array) -> Array:
+        """Pixels [n, 2] of points [n, 3] in the camera frame, metres; NaN for points not in front of the camera."""
+        in_front = points[:, 2] > 1e-9
+        pixels = np.full((len(points), 2), np.nan)
+        if in_front.any():
+            zero = np.zeros(3)
+            found, _ = cv2.projectPoints(points[in_front], zero, zero, self.matrix, self.coefficients)
+            pixels[in_front] = found[:, 0]
+        return pixels
+
+
+def _check_matrix(matrix: Array) -> None:
+    if matrix.shape != (3, 3):
+        raise CameraError(f"K has shape {list(matrix.shape)}; expected [3, 3]: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    shown = matrix.tolist()
+    if not np.isfinite(matrix).all():
+        raise CameraError(f"K has values that are not finite: {shown}")
+    if (matrix[2] != (0, 0, 1)).any() or matrix[1, 0] != 0:
+        raise CameraError(f"K is {shown}; its last row has to be [0, 0, 1] and the entry below fx 0")
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        raise CameraError(
+            f"K is singular or mirrored: fx = {matrix[0, 0]:g}, fy = {matrix[1, 1]:g}; both must be above 0"
+        )
+    if abs(matrix[0, 1]) > 1e-6 * matrix[0, 0]:
+        raise CameraError(f"K has a skew of {matrix[0, 1]:g} px; expected 0: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+
+
+def scaling(x_scale: float, y_scale: float) -> Array:
+    """Homogeneous [3, 3] matrix of p' + 1/2 = s (p + 1/2), from pixels of one image size to those of another."""
+    return np.array([[x_scale, 0, (x_scale - 1) / 2], [0, y_scale, (y_scale - 1) / 2], [0, 0, 1]])

@@ -1,0 +1,182 @@
+"""What an encoded image says about itself, read from its first bytes without decoding a pixel.
+
+A decoder told to open a file of 140 kB may allocate 432 MB; so size, colour model, completeness and EXIF orientation
+are read here first, and what is not acceptable never reaches the decoder.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import Literal
+
+from curio_serve.errors import ImageError
+
+ImageFormat = Literal["jpeg", "png", "webp"]
+
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_EXIF_ORIENTATION = 0x0112
+_SOF_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_BARE_MARKERS = frozenset(range(0xD0, 0xD8)) | {0x01}
+MAX_JPEG_SCANS = 64
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the head of an image file declares.
+
+    Attributes:
+        format: Container.
+        width: Pixels as stored.
+        height: Pixels as stored.
+        num_channels: 1 grey, 2 grey + alpha, 3 colour, 4 colour + alpha or CMYK.
+        orientation: EXIF orientation 1 … 8; 1 where there is none.
+    """
+
+    format: ImageFormat
+    width: int
+    height: int
+    num_channels: int
+    orientation: int = 1
+
+
+def read_header(data: bytes) -> Header:
+    """Read the declared size and kind of an encoded image and check that its end is there.
+
+    Raises:
+        ImageError: Empty, none of JPEG, PNG and WebP, damaged, or cut short.
+    """
+    if not data:
+        raise ImageError("the image is empty (0 bytes); expected a JPEG, PNG or WebP file")
+    try:
+        if data[:3] == b"\xff\xd8\xff":
+            return _read_jpeg(data)
+        if data[:8] == _PNG_MAGIC:
+            return _read_png(data)
+        if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+            return _read_webp(data)
+    except (struct.error, IndexError) as exc:
+        raise ImageError(f"the image ends inside its header ({len(data)} bytes); send the whole file") from exc
+    raise ImageError(
+        f"not a JPEG, PNG or WebP image: it starts with {data[:8].hex(' ')}; convert it or send raw pixels"
+    )
+
+
+def _read_jpeg(data: bytes) -> Header:
+    """Walk the marker segments up to the first scan (ITU-T T.81, annex B)."""
+    size: tuple[int, int, int] | None = None
+    orientation, position = 1, 2
+    while True:
+        marker, position = _next_marker(data, position)
+        if marker in _BARE_MARKERS:
+            continue
+        if marker == 0xDA:
+            break
+        if marker == 0xD9:
+            raise ImageError("the JPEG has no picture data: its end marker comes before a scan")
+        (length,) = struct.unpack_from(">H", data, position)
+        segment = data[position + 2 : position + length]
+        if length < 2 or len(segment) != length - 2:
+            raise ImageError(f"the JPEG ends inside a header segment ({len(data)} bytes); send the whole file")
+        if marker in _SOF_MARKERS:
+            precision, height, width, num_channels = struct.unpack_from(">BHHB", segment)
+            if precision != 8:
+                raise ImageError(f"the JPEG has {precision} bits a sample; expected 8: convert it")
+            size = (width, height, num_channels)
+        elif marker == 0xE1 and segment[:6] == b"Exif\x00\x00":
+            orientation = exif_orientation(segment[6:])
+        position += length
+    if size is None:
+        raise ImageError("the JPEG has no frame header before its first scan; the file is damaged")
+    _check_jpeg_body(data, position)
+    return Header("jpeg", *size, orientation)
+
+
+def _next_marker(data: bytes, position: int) -> tuple[int, int]:
+    if data[position] != 0xFF:
+        raise ImageError(f"the JPEG is damaged: no marker at byte {position}; send the file again")
+    while data[position] == 0xFF:
+        position += 1
+    return data[position], position + 1
+
+
+def _check_jpeg_body(data: bytes, first_scan: int) -> None:
+    """Refuse a picture without its end (decoders fill in grey) and one with absurdly many scans.
+
+    In entropy-coded data 0xFF is followed by 0 or a restart marker alone, so both byte pairs are true markers there.
+    """
+    if data.find(b"\xff\xd9", first_scan) < 0:
+        raise ImageError(f"the JPEG is cut short: no end marker in its {len(data)} bytes; send the whole file")
+    num_scans = 1 + data.count(b"\xff\xda", first_scan)
+    if num_scans > MAX_JPEG_SCANS:
+        raise ImageError(f"the JPEG has {num_scans} scans; at most {MAX_JPEG_SCANS} are accepted: save it as baseline")
+
+
+def _read_png(data: bytes) -> Header:
+    """Walk the chunks to IEND (W3C PNG, section 5)."""
+    width, height, _depth, color_type = struct.unpack_from(">IIBB", data, 16)
+    if data[12:16] != b"IHDR":
+        raise ImageError("the PNG is damaged: its first chunk is not IHDR; send the file again")
+    # 3 is a palette, decoded to colour.
+    num_channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(color_type)
+    if num_channels is None:
+        raise ImageError(f"the PNG is damaged: colour type {color_type} does not exist; send the file again")
+    orientation, position, num_data_bytes = 1, 8, 0
+    while position + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, position)
+        kind = data[position + 4 : position + 8]
+        if kind == b"IEND":
+            if not num_data_bytes:
+                raise ImageError("the PNG has no picture data (no IDAT chunk); the file is damaged")
+            return Header("png", width, height, num_channels, orientation)
+        num_data_bytes += length if kind == b"IDAT" else 0
+        if kind == b"eXIf":
+            orientation = exif_orientation(data[position + 8 : position + 8 + length])
+        position += 12 + length
+    raise ImageError(f"the PNG is cut short: no end chunk in its {len(data)} bytes; send the whole file")
+
+
+def _read_webp(data: bytes) -> Header:
+    """Read the first image chunk of a RIFF container (RFC 9649, section 2)."""
+    (riff_length,) = struct.unpack_from("<I", data, 4)
+    if len(data) < riff_length + 8:
+        raise ImageError(f"the WebP is cut short: {len(data)} of {riff_length + 8} bytes; send the whole file")
+    kind = data[12:16]
+    if kind == b"VP8X":
+        flags = data[20]
+        if flags & 0x02:
+            raise ImageError("the WebP is an animation; expected a single picture")
+        width, height = 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+        return Header("webp", width, height, 4 if flags & 0x10 else 3, _webp_orientation(data))
+    if kind == b"VP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        return Header("webp", 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF), 4 if bits >> 28 & 1 else 3)
+    if kind == b"VP8 ":
+        width, height = struct.unpack_from("<HH", data, 26)
+        return Header("webp", width & 0x3FFF, height & 0x3FFF, 3)
+    raise ImageError(f"the WebP is damaged: its first chunk is {kind!r}; send the file again")
+
+
+def _webp_orientation(data: bytes) -> int:
+    position = 12
+    while position + 8 <= len(data):
+        (length,) = struct.unpack_from("<I", data, position + 4)
+        if data[position : position + 4] == b"EXIF":
+            return exif_orientation(data[position + 8 : position + 8 + length].removeprefix(b"Exif\x00\x00"))
+        position += 8 + length + (length & 1)
+    return 1
+
+
+def exif_orientation(tiff: bytes) -> int:
+    """Orientation 1 … 8 of an EXIF block (TIFF 6.0 header and first directory); 1 where it tells none or is damaged."""
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    if order is None:
+        return 1
+    try:
+        (directory,) = struct.unpack_from(f"{order}I", tiff, 4)
+        (num_entries,) = struct.unpack_from(f"{order}H", tiff, directory)
+        for entry in range(num_entries):
+            tag, _type, _count, value = struct.unpack_from(f"{order}HHIH", tiff, directory + 2 + 12 * entry)
+            if tag == _EXIF_ORIENTATION:
+                return value if 1 <= value <= 8 else 1
+    except struct.error:
+        return 1
+    return 1

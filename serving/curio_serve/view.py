@@ -1,0 +1,239 @@
+"""A frame, or a region of it, as the camera a model was trained for would see it; and poses turned back.
+
+A model knows one pinhole camera K* and one image size. Turning a camera about its centre changes its picture by a
+homography alone, whatever the scene's depth: a direction ``d`` in the frame's camera is ``R d`` in the turned one, so
+an undistorted pixel ``p`` of the frame appears at
+
+    p* ~ K* R K⁻¹ p        and a pose found there is turned back with Rᵀ.
+
+*Choice of R*: the smallest rotation that brings the ray through the region's centre onto the ray through the centre of
+the canonical image. Where a frame comes from the training camera itself, K = S K* with S the scaling between the two
+sizes, these two rays of a whole frame are equal and R is exactly the identity: the frame is merely resized. (Turning
+the optical axis there instead would shift such a frame by the distance of its principal point from its centre.)
+
+*Size of a region*: a homography of this kind keeps angles, so the canonical image always shows the field of view of K*,
+and nothing else keeps the model's depths true: magnifying by s would make an object at z look like one at z/s, with a
+perspective it never has there. A region therefore says *where to look*, not how much to see: one narrower than the
+canonical field of view is seen with its surroundings, of a wider one the middle is seen. A whole frame is the region
+over the frame. The centre of a region that reaches over the edge is moved into the frame.
+
+*2D worlds* have no K*: the region is resized to the canonical size, and positions are (x, y, 0) in widths of the image
+from its centre.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from curio_serve.camera import PinholeCamera, scaling
+from curio_serve.errors import CameraError
+
+Array = np.ndarray
+_MIN_RAY_DEPTH = 0.05  # cosine to the optical axis: 87 degrees
+
+
+@dataclass(frozen=True)
+class Region:
+    """A rectangle in pixels of the full-size frame; x = 0, width = 640 covers exactly a frame 640 pixels wide."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+    def overlaps(self, width: int, height: int) -> bool:
+        """Whether it has any pixel of a frame of that size."""
+        return self.x < width and self.y < height and self.x + self.width > 0 and self.y + self.height > 0
+
+
+@dataclass(frozen=True, eq=False)
+class CanonicalCamera:
+    """What a model was trained for: the size of its input, and K* [3, 3] (None in 2D worlds).
+
+    Attributes:
+        is_default: A frame without K is taken as seen by K* scaled to the frame's size.
+    """
+
+    width: int
+    height: int
+    matrix: Array | None = None
+    is_default: bool = False
+
+    def for_frame(self, width: int, height: int) -> PinholeCamera | None:
+        """K* scaled to a frame's size, where the model allows that as a default."""
+        if self.matrix is None or not self.is_default:
+            return None
+        return PinholeCamera(scaling(width / self.width, height / self.height) @ self.matrix)
+
+
+class View(ABC):
+    """One region as the model sees it.
+
+    Attributes:
+        image: uint8 RGB [canonical height, canonical width, 3].
+    """
+
+    image: Array
+
+    @abstractmethod
+    def translation(self, found: Array) -> Array:
+        """Positions [n, 3] of the model as positions in the frame's camera (or widths of the frame)."""
+
+    @abstractmethod
+    def turn(self, found: Array) -> Array:
+        """Column vectors in the model's camera [..., 3, m] in the frame's camera: rotations, or a light with m = 1."""
+
+    @abstractmethod
+    def project(self, points: Array) -> Array:
+        """Pixels [n, 2] in the full-size frame of points [n, 3] in the frame's camera (or widths of the frame)."""
+
+
+class PinholeView(View):
+    """A region of a frame with K."""
+
+    def __init__(self, image: Array, camera: PinholeCamera, canonical_from_cam: Array) -> None:
+        self.image = image
+        self.canonical_from_cam = canonical_from_cam
+        self._camera = camera
+
+    def translation(self, found: Array) -> Array:
+        return found @ self.canonical_from_cam
+
+    def turn(self, found: Array) -> Array:
+        return self.canonical_from_cam.T @ found
+
+    def project(self, points: Array) -> Array:
+        return self._camera.project(points)
+
+
+class FlatView(View):
+    """A region of a 2D world's frame."""
+
+    def __init__(self, image: Array, region: Region, frame_size: tuple[int, int]) -> None:
+        self.image = image
+        self._region = region
+        self._frame_size = frame_size
+
+    def translation(self, found: Array) -> Array:
+        # From widths of the canonical image to its shares of the region, whose height may be stretched differently.
+        region, (width, height) = self._region, self._frame_size
+        canonical_height, canonical_width = self.image.shape[:2]
+        x = region.x + region.width * (found[:, 0] + 0.5)
+        y = region.y + region.height * (found[:, 1] * canonical_width / canonical_height + 0.5)
+        return np.stack([(x - width / 2) / width, (y - height / 2) / width, np.zeros_like(x)], axis=-1)
+
+    def turn(self, found: Array) -> Array:
+        return found
+
+    def project(self, points: Array) -> Array:
+        width, height = self._frame_size
+        return points[:, :2] * width + np.array([(width - 1) / 2, (height - 1) / 2])
+
+
+class PinholeFrame:
+    """A frame with its camera, made ready to be looked at by a model's camera.
+
+    Averaging it down to the model's scale comes first, once for all regions, because the warp itself samples points.
+    """
+
+    def __init__(self, pixels: Array, camera: PinholeCamera, canonical: CanonicalCamera, reduction: int = 1) -> None:
+        """Check the camera against the frame and average the pixels down.
+
+        Args:
+            pixels: uint8 RGB [height / reduction, width / reduction, 3].
+            camera: Of the full-size frame.
+            canonical: Of the model; with K*.
+            reduction: How much smaller than the frame the pixels are.
+
+        Raises:
+            CameraError: The camera cannot have taken this frame.
+        """
+        self.width, self.height = pixels.shape[1] * reduction, pixels.shape[0] * reduction
+        camera.check_frame(self.width, self.height)
+        if canonical.matrix is None:
+            raise CameraError("a 2D model has no camera to look through")
+        self._camera, self._canonical, self._target = camera, canonical, canonical.matrix
+        x_ratio, y_ratio = (self._target[i, i] / camera.matrix[i, i] for i in (0, 1))
+        self._pixels = _average_down(pixels, self.width * x_ratio, self.height * y_ratio)
+        height, width = self._pixels.shape[:2]
+        self._matrix = scaling(width / self.width, height / self.height) @ camera.matrix
+
+    def look(self, region: Region) -> PinholeView:
+        """The region as the model's camera sees it.
+
+        Raises:
+            CameraError: The view would reach behind the frame's camera.
+        """
+        x = float(np.clip(region.x + region.width / 2, 0, self.width)) - 0.5
+        y = float(np.clip(region.y + region.height / 2, 0, self.height)) - 0.5
+        size = self._canonical.width, self._canonical.height
+        middle = np.linalg.solve(self._target, [(size[0] - 1) / 2, (size[1] - 1) / 2, 1.0])
+        turn = smallest_rotation(self._camera.ray(x, y), middle / np.linalg.norm(middle))
+        self._check_in_front(turn, size)
+        distortion = self._camera.coefficients
+        if distortion is None:
+            image = _sample(self._pixels, self._matrix @ turn.T @ np.linalg.inv(self._target), size)
+        else:
+            maps = cv2.initUndistortRectifyMap(self._matrix, distortion, turn, self._target, size, cv2.CV_32FC1)
+            image = cv2.remap(self._pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return PinholeView(image, self._camera, turn)
+
+    def _check_in_front(self, turn: Array, size: tuple[int, int]) -> None:
+        corners = np.array([[x, y, 1.0] for x in (0, size[0] - 1) for y in (0, size[1] - 1)])
+        rays = np.linalg.solve(self._target, corners.T)
+        depths = (turn.T @ (rays / np.linalg.norm(rays, axis=0)))[2]
+        if depths.min() < _MIN_RAY_DEPTH:
+            raise CameraError(
+                "the model's view of this region would reach more than 87 degrees away from the camera's axis; "
+                "choose a region nearer the middle of the frame, or check K's focal length"
+            )
+
+
+class FlatFrame:
+    """A frame for a model of a 2D world."""
+
+    def __init__(self, pixels: Array, canonical: CanonicalCamera, reduction: int = 1) -> None:
+        self.width, self.height = pixels.shape[1] * reduction, pixels.shape[0] * reduction
+        self._pixels, self._canonical = pixels, canonical
+
+    def look(self, region: Region) -> FlatView:
+        """The region resized to the model's input; beyond the frame its edge pixels go on."""
+        size = self._canonical.width, self._canonical.height
+        x_ratio, y_ratio = size[0] / region.width, size[1] / region.height
+        pixels = _average_down(self._pixels, self.width * x_ratio, self.height * y_ratio)
+        to_pixels = scaling(pixels.shape[1] / self.width, pixels.shape[0] / self.height)
+        shift = np.array([[1, 0, region.x], [0, 1, region.y], [0, 0, 1]])
+        image = _sample(pixels, to_pixels @ shift @ scaling(1 / x_ratio, 1 / y_ratio), size)
+        return FlatView(image, region, (self.width, self.height))
+
+
+def smallest_rotation(source: Array, target: Array) -> Array:
+    """Rotation [3, 3] that takes one unit vector [3] to another on the shortest way (Rodrigues' formula).
+
+    Both look forward (z > 0), so they are never opposite.
+    """
+    axis = np.cross(source, target)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + source @ target)
+
+
+def _average_down(pixels: Array, width: float, height: float) -> Array:
+    """Pixels averaged over areas down to that size; sides that would grow stay as they are."""
+    size = (
+        min(pixels.shape[1], max(1, round(width))),
+        min(pixels.shape[0], max(1, round(height))),
+    )
+    if size == (pixels.shape[1], pixels.shape[0]):
+        return pixels
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+
+
+def _sample(pixels: Array, pixels_from_view: Array, size: tuple[int, int]) -> Array:
+    """Image of ``size`` whose pixel p shows ``pixels`` at the homography's ``pixels_from_view`` p."""
+    same_size = size == (pixels.shape[1], pixels.shape[0])
+    if same_size and np.allclose(pixels_from_view / pixels_from_view[2, 2], np.eye(3), atol=1e-6):
+        return pixels
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(pixels, pixels_from_view, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
