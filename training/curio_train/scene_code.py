@@ -55,8 +55,11 @@ class Field:
 
     @property
     def span(self) -> tuple[float, ...]:
-        """Width of the range of each component; 1 where unbounded. Metrics divide by it (Eq. 1 with w = 1)."""
-        return tuple(u - low for low, u in zip(self.lower, self.upper, strict=True)) or (1.0,) * self.size
+        """Width of each component's range, by which metrics divide (Eq. 1 with w = 1).
+
+        It is 1 where unbounded, and where the range is a point (z of a 2D world), whose error is 0 anyway.
+        """
+        return tuple((u - low) or 1.0 for low, u in zip(self.lower, self.upper, strict=True)) or (1.0,) * self.size
 
     def activate(self, raw: Tensor) -> Tensor:
         """Raw head output ``[..., size]`` to physical values of the same shape.

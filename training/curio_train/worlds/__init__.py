@@ -1,0 +1,26 @@
+"""The registry of worlds.
+
+A world NAME is a module ``worlds/NAME.py`` with a function ``build(options) -> World``, and a line here that names its
+options. Nothing is imported before it is asked for, so that listing the worlds costs no torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from curio_train.worlds.options import CirclesOptions, WorldOptions
+
+if TYPE_CHECKING:
+    from curio_train.worlds.base import World
+
+WORLDS: dict[str, type[WorldOptions]] = {
+    "circles": CirclesOptions,
+}
+
+
+def build(options: WorldOptions) -> World:
+    """The world that these options describe."""
+    name = next(name for name, kind in WORLDS.items() if isinstance(options, kind))
+    world: World = importlib.import_module(f"curio_train.worlds.{name}").build(options)
+    return world

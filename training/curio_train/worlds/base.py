@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
+from curio_train.errors import UsageError
 from curio_train.scene_code import Layout, SceneCode
 
 Split = Literal["train", "validation", "test"]
@@ -64,6 +65,14 @@ class ImageSource(ABC):
     @abstractmethod
     def batch(self, step: int, size: int) -> Batch:
         """The images of one step."""
+
+    def subset(self, share: float) -> "ImageSource":
+        """The first ``share`` of a finite set of images.
+
+        Raises:
+            UsageError: The images are drawn without end, so there is no share of them.
+        """
+        raise UsageError(f"this world draws images without end, so --labels {share} means nothing; expected --labels 1")
 
 
 @dataclass(frozen=True)
