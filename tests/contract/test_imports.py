@@ -24,7 +24,7 @@ if logging.getLogger().handlers:
     changes.append("root logger's handlers")
 if threading.active_count() != 1:
     changes.append(f"threads {threading.enumerate()}")
-changed = {name for name, _ in os.environ.items() ^ environment.items()} - {"LD_LIBRARY_PATH"}  # that one is OpenCV's doing
+changed = {name for name, _ in os.environ.items() ^ environment.items()} - {"LD_LIBRARY_PATH"}  # OpenCV sets that
 if changed:
     changes.append(f"environment {changed}")
 if "mitsuba" in sys.modules and sys.modules["mitsuba"].variant() is not None:
