@@ -1,0 +1,181 @@
+"""From what a command line names (files, folders, globs, videos, a list on standard input) to images, one at a time.
+
+The order is the order of the arguments, and inside a folder that of the names. Nothing here grows with the number of
+images: a folder of a million is listed in batches, and a video is read as it is used.
+"""
+
+import glob
+import heapq
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+from curio_serve.errors import ImageError, UsageError
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v"})
+STANDARD_INPUT = "-"
+
+_NAMES_A_PASS = 1 << 16
+_BOP_SCENE_FILES = ("scene_camera.json", "scene_gt.json")
+_BOP_IMAGE_FOLDERS = ("rgb", "gray")
+Pixels: TypeAlias = np.ndarray
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """An image that is going to be looked at.
+
+    Attributes:
+        name: Its path as given; a video's frames are ``clip.mp4#0``, ``clip.mp4#1`` and so on.
+        path: The file it comes from.
+        video_frame: Its number in a video; None for an image file.
+        pixels: uint8 RGB [height, width, 3] of a video's frame.
+        error: Why a video has no frames to give.
+    """
+
+    name: str
+    path: str
+    video_frame: int | None = None
+    pixels: Pixels | None = None
+    error: str = ""
+
+    def read(self) -> bytes:
+        """The bytes of an image file.
+
+        Raises:
+            ImageError: The file cannot be read, or there is none.
+        """
+        if self.error:
+            raise ImageError(self.error)
+        try:
+            return Path(self.path).read_bytes()
+        except (OSError, ValueError) as exc:  # ValueError: a null byte in the name
+            reason = exc.strerror if isinstance(exc, OSError) else str(exc)
+            raise ImageError(f"cannot be read: {reason}") from exc
+
+    @property
+    def relative_name(self) -> PurePath:
+        """The path in which a file of its own, such as a drawing, may be kept apart from all others'."""
+        if self.video_frame is None:
+            return PurePath(self.path)
+        return PurePath(self.path) / f"{self.video_frame:06d}.jpg"
+
+
+def check_arguments(arguments: Sequence[str]) -> None:
+    """Refuse a call that names what does not exist, before any work.
+
+    Raises:
+        UsageError: Says which argument.
+    """
+    if not arguments:
+        raise UsageError("no images given; expected files, folders, globs, videos, or - for a list on standard input")
+    if arguments.count(STANDARD_INPUT) > 1:
+        raise UsageError("- was given twice; standard input can be read once")
+    for argument in arguments:
+        if argument != STANDARD_INPUT and not os.path.exists(argument) and not _has_match(argument):
+            raise UsageError(f"{argument}: no such file or folder, and no file matches it; check the path")
+
+
+def images(arguments: Sequence[str]) -> Iterator[SourceImage]:
+    """Every image that the arguments name, in order.
+
+    Raises:
+        UsageError: A folder cannot be listed.
+    """
+    for argument in arguments:
+        if argument == STANDARD_INPUT:
+            for line in sys.stdin.buffer:
+                if path := os.fsdecode(line.rstrip(b"\r\n")):
+                    yield from _images_at(path)
+        elif os.path.exists(argument):
+            yield from _images_at(argument)
+        else:
+            for path in sorted(glob.iglob(argument, recursive=True)):
+                yield from _images_at(path)
+
+
+def common_folder(arguments: Sequence[str]) -> Path:
+    """The deepest folder that holds everything the arguments name: below it, relative paths are distinct."""
+    folders = [os.getcwd() if a == STANDARD_INPUT else _folder_of(os.path.abspath(a)) for a in arguments]
+    return Path(os.path.commonpath(folders))
+
+
+def _folder_of(path: str) -> str:
+    """The folder itself, a file's folder, or the part of a glob before its first wildcard."""
+    while not os.path.isdir(path):
+        path = os.path.dirname(path)
+    return path
+
+
+def _has_match(pattern: str) -> bool:
+    return glob.has_magic(pattern) and next(glob.iglob(pattern, recursive=True), None) is not None
+
+
+def _images_at(path: str) -> Iterator[SourceImage]:
+    if os.path.isdir(path):
+        yield from _images_below(path)
+    elif PurePath(path).suffix.lower() in VIDEO_SUFFIXES:
+        yield from _video_frames(path)
+    else:
+        yield SourceImage(path, path)
+
+
+def _images_below(folder: str) -> Iterator[SourceImage]:
+    """Image files of a folder and its sub-folders; of a BOP scene the photographs alone, not its depths and masks."""
+    is_bop_scene = any(os.path.exists(os.path.join(folder, name)) for name in _BOP_SCENE_FILES)
+    for name, is_folder in _sorted_entries(folder):
+        if not is_folder:
+            yield SourceImage(os.path.join(folder, name), os.path.join(folder, name))
+        elif not is_bop_scene or name in _BOP_IMAGE_FOLDERS:
+            yield from _images_below(os.path.join(folder, name))
+
+
+def _sorted_entries(folder: str) -> Iterator[tuple[str, bool]]:
+    """(name, is a folder) of images and sub-folders by name; hidden ones and links to folders are left out.
+
+    Each pass over the folder keeps the next names alone, so that memory does not depend on how many there are.
+    """
+    last = ""
+    while batch := heapq.nsmallest(_NAMES_A_PASS, _entries_after(folder, last)):
+        yield from batch
+        last = batch[-1][0]
+
+
+def _entries_after(folder: str, last: str) -> Iterator[tuple[str, bool]]:
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                if entry.name <= last or entry.name.startswith("."):
+                    continue
+                is_folder = entry.is_dir(follow_symlinks=False)
+                if is_folder or (os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES and not entry.is_dir()):
+                    yield entry.name, is_folder
+    except OSError as exc:
+        raise UsageError(f"{folder}: cannot be listed: {exc.strerror}") from exc
+
+
+def _video_frames(path: str) -> Iterator[SourceImage]:
+    """Frames as stored: a rotation noted in the video is not applied, because K belongs to the stored pixels."""
+    capture = cv2.VideoCapture(path)
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    number = 0
+    try:
+        while True:
+            is_read, pixels = capture.read()
+            if not is_read:
+                break
+            yield SourceImage(f"{path}#{number}", path, number, cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+            number += 1
+    finally:
+        capture.release()
+    if number == 0:
+        yield SourceImage(
+            path, path, error="not a video that can be decoded, or one without frames; convert it to H.264 in MP4"
+        )
