@@ -67,8 +67,9 @@ def read_camera_file(path: str | Path) -> CameraFile:
         raise CameraError(f"camera file {path} is not JSON: {exc}; OpenCV files need the suffix .yml or .yaml") from exc
     except CameraError as exc:
         raise CameraError(f"camera file {path}: {exc}") from exc
-    except (TypeError, ValueError, KeyError, cv2.error) as exc:
-        raise CameraError(f"camera file {path} has a value of the wrong kind: {exc!r}") from exc
+    except (TypeError, ValueError, KeyError, SystemError, cv2.error) as exc:
+        # OpenCV's reader turns its own errors into SystemError.
+        raise CameraError(f"camera file {path} cannot be understood: {exc!r}") from exc
 
 
 def _from_json(path: Path, content: Any) -> CameraFile:

@@ -1,0 +1,151 @@
+"""Image in, poses out: one loaded model over the regions of a frame. No gRPC here."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from curio_proto.v1.detector_pb2 import (
+    REGION_STATUS_DETECTED,
+    REGION_STATUS_NO_OBJECT,
+    REGION_STATUS_OUTSIDE_FRAME,
+    RegionResult,
+)
+from scipy.spatial.transform import Rotation
+
+from curio_serve.camera import PinholeCamera
+from curio_serve.errors import ArgumentError, CameraMissing, ImageError
+from curio_serve.model import Model, Outputs, Slot
+from curio_serve.view import FlatFrame, PinholeFrame, Region, View
+
+Array = np.ndarray
+_REDUCTIONS = (8, 4, 2)
+
+
+class Detector:
+    """Finds a model's objects in frames; safe to share between threads."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+
+    def detect(
+        self,
+        pixels: Array,
+        camera: PinholeCamera | None,
+        *,
+        regions: Sequence[Region] = (),
+        min_confidence: float = 0.0,
+        max_detections: int | None = None,
+        reduction: int = 1,
+    ) -> list[RegionResult]:
+        """Poses in one frame.
+
+        Args:
+            pixels: uint8 RGB [height / reduction, width / reduction, 3].
+            camera: Intrinsics of the full-size frame; None for 2D worlds and for models that allow a default.
+            regions: Where to look, in pixels of the full-size frame; none: the whole frame.
+            min_confidence: Detections below are left out; 0 … 1.
+            max_detections: Most detections a region; None: all.
+            reduction: How much smaller than the frame the pixels were decoded.
+
+        Returns:
+            One result a region, in order; detections most confident first.
+
+        Raises:
+            CameraMissing: The model needs K.
+            CameraError: K cannot be this frame's.
+            ImageError: Not uint8 RGB.
+            ArgumentError: A region or threshold that makes no sense.
+            InternalError: The network failed.
+        """
+        _check_arguments(pixels, regions, min_confidence)
+        frame = self._frame(pixels, camera, reduction)
+        looks = regions or [Region(0, 0, frame.width, frame.height)]
+        views = [frame.look(region) if region.overlaps(frame.width, frame.height) else None for region in looks]
+        images = [view.image for view in views if view is not None]
+        outputs = self.model.run(np.stack(images)) if images else {}
+        results = []
+        for index, view in enumerate(views):
+            result = RegionResult(model=self.model.name, model_version=self.model.version, region=index)
+            if view is None:
+                result.status = REGION_STATUS_OUTSIDE_FRAME
+            else:
+                row = len([earlier for earlier in views[:index] if earlier is not None])
+                _fill(result, view, self.model.slots, {name: value[row] for name, value in outputs.items()})
+                _select(result, min_confidence, max_detections)
+            results.append(result)
+        return results
+
+    def reduction(self, camera: PinholeCamera | None, width: int, height: int) -> int:
+        """How much smaller a frame may be decoded (1, 2, 4, 8) without going below the model's own resolution.
+
+        Args:
+            camera: Of the frame, where known.
+            width: Of the frame.
+            height: Of the frame.
+        """
+        canonical = self.model.camera
+        if canonical.matrix is None:
+            ratios = (width / canonical.width, height / canonical.height)
+        else:
+            camera = camera or canonical.for_frame(width, height)
+            if camera is None:
+                return 1
+            ratios = tuple(camera.matrix[i, i] / canonical.matrix[i, i] for i in (0, 1))
+        return next((r for r in _REDUCTIONS if r <= min(ratios)), 1)
+
+    def _frame(self, pixels: Array, camera: PinholeCamera | None, reduction: int) -> "PinholeFrame | FlatFrame":
+        canonical = self.model.camera
+        if canonical.matrix is None:
+            return FlatFrame(pixels, canonical, reduction)
+        camera = camera or canonical.for_frame(pixels.shape[1] * reduction, pixels.shape[0] * reduction)
+        if camera is None:
+            raise CameraMissing(
+                f"model {self.model.label} needs the camera matrix K of the frame and none was given; "
+                "set `camera` in the request, or --camera FILE on the command line"
+            )
+        return PinholeFrame(pixels, camera, canonical, reduction)
+
+
+def _check_arguments(pixels: Array, regions: Sequence[Region], min_confidence: float) -> None:
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
+        raise ImageError(f"pixels are {pixels.dtype} {pixels.shape}; expected uint8 RGB [height, width, 3]")
+    if not 0 <= min_confidence <= 1:
+        raise ArgumentError(f"min_confidence is {min_confidence}; expected 0 to 1")
+    for index, region in enumerate(regions):
+        values = (region.x, region.y, region.width, region.height)
+        if not np.isfinite(values).all() or np.abs(values).max() > 1e6 or min(region.width, region.height) < 1:
+            raise ArgumentError(
+                f"regions[{index}] has (x, y, width, height) = {values}; "
+                "expected pixels within ±1e6, width and height at least 1"
+            )
+
+
+def _fill(result: RegionResult, view: View, slots: Sequence[Slot], outputs: Outputs) -> None:
+    """Turn one image's outputs back into the frame's camera and write them down."""
+    translations = view.translation(outputs["translation_m"].astype(float))
+    if "light" in outputs:
+        result.light.extend(view.turn(outputs["light"].astype(float)[:, None])[:, 0])
+    rotations = np.broadcast_to(np.eye(3), (len(slots), 3, 3))
+    if "rotation" in outputs:
+        rotations = view.turn(outputs["rotation"].astype(float))
+        quaternions = Rotation.from_matrix(rotations).as_quat()
+    for row, slot in enumerate(slots):
+        detection = result.detections.add(object=slot.object, translation_m=translations[row])
+        detection.confidence = float(np.clip(outputs["confidence"][row], 0, 1)) if "confidence" in outputs else 1.0
+        if "color" in outputs:
+            detection.color.extend(outputs["color"][row].tolist())
+        if "rotation" in outputs:
+            detection.rotation.extend(rotations[row].ravel().tolist())
+            detection.rotation_6d.extend(rotations[row, :, :2].T.ravel().tolist())
+            detection.quaternion_xyzw.extend(quaternions[row].tolist())
+        if len(slot.box_corners):
+            corners = slot.box_corners @ rotations[row].T + translations[row]
+            detection.box_px.extend(view.project(corners).ravel().tolist())
+
+
+def _select(result: RegionResult, min_confidence: float, max_detections: int | None) -> None:
+    """Keep the detections that are confident enough, best first."""
+    kept = sorted((d for d in result.detections if d.confidence >= min_confidence), key=lambda d: -d.confidence)
+    kept = kept[:max_detections]
+    result.status = REGION_STATUS_DETECTED if kept else REGION_STATUS_NO_OBJECT
+    del result.detections[:]
+    result.detections.extend(kept)
