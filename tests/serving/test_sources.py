@@ -1,0 +1,137 @@
+"""From arguments to images: order, what is left out, and what it costs."""
+
+import io
+import os
+import tracemalloc
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from curio_serve import sources
+from curio_serve.errors import ImageError, UsageError
+from curio_serve.sources import check_arguments, common_folder, images
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"x")
+
+
+def names(*arguments: str | Path) -> list[str]:
+    return [image.name for image in images([str(a) for a in arguments])]
+
+
+def test_a_folder_gives_its_images_and_those_below_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    touch(
+        tmp_path, "in/b.PNG", "in/a.jpg", "in/c/z.webp", "in/notes.txt", "in/.hidden.jpg", "in/.git/x.jpg", "in/d.jpeg"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert names("in") == ["in/a.jpg", "in/b.PNG", "in/c/z.webp", "in/d.jpeg"]
+    assert names("in/") == names("in")
+
+
+def test_order_does_not_depend_on_how_many_names_a_pass_keeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    touch(tmp_path, *(f"{(7919 * i) % 1000:03d}.png" for i in range(1000)))
+    monkeypatch.setattr(sources, "_NAMES_A_PASS", 64)
+    assert [Path(n).stem for n in names(tmp_path)] == [f"{i:03d}" for i in range(1000)]
+
+
+def test_of_a_bop_scene_only_the_photographs_count(tmp_path: Path) -> None:
+    touch(tmp_path, *(f"test/000002/{kind}/000003.png" for kind in ("rgb", "depth", "mask", "mask_visib")))
+    touch(tmp_path, "test/000002/scene_camera.json")
+    assert names(tmp_path / "test") == [str(tmp_path / "test/000002/rgb/000003.png")]
+
+
+def test_files_keep_the_order_of_the_arguments_whatever_their_suffix(tmp_path: Path) -> None:
+    touch(tmp_path, "b.png", "a.dat")
+    assert names(tmp_path / "b.png", tmp_path / "a.dat") == [str(tmp_path / "b.png"), str(tmp_path / "a.dat")]
+
+
+def test_globs_are_expanded_unless_a_file_has_that_very_name(tmp_path: Path) -> None:
+    touch(tmp_path, "2.png", "1.png", "x/3.png", "[1].png")
+    assert names(tmp_path / "?.png") == [str(tmp_path / n) for n in ("1.png", "2.png")]
+    assert names(tmp_path / "[1].png") == [str(tmp_path / "[1].png")]
+    assert str(tmp_path / "x/3.png") in names(tmp_path / "**" / "*.png")
+
+
+def test_a_list_on_standard_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    touch(tmp_path, "a.png", "in/b.png")
+    listed = f"{tmp_path}/a.png\r\n\n{tmp_path}/in\n{tmp_path}/missing.png"
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO(listed.encode())))
+    assert names("-") == [f"{tmp_path}/a.png", f"{tmp_path}/in/b.png", f"{tmp_path}/missing.png"]
+
+
+def test_a_missing_file_is_an_error_of_that_image(tmp_path: Path) -> None:
+    for name in ("missing.png", "null\0byte.png"):
+        with pytest.raises(ImageError, match="cannot be read"):
+            sources.SourceImage(name, str(tmp_path / name)).read()
+
+
+def test_arguments_that_name_nothing_are_refused_before_the_start(tmp_path: Path) -> None:
+    touch(tmp_path, "a.png")
+    check_arguments([str(tmp_path / "a.png"), str(tmp_path), str(tmp_path / "*.png"), "-"])
+    for arguments in ([], ["-", "-"], [str(tmp_path / "b.png")], [str(tmp_path / "*.jpg")]):
+        with pytest.raises(UsageError):
+            check_arguments(arguments)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may list every folder")
+def test_a_folder_that_may_not_be_listed_is_named(tmp_path: Path) -> None:
+    tmp_path.chmod(0)
+    with pytest.raises(UsageError, match=str(tmp_path)):
+        names(tmp_path)
+
+
+def test_relative_names_stay_apart_below_the_common_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "a/0.png", "b/0.png", "b/c/0.png")
+    assert common_folder([str(tmp_path / "a")]) == tmp_path / "a"
+    assert common_folder([str(tmp_path / "b/0.png"), str(tmp_path / "b/c/0.png")]) == tmp_path / "b"
+    assert common_folder([str(tmp_path / "a"), str(tmp_path / "b/*.png")]) == tmp_path
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    """Five frames, each of one grey."""
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for shade in range(5):
+        writer.write(np.full((48, 64, 3), 40 * shade, np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_video_gives_its_frames(clip: Path) -> None:
+    frames = list(images([str(clip)]))
+    assert [f.name for f in frames] == [f"{clip}#{i}" for i in range(5)]
+    for i, frame in enumerate(frames):
+        assert frame.pixels is not None
+        assert frame.pixels.shape == (48, 64, 3)
+        assert abs(frame.pixels.mean() - 40 * i) < 4
+    assert frames[3].relative_name == clip / "000003.jpg"
+
+
+def test_a_video_that_is_none_gives_one_error(tmp_path: Path) -> None:
+    touch(tmp_path, "clip.mp4")
+    (image,) = images([str(tmp_path / "clip.mp4")])
+    with pytest.raises(ImageError, match="not a video"):
+        image.read()
+
+
+def test_memory_does_not_grow_with_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same peak for a folder twenty times as large, with passes that are small against both."""
+    monkeypatch.setattr(sources, "_NAMES_A_PASS", 100)
+    peaks = []
+    for count in (500, 10_000):
+        folder = tmp_path / str(count)
+        folder.mkdir()
+        for i in range(count):
+            (folder / f"{i:06d}.png").touch()
+        tracemalloc.start()
+        assert sum(1 for _ in images([str(folder)])) == count
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.5 * peaks[0] + 20_000
