@@ -1,0 +1,124 @@
+"""The static Mitsuba scene: every kind of object once, at unit size, far from the others; built once, traced for ever.
+
+A rigid object seen by a camera is the camera seen from the object, so meshes never move; rays do. Each mesh is moved
+to its bounding sphere's centre, scaled to unit radius and shifted to a place of its own, which keeps float32 at its best
+whatever the object's size.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from curio_train.data.meshes import Mesh
+from curio_train.errors import RendererError
+from curio_train.rendering.edges import EdgeTable, build_edges
+from curio_train.rendering.topology import Adjacency, adjacency, smooth_normals
+
+SPACING = 4.0
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a kind of object lies in the static scene: ``scene = (object − center) / radius + offset``."""
+
+    center_m: np.ndarray
+    radius_m: float
+    offset: np.ndarray
+
+
+@dataclass(frozen=True)
+class StaticScene:
+    """What the renderer traces.
+
+    Attributes:
+        scene: The ``mitsuba.Scene``.
+        placements: One a kind.
+        edges: Silhouette candidates of all kinds, in scene coordinates.
+    """
+
+    scene: Any
+    placements: tuple[Placement, ...]
+    edges: EdgeTable
+
+
+def place(meshes: Sequence[Mesh]) -> tuple[Placement, ...]:
+    """Unit size and a place of its own for each mesh."""
+    placements = []
+    for kind, mesh in enumerate(meshes):
+        used = mesh.vertices_m[np.unique(mesh.faces)]
+        center = (used.min(0) + used.max(0)) / 2
+        radius = float(np.linalg.norm(used - center, axis=1).max())
+        if not np.isfinite(radius) or radius <= 0:
+            raise RendererError(f"mesh {kind} has no extent (radius {radius}); it cannot be rendered")
+        placements.append(Placement(center, radius, np.array([SPACING * kind, 0.0, 0.0])))
+    return tuple(placements)
+
+
+def build_scene(mitsuba: Any, meshes: Sequence[Mesh]) -> StaticScene:
+    """Load all meshes into one scene.
+
+    Raises:
+        RendererError: There is no mesh, or one without extent.
+    """
+    if not meshes:
+        raise RendererError("no mesh to render")
+    placements = place(meshes)
+    shapes, edges = {}, []
+    for kind, (mesh, placement) in enumerate(zip(meshes, placements, strict=True)):
+        unit = (mesh.vertices_m - placement.center_m) / placement.radius_m
+        neighbours = adjacency(unit, mesh.faces)
+        if len(neighbours.faces) == 0:
+            raise RendererError(f"mesh {kind} has no face with an area; it cannot be rendered")
+        shapes[f"kind_{kind}"] = _shape(mitsuba, f"kind_{kind}", mesh, unit + placement.offset, neighbours)
+        edges.append((unit + placement.offset, neighbours))
+    scene = mitsuba.load_dict({"type": "scene", **shapes})
+    return StaticScene(scene, placements, build_edges(edges))
+
+
+def _shape(mitsuba: Any, name: str, mesh: Mesh, vertices: np.ndarray, neighbours: Adjacency) -> Any:
+    source, faces, normals = smooth_normals(vertices, neighbours)
+    textured = mesh.texture_srgb is not None and mesh.uv is not None
+    colored = mesh.vertex_colors_srgb is not None and not textured
+    properties = mitsuba.Properties()
+    properties["bsdf"] = mitsuba.load_dict(_bsdf(mitsuba, mesh, textured, colored))
+    shape = mitsuba.Mesh(
+        name,
+        vertex_count=len(source),
+        face_count=len(faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=textured,
+        props=properties,
+    )
+    if colored:
+        shape.add_attribute("vertex_color", 3, _flat(linear_from_srgb(mesh.vertex_colors_srgb[source])))
+    parameters = mitsuba.traverse(shape)
+    parameters["vertex_positions"] = _flat(vertices[source])
+    parameters["faces"] = np.ascontiguousarray(faces, dtype=np.uint32).ravel()
+    parameters["vertex_normals"] = _flat(normals)
+    if textured:
+        parameters["vertex_texcoords"] = _flat(mesh.uv[source])
+    parameters.update()
+    return shape
+
+
+def _bsdf(mitsuba: Any, mesh: Mesh, textured: bool, colored: bool) -> dict[str, Any]:
+    if textured:
+        linear = mitsuba.Bitmap(np.ascontiguousarray(linear_from_srgb(mesh.texture_srgb)))
+        reflectance: dict[str, Any] = {"type": "bitmap", "bitmap": linear, "raw": True}
+    elif colored:
+        reflectance = {"type": "mesh_attribute", "name": "vertex_color"}
+    else:
+        reflectance = {"type": "rgb", "value": 1.0}
+    return {"type": "diffuse", "reflectance": reflectance}
+
+
+def _flat(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, dtype=np.float32).ravel()
+
+
+def linear_from_srgb(srgb: np.ndarray) -> np.ndarray:
+    """Decode sRGB (IEC 61966-2-1) in [0, 1] to linear light."""
+    srgb = np.asarray(srgb, dtype=np.float32)
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -1,0 +1,102 @@
+"""Which faces meet at which edges, where a surface folds, and the smooth normals between the folds (numpy)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+CREASE_DEG = 30.0
+"""Faces that meet at a larger angle are shaded apart, with a fold in between, as in CAD viewers."""
+
+
+@dataclass(frozen=True)
+class Adjacency:
+    """Edges of a mesh, vertices in the same place taken as one, faces without area left out.
+
+    Attributes:
+        faces: int [f, 3], the faces with area.
+        face_normals: [f, 3], unit length.
+        first: int [e], half-edge (3 · face + corner, from that corner to the next) of one face at each edge.
+        second: int [e], half-edge of another face; meaningless where not ``paired``.
+        paired: bool [e], exactly two faces meet.
+        sign: [e], −1 where the two are wound against each other.
+        cosine: [e], between the two normals (after ``sign``).
+    """
+
+    faces: np.ndarray
+    face_normals: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    paired: np.ndarray
+    sign: np.ndarray
+    cosine: np.ndarray
+
+    @property
+    def crease(self) -> np.ndarray:
+        """bool [e], a fold."""
+        return self.paired & (self.cosine < np.cos(np.radians(CREASE_DEG)))
+
+    @property
+    def closed(self) -> bool:
+        """Whether the surface has an inside: two faces at every edge, wound alike."""
+        return bool(self.paired.all() and (self.sign > 0).all())
+
+
+def adjacency(vertices: np.ndarray, faces: np.ndarray) -> Adjacency:
+    """Find the edges of a mesh given as vertices [v, 3] of about unit size and faces [f, 3]."""
+    faces = np.asarray(faces, dtype=np.int64)
+    _, merged = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
+    corners = np.asarray(vertices, dtype=np.float64)[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normals, axis=1)
+    solid = area > 1e-14
+    faces, normals = faces[solid], normals[solid] / area[solid, None]
+    ends = merged.reshape(-1)[np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)]
+    forward = ends[:, 0] < ends[:, 1]
+    low, high = ends.min(1), ends.max(1)
+    order = np.lexsort((high, low))
+    changes = (np.diff(low[order]) != 0) | (np.diff(high[order]) != 0)
+    start = np.flatnonzero(np.r_[True, changes]) if len(order) else np.zeros(0, dtype=np.int64)
+    paired = np.diff(np.r_[start, len(order)]) == 2
+    first, second = order[start], order[np.minimum(start + 1, len(order) - 1)]
+    sign = np.where(forward[first] == forward[second], -1.0, 1.0)
+    cosine = (normals[first // 3] * normals[second // 3]).sum(1) * sign
+    return Adjacency(faces, normals, first, second, paired, sign, np.clip(cosine, -1, 1))
+
+
+def smooth_normals(vertices: np.ndarray, mesh: Adjacency) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Split vertices at folds and give each piece the angle-weighted mean normal of its faces.
+
+    Returns:
+        source: int [v'], the original vertex of each new one; faces: int [f, 3]; normals: [v', 3], unit length.
+    """
+    num_corners = mesh.faces.size
+    smooth = mesh.paired & ~mesh.crease
+    first, second, same_way = mesh.first[smooth], mesh.second[smooth], mesh.sign[smooth] > 0
+    # A face passes the edge from one corner to its next; a neighbour wound alike passes it the other way round.
+    mate_of_start = np.where(same_way, _next(second), second)
+    mate_of_end = np.where(same_way, second, _next(second))
+    joins = np.r_[first, _next(first)], np.r_[mate_of_start, mate_of_end]
+    graph = coo_matrix((np.ones(len(joins[0]), dtype=np.int8), joins), shape=(num_corners, num_corners))
+    _, piece = connected_components(graph, directed=False)
+    weighted = mesh.face_normals.repeat(3, axis=0) * _corner_angles(vertices, mesh.faces).reshape(-1, 1)
+    sums = np.stack([np.bincount(piece, weights=weighted[:, i]) for i in range(3)], axis=1)
+    pair = np.stack([piece, mesh.faces.ravel()], axis=1)
+    unique, corner = np.unique(pair, axis=0, return_inverse=True)
+    normals = sums[unique[:, 0]]
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.tile([0.0, 0.0, 1.0], (len(normals), 1)), where=length > 1e-12)
+    return unique[:, 1], corner.reshape(-1, 3), normals
+
+
+def _next(half_edge: np.ndarray) -> np.ndarray:
+    return half_edge - half_edge % 3 + (half_edge + 1) % 3
+
+
+def _corner_angles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    corners = np.asarray(vertices, dtype=np.float64)[faces]
+    to_next = np.roll(corners, -1, axis=1) - corners
+    to_last = np.roll(corners, 1, axis=1) - corners
+    cross = np.linalg.norm(np.cross(to_next, to_last), axis=2)
+    return np.arctan2(cross, (to_next * to_last).sum(2))
