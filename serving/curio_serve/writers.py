@@ -124,7 +124,10 @@ class ResultFormat(ABC):
 
 
 class JsonLines(ResultFormat):
-    """One JSON object an image; every key is always there, ``error`` in place of ``detections``."""
+    """One JSON object an image, always with the same keys; ``error`` stands in place of ``detections``.
+
+    What does not apply (the rotation of a flat object, the size of what is no image) is null.
+    """
 
     opening = b'{"image": '
     is_one_line_an_image = True
@@ -271,11 +274,11 @@ def _detection_json(detection: Detection) -> dict[str, object]:
         "object": detection.object,
         "confidence": round(detection.confidence, 6),
         "translation_m": list(detection.translation_m),
-        "rotation": _rows(detection.rotation, 3),
-        "rotation_6d": list(detection.rotation_6d),
-        "quaternion_xyzw": list(detection.quaternion_xyzw),
+        "rotation": _rows(detection.rotation, 3) or None,
+        "rotation_6d": list(detection.rotation_6d) or None,
+        "quaternion_xyzw": list(detection.quaternion_xyzw) or None,
         "color": list(detection.color) or None,
-        "box_px": [[_finite(value) for value in corner] for corner in _rows(detection.box_px, 2)],
+        "box_px": [[_finite(value) for value in corner] for corner in _rows(detection.box_px, 2)] or None,
     }
 
 

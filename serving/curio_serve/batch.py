@@ -1,0 +1,36 @@
+"""Many images through one function: in parallel, answered in order, with a bounded number in flight."""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+# Enough that one slow image does not idle the other threads, few enough that memory does not notice.
+_IN_FLIGHT_A_JOB = 8
+
+
+def in_order(function: Callable[[Item], Answer], items: Iterable[Item], num_jobs: int) -> Iterator[Answer]:
+    """The function's answers in the order of the items.
+
+    Args:
+        function: Called in other threads.
+        items: May be endless; never more than a few beyond the next answer are taken.
+        num_jobs: Threads.
+
+    Raises:
+        Exception: What the function or the iterable raised, where its turn comes.
+    """
+    pool = ThreadPoolExecutor(num_jobs)
+    pending: deque[Future[Answer]] = deque()
+    try:
+        for item in items:
+            pending.append(pool.submit(function, item))
+            if len(pending) >= num_jobs * _IN_FLIGHT_A_JOB:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
