@@ -1,5 +1,7 @@
-"""Layers to pixels: per ray sample, sorted by depth, attenuated by confidence (paper, "Differentiable Rendering with
-Confidence"); with confidence 1 that is exact occlusion."""
+"""Layers to pixels: per ray sample, by depth, attenuated by confidence; with confidence 1 that is exact occlusion.
+
+Paper, section "Differentiable Rendering with Confidence".
+"""
 
 from types import ModuleType
 from typing import Any

@@ -1,4 +1,4 @@
-"""One launch for a batch: rays of all images and slots through the static scene, each hit shaded by the mesh's own BSDF.
+"""One launch for a batch: rays of all images and slots through the static scene, shaded by the mesh's own BSDF.
 
 A *row* is one object in one image (image · num_slots + slot). A *layer* is what one row's rays see: coverage, depth
 along the optical axis in metres, and sRGB colour.

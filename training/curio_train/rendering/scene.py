@@ -1,8 +1,8 @@
 """The static Mitsuba scene: every kind of object once, at unit size, far from the others; built once, traced for ever.
 
 A rigid object seen by a camera is the camera seen from the object, so meshes never move; rays do. Each mesh is moved
-to its bounding sphere's centre, scaled to unit radius and shifted to a place of its own, which keeps float32 at its best
-whatever the object's size.
+to its bounding sphere's centre, scaled to unit radius and shifted to a place of its own, which keeps float32 at its
+best whatever the object's size.
 """
 
 from collections.abc import Sequence
@@ -79,7 +79,7 @@ def build_scene(mitsuba: Any, meshes: Sequence[Mesh]) -> StaticScene:
 
 def _shape(mitsuba: Any, name: str, mesh: Mesh, vertices: np.ndarray, neighbours: Adjacency) -> Any:
     source, faces, normals = smooth_normals(vertices, neighbours)
-    textured = mesh.texture_srgb is not None and mesh.uv is not None
+    textured = mesh.texture is not None and mesh.uv is not None
     colored = mesh.vertex_colors_srgb is not None and not textured
     properties = mitsuba.Properties()
     properties["bsdf"] = mitsuba.load_dict(_bsdf(mitsuba, mesh, textured, colored))
@@ -98,14 +98,16 @@ def _shape(mitsuba: Any, name: str, mesh: Mesh, vertices: np.ndarray, neighbours
     parameters["faces"] = np.ascontiguousarray(faces, dtype=np.uint32).ravel()
     parameters["vertex_normals"] = _flat(normals)
     if textured:
-        parameters["vertex_texcoords"] = _flat(mesh.uv[source])
+        parameters["vertex_texcoords"] = _flat(
+            mesh.uv[source] * [1, -1] + [0, 1]
+        )  # Mitsuba counts v from the upper edge
     parameters.update()
     return shape
 
 
 def _bsdf(mitsuba: Any, mesh: Mesh, textured: bool, colored: bool) -> dict[str, Any]:
     if textured:
-        linear = mitsuba.Bitmap(np.ascontiguousarray(linear_from_srgb(mesh.texture_srgb)))
+        linear = mitsuba.Bitmap(np.ascontiguousarray(linear_from_srgb(mesh.texture / 255.0)))
         reflectance: dict[str, Any] = {"type": "bitmap", "bitmap": linear, "raw": True}
     elif colored:
         reflectance = {"type": "mesh_attribute", "name": "vertex_color"}

@@ -172,7 +172,7 @@ class OutlineSampler:
         )
 
     def _to_camera(self, rows: Rows, row: Any, point: Any) -> Any:
-        """Scene to camera frame: the inverse of p = matrix · q + origin, with matrix = Rᵀ / s, is q = s² matrixᵀ (p − origin)."""
+        """Scene to camera frame: p = matrix · q + origin with matrix = Rᵀ / s, hence q = s² matrixᵀ (p − origin)."""
         mi, dr = self.mi, self.dr
         m = [dr.gather(mi.Float, v, row) for v in rows.matrix]
         d = point - self._origin(rows, row)

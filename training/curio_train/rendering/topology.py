@@ -34,7 +34,7 @@ class Adjacency:
 
     @property
     def crease(self) -> np.ndarray:
-        """bool [e], a fold."""
+        """Where the surface folds, bool [e]."""
         return self.paired & (self.cosine < np.cos(np.radians(CREASE_DEG)))
 
     @property

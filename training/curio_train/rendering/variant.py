@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 
 
 def llvm_version(path: str) -> int | None:
-    """Major version of a libLLVM: from its name, else from ``llvm-config``-like strings in it; None: unknown."""
+    """Major version of a libLLVM by the name of its file; None: unknown."""
     match = re.search(r"libLLVM[-.](?:so\.)?(\d+)", os.path.basename(os.path.realpath(path)))
     return int(match.group(1)) if match else None
 
@@ -78,7 +78,8 @@ def optix_available() -> bool:
 @functools.cache
 def _say_fallback_once() -> None:
     _log.warning(
-        "CUDA is here, but the driver's OptiX library (libnvoptix.so.1) is not: images are rendered on the CPU, networks stay on the GPU."
+        "CUDA is here, but the driver's OptiX library (libnvoptix.so.1) is not: images are rendered on the CPU, networks "
+        "stay on the GPU."
     )
 
 
