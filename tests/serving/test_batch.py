@@ -1,0 +1,50 @@
+"""Parallel, in order, bounded."""
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+from curio_serve.batch import in_order
+
+
+def test_answers_keep_the_order_whoever_is_first() -> None:
+    def slow_at_first(number: int) -> int:
+        time.sleep(0.02 if number % 4 == 0 else 0)
+        return number
+
+    assert list(in_order(slow_at_first, range(50), 4)) == list(range(50))
+
+
+def test_little_more_than_the_next_answer_is_taken() -> None:
+    taken = 0
+
+    def endless() -> Iterator[int]:
+        nonlocal taken
+        while True:
+            taken += 1
+            yield taken
+
+    answers = in_order(lambda number: number, endless(), 2)
+    for expected in range(1, 1001):
+        assert next(answers) == expected
+        assert taken <= expected + 2 * 8
+    answers.close()
+
+
+def test_work_is_done_at_the_same_time() -> None:
+    meeting = threading.Barrier(3, timeout=30)
+    assert sorted(in_order(lambda _: meeting.wait(), range(3), 3)) == [0, 1, 2]
+
+
+def test_what_is_raised_comes_in_its_turn_and_ends_the_rest() -> None:
+    def refuse_five(number: int) -> int:
+        if number == 5:
+            raise KeyError(number)
+        return number
+
+    answers = in_order(refuse_five, range(100), 2)
+    assert [next(answers) for _ in range(5)] == list(range(5))
+    with pytest.raises(KeyError):
+        next(answers)
+    assert threading.active_count() == 1 or not any("ThreadPool" in t.name for t in threading.enumerate())

@@ -1,0 +1,383 @@
+"""``curio-detect`` on a model of this machine: what it writes, what it refuses, what it survives."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from curio_serve.detect_cli import DetectArguments, run
+from curio_serve.errors import CurioError, UsageError
+
+SIZE = (320, 240)
+K = [[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]]
+
+
+def command(*arguments: str | Path) -> list[str]:
+    return [sys.executable, "-c", "from curio_serve.detect_cli import main; main()", *map(str, arguments)]
+
+
+def detect(model: Path, *sources: Path | str, **flags: Any) -> int:
+    """In this process; returns the exit status."""
+    return run(DetectArguments(str(model), tuple(map(str, sources)), **flags))
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+@pytest.fixture
+def frames(tmp_path: Path, spot_image: Callable[..., np.ndarray]) -> Path:
+    """Folder of six frames; the spot of frame n is at (100 + 20 n, 120)."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for number in range(6):
+        pixels = spot_image(*SIZE, 100 + 20 * number, 120, 12, 12, (255, 128, 0))
+        cv2.imwrite(str(folder / f"{number:06d}.png"), pixels[..., ::-1])
+    return folder
+
+
+@pytest.fixture
+def camera(tmp_path: Path) -> Path:
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps({"camera_matrix": K, "width": SIZE[0], "height": SIZE[1]}))
+    return path
+
+
+def test_a_folder_gives_a_line_an_image_in_order(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.jsonl"
+    assert detect(models_dir / "flat", frames, out=out, jobs=3) == 0
+    lines = read(out)
+    assert [line["image"] for line in lines] == [str(frames / f"{n:06d}.png") for n in range(6)]
+    for number, line in enumerate(lines):
+        assert (line["width"], line["height"]) == SIZE
+        assert line["camera_matrix"] is None
+        assert line["model"] == {"name": "flat", "version": 1}
+        (found,) = line["detections"]
+        expected = [(100 + 20 * number - 159.5) / 320, (120 - 119.5) / 320, 0]
+        np.testing.assert_allclose(found["translation_m"], expected, atol=0.003)
+        assert found["rotation"] is None
+        assert line["milliseconds"]["inference"] > 0
+
+
+def test_poses_in_space_use_the_camera_file(models_dir: Path, frames: Path, camera: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.jsonl"
+    assert detect(models_dir / "pinhole", frames, camera=camera, out=out) == 0
+    for number, line in enumerate(read(out)):
+        assert line["camera_matrix"] == K
+        (found,) = line["detections"]
+        x, y, z = found["translation_m"]
+        np.testing.assert_allclose([300 * x / z + 160, 301 * y / z + 119], [100 + 20 * number, 120], atol=0.5)
+        rotation = np.array(found["rotation"])
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+        np.testing.assert_allclose(rotation[:, :2].T.ravel(), found["rotation_6d"], atol=1e-12)
+        assert np.shape(found["box_px"]) == (8, 2)
+        assert len(line["light"]) == 3
+
+
+def test_a_folder_a_version_and_a_file_are_the_same_model(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    found = []
+    for index, model in enumerate(("flat", "flat/1", "flat/1/model.onnx")):
+        out = tmp_path / f"{index}.jsonl"
+        assert detect(models_dir / model, frames, out=out) == 0
+        found.append([line["detections"] for line in read(out)])
+    assert found[0] == found[1] == found[2]
+
+
+def test_confidence_and_count_select(models_dir: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((240, 320, 3), np.uint8))
+    for threshold, count in ((0.0, 1), (0.5, 0)):
+        out = tmp_path / f"{threshold}.jsonl"
+        assert detect(models_dir / "flat", tmp_path / "black.png", out=out, min_confidence=threshold) == 0
+        assert len(read(out)[0]["detections"]) == count
+
+
+def bad_images() -> dict[str, bytes]:
+    """By name, images that are refused; every other kind in the next function is accepted."""
+    jpeg = cv2.imencode(".jpg", np.full((240, 320, 3), 90, np.uint8))[1].tobytes()
+    return {
+        "empty.jpg": b"",
+        "text.png": b"this is not an image",
+        "cut.jpg": jpeg[:300],
+        "tiny.png": cv2.imencode(".png", np.zeros((1, 1, 3), np.uint8))[1].tobytes(),
+    }
+
+
+def good_images() -> dict[str, bytes]:
+    plain = np.full((240, 320, 3), 90, np.uint8)
+    return {
+        "16bit.png": cv2.imencode(".png", plain.astype(np.uint16) * 257)[1].tobytes(),
+        "grey.png": cv2.imencode(".png", plain[..., 0])[1].tobytes(),
+        "alpha.png": cv2.imencode(".png", np.dstack([plain, plain[..., :1]]))[1].tobytes(),
+    }
+
+
+def test_bad_images_get_an_error_line_and_stop_nothing(
+    models_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "mixed"
+    folder.mkdir()
+    for name, data in (bad_images() | good_images()).items():
+        (folder / name).write_bytes(data)
+    out = tmp_path / "out.jsonl"
+    assert detect(models_dir / "flat", folder, out=out) == 1
+    lines = {Path(line["image"]).name: line for line in read(out)}
+    assert set(lines) == {*bad_images(), *good_images()}
+    for name, line in lines.items():
+        assert ("error" in line) == (name in bad_images())
+        assert ("detections" in line) != ("error" in line)
+    told = capsys.readouterr().err
+    assert "4 images have no answer" in told
+    assert all(name in told for name in bad_images())
+    assert detect(models_dir / "flat", folder, out=out) == 1  # gone on with nothing to do: still not all right
+
+
+def test_a_camera_of_another_size_is_an_error_of_each_image(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    camera = tmp_path / "camera.json"
+    camera.write_text(json.dumps({"camera_matrix": K, "width": 640, "height": 480}))
+    out = tmp_path / "out.jsonl"
+    assert detect(models_dir / "pinhole", frames, camera=camera, out=out) == 1
+    assert all("640x480" in line["error"] and "320x240" in line["error"] for line in read(out))
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"model": "models/none"}, "no such folder or file, nor HOST:PORT/NAME"),
+        ({"images": ()}, "no images given"),
+        ({"images": ("missing.png",)}, "missing.png: no such file"),
+        ({"model": "pinhole"}, "--camera FILE"),
+        ({"camera": Path("missing.json")}, "--camera: .*missing.json"),
+        ({"jobs": 0}, "--jobs 0"),
+        ({"min_confidence": 1.5}, "--min-confidence 1.5"),
+        ({"max_detections": 0}, "--max-detections 0"),
+        ({"obj_id": 3}, "--format bop"),
+        ({"format": "bop"}, "flat"),
+        ({"overlays": Path("frames")}, "--overlays"),
+        ({"overlays": Path("frames/drawn")}, "--overlays"),
+    ],
+)
+def test_wrong_calls_are_refused_before_anything_is_written(
+    changes: dict[str, Any], told: str, models_dir: Path, frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "flat").symlink_to(models_dir / "flat")
+    (tmp_path / "pinhole").symlink_to(models_dir / "pinhole")
+    call = {"model": "flat", "images": ("frames",), "out": Path("out"), **changes}
+    with pytest.raises(UsageError, match=told):
+        run(DetectArguments(**call))
+    assert not (tmp_path / "out").exists()
+    assert len(list(frames.iterdir())) == 6
+
+
+def test_a_folder_without_images_is_no_success(models_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UsageError, match=r"no images in .*empty"):
+        detect(models_dir / "flat", tmp_path / "empty", out=tmp_path / "out.jsonl")
+
+
+def test_a_folder_that_is_no_model_is_named(models_dir: Path, frames: Path) -> None:
+    with pytest.raises(CurioError, match="no model in"):
+        detect(models_dir, frames)
+
+
+def test_overlays_mirror_the_images_and_leave_them_alone(
+    models_dir: Path, frames: Path, camera: Path, tmp_path: Path
+) -> None:
+    (frames / "below").mkdir()
+    first = frames / "000000.png"
+    (frames / "below" / "000000.png").write_bytes(first.read_bytes())
+    before = first.read_bytes()
+    drawn = tmp_path / "drawn"
+    assert detect(models_dir / "pinhole", frames, camera=camera, out=tmp_path / "out", overlays=drawn) == 0
+    found = sorted(str(path.relative_to(drawn)) for path in drawn.rglob("*") if path.is_file())
+    assert found == sorted(str(path.relative_to(frames)) for path in frames.rglob("*") if path.is_file())
+    assert first.read_bytes() == before
+    picture = cv2.imread(str(drawn / "000000.png"))
+    assert picture.shape == (240, 320, 3)
+    assert (picture != cv2.imread(str(first))).any(axis=2).sum() > 200
+
+
+def test_bop_scenes_take_k_by_image_number_and_give_bop_results(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "test" / "000007"
+    scene.mkdir(parents=True)
+    frames.rename(scene / "rgb")
+    cameras = {str(n): {"cam_K": [300 + n, 0, 160, 0, 301, 119, 0, 0, 1], "depth_scale": 1} for n in range(6)}
+    (scene / "scene_camera.json").write_text(json.dumps(cameras))
+    flags = {"camera": scene / "scene_camera.json"}
+    lines, results = tmp_path / "out.jsonl", tmp_path / "out.csv"
+    assert detect(models_dir / "pinhole", tmp_path / "test", out=lines, **flags) == 0
+    assert [line["camera_matrix"][0][0] for line in read(lines)] == [300 + n for n in range(6)]
+    assert detect(models_dir / "pinhole", tmp_path / "test", out=results, format="bop", obj_id=4, **flags) == 0
+    with results.open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
+    for number, (row, line) in enumerate(zip(rows, read(lines), strict=True)):
+        assert (row["scene_id"], row["im_id"], row["obj_id"]) == ("7", str(number), "4")
+        (found,) = line["detections"]
+        np.testing.assert_allclose(
+            np.array(row["t"].split(), float), 1000 * np.array(found["translation_m"]), rtol=1e-6
+        )
+        np.testing.assert_allclose(np.array(row["R"].split(), float), np.ravel(found["rotation"]), atol=1e-6)
+
+
+def with_exif_orientation(jpeg: bytes, orientation: int) -> bytes:
+    """The same file with an EXIF segment that has that one entry."""
+    tiff = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0" + bytes([orientation, 0, 0, 0]) + b"\0\0\0\0"
+    segment = b"Exif\0\0" + tiff
+    return jpeg[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + jpeg[2:]
+
+
+def test_exif_rotation_is_ignored_unless_asked_for_and_then_turns_k(
+    models_dir: Path, camera: Path, tmp_path: Path, spot_image: Callable[..., np.ndarray]
+) -> None:
+    pixels = spot_image(*SIZE, 200, 100, 12, 12, (255, 255, 255))
+    stored = cv2.imencode(".jpg", pixels)[1].tobytes()
+    (tmp_path / "turned.jpg").write_bytes(with_exif_orientation(stored, 6))
+    answers = {}
+    for flag in (False, True):
+        out = tmp_path / f"{flag}.jsonl"
+        status = detect(models_dir / "pinhole", tmp_path / "turned.jpg", camera=camera, out=out, exif_rotation=flag)
+        assert status == 0
+        (answers[flag],) = read(out)
+    assert (answers[False]["width"], answers[False]["height"]) == (320, 240)
+    assert (answers[True]["width"], answers[True]["height"]) == (240, 320)
+    assert answers[False]["camera_matrix"] == K
+    assert answers[True]["camera_matrix"] == [[301, 0, 239 - 119], [0, 300, 160], [0, 0, 1]]
+    x, y, z = answers[False]["detections"][0]["translation_m"]
+    # a quarter turn clockwise takes (x, y) to (-y, x)
+    np.testing.assert_allclose(answers[True]["detections"][0]["translation_m"], [-y, x, z], rtol=0.03, atol=0.01)
+
+
+def test_videos_give_a_line_a_frame(models_dir: Path, tmp_path: Path, spot_image: Callable[..., np.ndarray]) -> None:
+    clip = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(clip), cv2.VideoWriter.fourcc(*"MJPG"), 10, SIZE)
+    for number in range(4):
+        writer.write(spot_image(*SIZE, 100 + 20 * number, 120, 12, 12, (255, 255, 255)))
+    writer.release()
+    out, drawn = tmp_path / "out.jsonl", tmp_path / "drawn"
+    assert detect(models_dir / "flat", clip, out=out, overlays=drawn) == 0
+    lines = read(out)
+    assert [line["image"] for line in lines] == [f"{clip}#{n}" for n in range(4)]
+    steps = np.diff([line["detections"][0]["translation_m"][0] for line in lines])
+    np.testing.assert_allclose(steps, 20 / 320, atol=0.005)
+    assert len(list((drawn / "clip.avi").iterdir())) == 4
+
+
+def test_standard_input_and_output(models_dir: Path, frames: Path) -> None:
+    listed = "".join(f"{path}\n" for path in sorted(frames.iterdir(), reverse=True))
+    done = subprocess.run(
+        command(models_dir / "flat", "-"), input=listed, capture_output=True, text=True, check=True, env=os.environ
+    )
+    assert [json.loads(line)["image"] for line in done.stdout.splitlines()] == listed.split()
+    assert "6 images" in done.stderr
+
+
+@pytest.fixture
+def many_frames(frames: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "many"
+    folder.mkdir()
+    for number in range(600):
+        os.link(frames / f"{number % 6:06d}.png", folder / f"{number:04d}.png")
+    return folder
+
+
+def wait_for_lines(out: Path, count: int, process: subprocess.Popen[str]) -> None:
+    while not out.exists() or out.read_bytes().count(b"\n") < count:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
+
+
+def without_times(out: Path) -> list[dict[str, Any]]:
+    lines = read(out)
+    for line in lines:
+        del line["milliseconds"]
+    return lines
+
+
+def test_killed_again_and_again_it_neither_repeats_nor_loses_a_line(
+    models_dir: Path, many_frames: Path, tmp_path: Path
+) -> None:
+    out, whole = tmp_path / "out.jsonl", tmp_path / "whole.jsonl"
+    for count in (1, 100, 250):
+        with subprocess.Popen(
+            command(models_dir / "flat", many_frames, "--out", out), stderr=subprocess.PIPE, text=True
+        ) as p:
+            wait_for_lines(out, count, p)
+            p.kill()
+        assert count <= out.read_bytes().count(b"\n") < 600
+    subprocess.run(command(models_dir / "flat", many_frames, "--out", out), check=True, capture_output=True)
+    assert detect(models_dir / "flat", many_frames, out=whole) == 0
+    assert len(without_times(out)) == 600
+    assert without_times(out) == without_times(whole)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_it_says_how_to_go_on(
+    number: int, status: int, models_dir: Path, many_frames: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.jsonl"
+    arguments = command(models_dir / "flat", many_frames, "--out", out)
+    with subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True) as process:
+        wait_for_lines(out, 20, process)
+        process.send_signal(number)
+        told = process.communicate()[1]
+    assert process.returncode == status
+    assert "Traceback" not in told
+    assert f"--out {out}" in told
+    assert out.read_bytes().endswith(b"\n")
+    subprocess.run(arguments, check=True, capture_output=True)
+    assert len(read(out)) == 600
+
+
+def test_a_reader_that_leaves_is_no_traceback(models_dir: Path, many_frames: Path) -> None:
+    with subprocess.Popen(
+        command(models_dir / "flat", many_frames), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.readline()
+        process.stdout.close()
+        told = process.stderr.read()
+    assert process.returncode == 1
+    assert told == ""
+
+
+def test_it_runs_where_the_training_stack_cannot_be_imported(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    for name in ("torch", "mitsuba", "drjit", "onnx", "trimesh", "curio_train"):
+        (tmp_path / f"{name}.py").write_text("raise ImportError(__name__)")
+    done = subprocess.run(
+        command(models_dir / "flat", frames),
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    assert len(done.stdout.splitlines()) == 6
+
+
+def test_help_imports_nothing_heavy() -> None:
+    program = "import sys, curio_serve.detect_cli; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"numpy", "cv2", "onnxruntime", "scipy", "grpc", "google.protobuf"} & set(loaded)
+
+
+def test_errors_are_one_clear_line_and_the_right_status(models_dir: Path, frames: Path) -> None:
+    for arguments, status in (
+        (["none", str(frames)], 2),
+        ([str(models_dir), str(frames)], 1),
+        ([str(models_dir / "flat"), str(frames), "--out", "/proc/none/out.jsonl"], 1),
+    ):
+        done = subprocess.run(command(*arguments), capture_output=True, text=True)
+        assert done.returncode == status
+        assert done.stderr.startswith("curio-detect: error: ")
+        assert done.stderr.count("\n") == 1
+        assert done.stdout == ""
