@@ -68,7 +68,7 @@ def diameter(points: np.ndarray) -> float:
 
 
 def _long_distance(points: np.ndarray) -> float:
-    """A distance that occurs, usually the diameter: from one point to the farthest, from there on to its farthest, and on."""
+    """A distance that occurs, usually the diameter: to the farthest point, from there to its farthest, and on."""
     found, start = 0.0, points[np.linalg.norm(points, axis=1).argmax()]
     for _ in range(8):
         distance = np.linalg.norm(points - start, axis=1)

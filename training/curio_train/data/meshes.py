@@ -152,7 +152,7 @@ def _check_size(path: Path, mesh: Mesh, unit: str, *, given: bool) -> None:
     source = f"--mesh-unit {unit}" if given else f"read as {unit}; the file names no other unit"
     remedy = f"set --mesh-unit to {' or '.join(fitting)}" if fitting else "rescale the mesh"
     raise MeshError(
-        f"{path}: found a diameter of {found} ({source}), expected {SMALLEST_M * 1000:g} mm to {LARGEST_M:g} m; {remedy}"
+        f"{path}: found a diameter of {found} ({source}), expected {SMALLEST_M:g} to {LARGEST_M:g} m; {remedy}"
     )
 
 
