@@ -1,0 +1,186 @@
+"""The server's settings, and where they may come from: flags, environment, TOML file, defaults, in this order."""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from curio_serve.errors import UsageError
+
+ENV_PREFIX = "CURIO_SERVE_"
+
+
+@dataclass(frozen=True)
+class ServeConfig:
+    """Serve exported models over gRPC.
+
+    Every flag is also an environment variable (--max-pixels is CURIO_SERVE_MAX_PIXELS) and a key of the --config file
+    (max_pixels). Flags win over the environment, the environment over the file.
+    """
+
+    models: Annotated[Path, tyro.conf.Positional] = Path("models")
+    """Folder of models: <name>/<version>/model.onnx, as curio-export writes it."""
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 for all interfaces."""
+    port: int = 8500
+    """Port for gRPC; 0 takes a free one and prints it."""
+    metrics_port: int | None = None
+    """Port for Prometheus over HTTP at /metrics; 0 takes a free one; none: off."""
+    workers: int = 0
+    """Frames worked on at the same time, one thread each; 0: as many as there are cores."""
+    queue: int = 64
+    """Requests that may wait for a worker; more are answered RESOURCE_EXHAUSTED."""
+    max_streams: int = 256
+    """Open DetectStream calls."""
+    max_message_mb: int = 32
+    """Largest request, in MiB."""
+    max_pixels: int = 1 << 25
+    """Most pixels of an image; checked before it is decoded."""
+    max_regions: int = 64
+    """Most regions of interest in a request."""
+    max_models: int = 16
+    """Most models named in a request."""
+    min_confidence: float = 0.0
+    """Least confidence of a detection where a request says none; 0 to 1."""
+    full_decode: bool = False
+    """Decode JPEGs at full size even where the model needs fewer pixels (slower)."""
+    versions: int = 2
+    """Newest versions of each model kept loaded."""
+    refresh_s: float = 5.0
+    """Seconds between looks for new model versions; 0: never."""
+    providers: tuple[str, ...] = ("CPUExecutionProvider",)
+    """onnxruntime's execution providers, in order of preference."""
+    tls_certificate: Path | None = None
+    """Server certificate chain, PEM; with --tls-key turns TLS on."""
+    tls_key: Path | None = None
+    """Key of the certificate, PEM."""
+    client_ca: Path | None = None
+    """Authority whose certificates clients must show (mutual TLS), PEM."""
+    token_file: Path | None = None
+    """File of accepted bearer tokens, one a line; health checks need none."""
+    grace_s: float = 30.0
+    """Seconds that accepted requests may take to finish after SIGTERM."""
+    log_level: str = "info"
+    """debug, info, warning or error."""
+    config: Path | None = None
+    """TOML file with these settings."""
+    dump_config: bool = False
+    """Print the settings in effect as TOML and stop."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that no server can have.
+
+        Raises:
+            UsageError: Names the flag.
+        """
+        least = {
+            "port": 0, "workers": 0, "queue": 0, "max_streams": 0, "max_message_mb": 1, "max_pixels": 256,
+            "max_regions": 1, "max_models": 1, "versions": 1, "refresh_s": 0, "grace_s": 0,
+        }  # fmt: skip
+        for name, smallest in least.items():
+            if not getattr(self, name) >= smallest:
+                raise UsageError(f"--{_flag(name)} is {getattr(self, name)}; expected at least {smallest}")
+        for name in ("port", "metrics_port"):
+            if not 0 <= (getattr(self, name) or 0) <= 65535:
+                raise UsageError(f"--{_flag(name)} is {getattr(self, name)}; expected 0 to 65535")
+        if not 0 <= self.min_confidence <= 1:
+            raise UsageError(f"--min-confidence is {self.min_confidence}; expected 0 to 1")
+        if self.max_message_mb > 1024:
+            raise UsageError(f"--max-message-mb is {self.max_message_mb}; expected at most 1024")
+        if self.log_level not in ("debug", "info", "warning", "error"):
+            raise UsageError(f"--log-level is {self.log_level!r}; expected debug, info, warning or error")
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise UsageError("--tls-certificate and --tls-key come together; give both or neither")
+        if self.client_ca is not None and self.tls_certificate is None:
+            raise UsageError(
+                "--client-ca needs --tls-certificate and --tls-key: clients show certificates over TLS only"
+            )
+
+
+def read_config(arguments: list[str], environment: Mapping[str, str]) -> ServeConfig:
+    """Settings from all sources.
+
+    Args:
+        arguments: Of the command line, without its name.
+        environment: Variables.
+
+    Raises:
+        UsageError: Names the setting, and the file or variable it came from.
+        SystemExit: tyro has printed a usage error (2) or the help (0).
+    """
+    # A first reading of the flags alone, because one of them names the file.
+    flags = _parse(arguments, ServeConfig())
+    named = flags.config or environment.get(f"{ENV_PREFIX}CONFIG")
+    config = ServeConfig()
+    if named:
+        config = _parse(_file_arguments(Path(named)), config, f"(settings in {named})")
+    config = _parse(_environment_arguments(environment), config, f"(variables {ENV_PREFIX}...)")
+    return _parse(arguments, config)
+
+
+def _parse(arguments: list[str], default: ServeConfig, source: str = "") -> ServeConfig:
+    return tyro.cli(ServeConfig, args=arguments, default=default, prog=f"curio-serve {source}".strip())
+
+
+def _flag(name: str) -> str:
+    return name.replace("_", "-")
+
+
+def _file_arguments(path: Path) -> list[str]:
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as exc:
+        raise UsageError(f"--config {path} cannot be read: {exc}") from exc
+    except tomllib.TOMLDecodeError as exc:
+        raise UsageError(f"--config {path} is not TOML: {exc}") from exc
+    known = {field.name for field in fields(ServeConfig)} - {"config", "dump_config"}
+    if unknown := content.keys() - known:
+        raise UsageError(f"--config {path} has unknown keys {sorted(unknown)}; known are {sorted(known)}")
+    return [argument for name, value in content.items() for argument in _arguments(name, value, str(path))]
+
+
+def _environment_arguments(environment: Mapping[str, str]) -> list[str]:
+    known = {field.name: str(field.type) for field in fields(ServeConfig)}
+    arguments = []
+    for variable, text in environment.items():
+        name = variable.removeprefix(ENV_PREFIX).lower()
+        if not variable.startswith(ENV_PREFIX) or name in ("config", "dump_config"):
+            continue
+        if name not in known:
+            raise UsageError(f"environment variable {variable} is no setting; known are {sorted(known)}")
+        value: Any = text
+        if isinstance(getattr(ServeConfig, name), bool):
+            if text.lower() not in ("true", "false", "1", "0"):
+                raise UsageError(f"{variable} is {text!r}; expected true or false")
+            value = text.lower() in ("true", "1")
+        elif isinstance(getattr(ServeConfig, name), tuple):
+            value = text.split(",")
+        arguments += _arguments(name, value, variable)
+    return arguments
+
+
+def _arguments(name: str, value: Any, source: str) -> list[str]:
+    """One setting as command line arguments, so that one parser checks all sources."""
+    if isinstance(value, bool):
+        return [f"--{_flag(name)}" if value else f"--no-{_flag(name)}"]
+    if isinstance(value, dict):
+        raise UsageError(f"{source}: {name} is a table; expected a value")
+    if isinstance(value, list):
+        return [f"--{_flag(name)}", *map(str, value)]
+    return [str(value)] if name == "models" else [f"--{_flag(name)}={value}"]
+
+
+def to_toml(config: ServeConfig) -> str:
+    """The settings as a file that --config takes; those that are off are left out."""
+    values = {field.name: getattr(config, field.name) for field in fields(config)}
+    lines = (
+        # JSON's strings, numbers, booleans and lists are TOML's.
+        f"{name} = {json.dumps(str(value) if isinstance(value, Path) else value, ensure_ascii=False)}"
+        for name, value in values.items()
+        if value is not None and name not in ("config", "dump_config")
+    )
+    return "\n".join(lines) + "\n"

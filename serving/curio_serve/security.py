@@ -1,0 +1,77 @@
+"""Who may call: TLS, client certificates, bearer tokens."""
+
+import hmac
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import grpc
+from grpc_health.v1 import health
+
+from curio_serve.config import ServeConfig
+from curio_serve.errors import TokenError, UsageError
+from curio_serve.wire import status_from_error
+
+_HEALTH_PREFIX = f"/{health.SERVICE_NAME}/"
+
+
+class TokenInterceptor(grpc.aio.ServerInterceptor):
+    """Lets calls pass that show a known bearer token, and health checks."""
+
+    def __init__(self, tokens: list[bytes]) -> None:
+        self._tokens = tokens
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], "Awaitable[grpc.RpcMethodHandler[Any, Any] | None]"],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> "grpc.RpcMethodHandler[Any, Any] | None":
+        shown = dict(handler_call_details.invocation_metadata).get("authorization", "")
+        if handler_call_details.method.startswith(_HEALTH_PREFIX) or self._knows(shown):
+            return await continuation(handler_call_details)
+        return grpc.stream_stream_rpc_method_handler(_refuse_token)
+
+    def _knows(self, shown: str | bytes) -> bool:
+        text = shown.encode() if isinstance(shown, str) else shown
+        token = text.removeprefix(b"Bearer ")
+        # Every token is compared, in constant time, so that timing tells nothing.
+        matches = [hmac.compare_digest(token, known) for known in self._tokens]
+        return token != text and any(matches)
+
+
+async def _refuse_token(_requests: AsyncIterator[bytes], context: grpc.aio.ServicerContext) -> None:
+    error = TokenError("bearer token missing or unknown; send the metadata `authorization: Bearer <token>`")
+    status = status_from_error(error)
+    await context.abort(status.code, status.details, status.trailing_metadata)
+
+
+def server_credentials(config: ServeConfig) -> grpc.ServerCredentials | None:
+    """TLS as configured, or None.
+
+    Raises:
+        UsageError: A file cannot be read.
+    """
+    if config.tls_certificate is None or config.tls_key is None:
+        return None
+    pair = (_read(config.tls_key, "--tls-key"), _read(config.tls_certificate, "--tls-certificate"))
+    authority = _read(config.client_ca, "--client-ca") if config.client_ca else None
+    return grpc.ssl_server_credentials([pair], authority, require_client_auth=authority is not None)
+
+
+def read_tokens(path: Path) -> list[bytes]:
+    """Accepted bearer tokens, one a line.
+
+    Raises:
+        UsageError: The file cannot be read or holds none.
+    """
+    tokens = [line.strip() for line in _read(path, "--token-file").splitlines() if line.strip()]
+    if not tokens:
+        raise UsageError(f"--token-file {path} holds no token; expected one a line")
+    return tokens
+
+
+def _read(path: Path, flag: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as exc:
+        raise UsageError(f"{flag} {path} cannot be read: {exc.strerror}") from exc

@@ -1,0 +1,45 @@
+"""The command ``curio-serve``."""
+
+import asyncio
+import os
+import sys
+
+from curio_serve.config import ServeConfig, read_config, to_toml
+from curio_serve.errors import CurioError
+
+
+def main() -> None:
+    """Serve the models of a folder until SIGTERM or Ctrl-C."""
+    try:
+        config = read_config(sys.argv[1:], os.environ)
+        if config.dump_config:
+            print(to_toml(config), end="")
+            return
+        status = asyncio.run(_serve(config))
+    except CurioError as exc:
+        print(f"curio-serve: {exc}", file=sys.stderr)
+        sys.exit(exc.exit_status)
+    except KeyboardInterrupt:
+        # Before the server has taken the signal over there is nothing to drain.
+        sys.exit(130)
+    sys.exit(status)
+
+
+async def _serve(config: ServeConfig) -> int:
+    # gRPC's own stderr lines say again, and less clearly, what our messages say.
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")
+    # Imported here, so that --help need not wait for gRPC and OpenCV.
+    from curio_serve.server import PoseServer
+    from curio_serve.telemetry import start_logging
+
+    lines = start_logging(config.log_level)
+    try:
+        server = PoseServer(config)
+        address, *metrics = await server.start()
+        print(f"listening on {address}", flush=True)
+        for url in metrics:
+            print(f"metrics on {url}", flush=True)
+        await server.serve_until_stopped()
+    finally:
+        lines.stop()
+    return 0

@@ -1,0 +1,192 @@
+"""The server's life: open the port, load the models, watch for new ones, drain, leave."""
+
+import asyncio
+import contextlib
+import logging
+import signal
+import socket
+
+import grpc
+from curio_proto.inference import inference_pb2
+from curio_proto.inference.inference_pb2_grpc import add_GRPCInferenceServiceServicer_to_server
+from curio_proto.v1 import detector_pb2
+from curio_proto.v1.detector_pb2_grpc import add_PoseDetectorServicer_to_server
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+from prometheus_client import CollectorRegistry, start_http_server
+
+from curio_serve.admission import WorkQueue, num_cores
+from curio_serve.config import ServeConfig
+from curio_serve.errors import ModelError, Unavailable
+from curio_serve.inference_protocol import InferenceService
+from curio_serve.model_check import ChildCheck
+from curio_serve.repository import Change, Repository
+from curio_serve.security import TokenInterceptor, read_tokens, server_credentials
+from curio_serve.service import Limits, PoseService
+from curio_serve.telemetry import Metrics, log
+
+_POSE = detector_pb2.DESCRIPTOR.services_by_name["PoseDetector"].full_name
+_INFERENCE = inference_pb2.DESCRIPTOR.services_by_name["GRPCInferenceService"].full_name
+_SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
+
+
+class PoseServer:
+    """One server process. Use from within one event loop: :meth:`start`, then :meth:`serve_until_stopped`."""
+
+    def __init__(self, config: ServeConfig) -> None:
+        self.config = config
+        registry = CollectorRegistry()
+        self._registry = registry
+        self._metrics = Metrics(registry)
+        self._repository = Repository(config.models, config.versions, config.providers)
+        self._work = WorkQueue(config.workers or num_cores(), config.queue, self._metrics)
+        self._health = health.aio.HealthServicer()
+        self._inference = InferenceService(self._repository, self._work, self._metrics)
+        self._check = ChildCheck()
+        self._server: grpc.aio.Server | None = None
+        self._stopped = asyncio.Event()
+
+    async def start(self) -> list[str]:
+        """Load the models and open the ports.
+
+        Returns:
+            The addresses that answer: gRPC's, and the metrics' URL where they are on.
+
+        Raises:
+            ModelError: No model can be loaded.
+            Unavailable: A port is taken.
+            UsageError: A certificate, key or token file cannot be used.
+        """
+        self._report(await asyncio.to_thread(self._repository.refresh))
+        if not list(self._repository):
+            raise ModelError(
+                f"no model could be loaded from {self.config.models}; the log says why each was refused. "
+                "Export one with curio-export"
+            )
+        self._server = self._build()
+        addresses = [self._open_port(self._server)]
+        if self.config.metrics_port is not None:
+            addresses.append(self._open_metrics(self.config.metrics_port))
+        await self._server.start()
+        await self._announce()
+        return addresses
+
+    def _build(self) -> grpc.aio.Server:
+        interceptors = [TokenInterceptor(read_tokens(self.config.token_file))] if self.config.token_file else []
+        server = grpc.aio.server(interceptors=interceptors, options=channel_options(self.config))
+        config = self.config
+        limits = Limits(
+            config.max_pixels,
+            config.max_regions,
+            config.max_models,
+            config.max_streams,
+            config.min_confidence,
+            config.full_decode,
+        )
+        add_PoseDetectorServicer_to_server(PoseService(self._repository, self._work, limits, self._metrics), server)
+        add_GRPCInferenceServiceServicer_to_server(self._inference, server)
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, server)
+        reflection.enable_server_reflection([_POSE, _INFERENCE, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
+        return server
+
+    def _open_port(self, server: grpc.aio.Server) -> str:
+        host, port = self.config.host, self.config.port
+        address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        credentials = server_credentials(self.config)
+        try:
+            bound = server.add_secure_port(address, credentials) if credentials else server.add_insecure_port(address)
+        except RuntimeError as exc:
+            raise Unavailable(f"cannot listen on {address}: {_why_not(host, port)}; choose another --port") from exc
+        return f"{address.rsplit(':', 1)[0]}:{bound}"
+
+    def _open_metrics(self, port: int) -> str:
+        try:
+            http, _thread = start_http_server(port, addr=self.config.host, registry=self._registry)
+        except OSError as exc:
+            raise Unavailable(
+                f"cannot serve metrics on port {port}: {exc.strerror}; choose another --metrics-port"
+            ) from exc
+        return f"http://{self.config.host}:{http.server_port}/metrics"
+
+    async def _announce(self) -> None:
+        """Health of the whole and of each service and model."""
+        names = [name for name, _ in self._repository]
+        for name in ("", _POSE, _INFERENCE, *names):
+            await self._health.set(name, _SERVING)
+
+    async def serve_until_stopped(self) -> None:
+        """Answer calls until SIGTERM, SIGINT or :meth:`stop`; then finish what was accepted."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self.stop)
+        watcher = asyncio.create_task(self._watch())
+        try:
+            await self._stopped.wait()
+        finally:
+            watcher.cancel()
+            self._check.stop()
+            await self._drain()
+
+    def stop(self) -> None:
+        """Begin to drain."""
+        self._stopped.set()
+
+    async def _drain(self) -> None:
+        if self._server is None:
+            return
+        log(logging.INFO, "draining", grace_s=self.config.grace_s)
+        self._inference.drain()
+        await self._health.enter_graceful_shutdown()
+        await self._server.stop(self.config.grace_s)
+        self._work.close()
+        log(logging.INFO, "stopped")
+
+    async def _watch(self) -> None:
+        """Pick up new model versions for as long as the server lives."""
+        while self.config.refresh_s:
+            await asyncio.sleep(self.config.refresh_s)
+            before = {name for name, _ in self._repository}
+            try:
+                self._report(await asyncio.to_thread(self._repository.refresh, self._check))
+            except ModelError as exc:
+                log(logging.ERROR, "models folder unreadable; serving what is loaded", reason=str(exc))
+                continue
+            await self._announce()
+            for gone in before - {name for name, _ in self._repository}:
+                await self._health.set(gone, _NOT_SERVING)
+
+    def _report(self, changes: list[Change]) -> None:
+        for change in changes:
+            refused = change.event == "refused"
+            reason = {"reason": change.reason} if refused else {}
+            level = logging.ERROR if refused else logging.INFO
+            log(level, f"model {change.event}", model=change.name, version=change.version, **reason)
+            self._metrics.refused_models.inc(refused)
+        self._metrics.models.set(sum(len(loaded) for _, loaded in self._repository))
+
+
+def channel_options(config: ServeConfig) -> list[tuple[str, int]]:
+    """What gRPC itself shall enforce on every connection."""
+    return [
+        # Two servers on one port would share its calls without a word.
+        ("grpc.so_reuseport", 0),
+        ("grpc.max_receive_message_length", config.max_message_mb << 20),
+        ("grpc.max_send_message_length", 64 << 20),
+        ("grpc.max_metadata_size", 16 << 10),
+        ("grpc.max_concurrent_streams", 128),
+        # Half-open connections are found out; idle clients may ping, but not more often than every 10 s.
+        ("grpc.keepalive_time_ms", 60_000),
+        ("grpc.keepalive_timeout_ms", 20_000),
+        ("grpc.keepalive_permit_without_calls", 1),
+        ("grpc.http2.min_ping_interval_without_data_ms", 10_000),
+    ]
+
+
+def _why_not(host: str, port: int) -> str:
+    """GRPC keeps the operating system's reason to itself, so ask for it."""
+    with contextlib.closing(socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)) as probe:
+        try:
+            probe.bind((host, port))
+        except OSError as exc:
+            return exc.strerror or str(exc)
+    return "the certificate and key may not belong together, or the port was taken for a moment"

@@ -1,0 +1,194 @@
+"""The typed API ``curio.v1.PoseDetector``: translates between messages and the detector, and nothing else."""
+
+import logging
+import time
+import uuid
+from collections.abc import AsyncIterator, Awaitable
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+import grpc
+from curio_proto.v1 import detector_pb2 as messages
+from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer
+
+from curio_serve import image, wire
+from curio_serve.admission import WorkQueue
+from curio_serve.camera import PinholeCamera
+from curio_serve.detector import Detector
+from curio_serve.errors import ArgumentError, CurioError, ImageError, InternalError, Overloaded
+from curio_serve.repository import Repository
+from curio_serve.telemetry import Metrics, log
+
+Context = grpc.aio.ServicerContext
+Answer = TypeVar("Answer")
+_MAX_ID_LENGTH = 128
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a request may ask for. Names are those of the server's settings."""
+
+    max_pixels: int = image.MAX_PIXELS
+    max_regions: int = 64
+    max_models: int = 16
+    max_streams: int = 256
+    min_confidence: float = 0.0
+    full_decode: bool = False
+
+
+class CallGuard:
+    """Runs a call's body, turns its exceptions into statuses, counts and logs it."""
+
+    def __init__(self, metrics: Metrics) -> None:
+        self._metrics = metrics
+
+    async def run(self, method: str, request_id: str, context: Context, body: Awaitable[Answer]) -> Answer:
+        """Await the body; abort the call with the status of what it raises."""
+        code = "UNKNOWN"
+        try:
+            answer = await body
+            code = "OK"
+        except CurioError as exc:
+            status = wire.status_from_error(exc)
+            code = status.code.name
+            level = logging.ERROR if isinstance(exc, InternalError) else logging.INFO
+            log(level, "refused", method=method, request_id=request_id, code=code, reason=str(exc), peer=context.peer())
+            await context.abort(status.code, status.details, status.trailing_metadata)
+        finally:
+            self._metrics.requests.labels(method, code).inc()
+        log(logging.DEBUG, "answered", method=method, request_id=request_id)
+        return answer
+
+
+class PoseService(PoseDetectorServicer):
+    """Answers ``PoseDetector``'s calls on the event loop; frames are worked on by the queue's threads."""
+
+    def __init__(self, repository: Repository, work: WorkQueue, limits: Limits, metrics: Metrics) -> None:
+        self._repository, self._work, self._limits, self._metrics = repository, work, limits, metrics
+        self._guard = CallGuard(metrics)
+        self._num_streams = 0
+        metrics.streams.set_function(lambda: self._num_streams)
+
+    async def Detect(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
+        body = self._detect(request, context, always=False)
+        return await self._guard.run("Detect", request.request_id[:_MAX_ID_LENGTH], context, body)
+
+    async def DetectStream(
+        self, request_iterator: AsyncIterator[messages.DetectRequest], context: Context
+    ) -> AsyncIterator[messages.DetectResponse]:
+        await self._guard.run("DetectStream", "", context, self._open_stream())
+        self._num_streams += 1
+        try:
+            # One frame of a stream at a time: the next is read when this one is answered, so the client feels the load.
+            async for request in request_iterator:
+                body = self._detect(request, context, always=True)
+                yield await self._guard.run("DetectStream.frame", request.request_id[:_MAX_ID_LENGTH], context, body)
+        finally:
+            self._num_streams -= 1
+
+    async def ListModels(self, request: messages.ListModelsRequest, context: Context) -> messages.ListModelsResponse:
+        return await self._guard.run("ListModels", "", context, self._list())
+
+    async def GetModel(self, request: messages.GetModelRequest, context: Context) -> messages.GetModelResponse:
+        return await self._guard.run("GetModel", "", context, self._get(request))
+
+    async def _open_stream(self) -> None:
+        if self._num_streams >= self._limits.max_streams:
+            raise Overloaded(f"{self._num_streams} streams are open, which is the limit (--max-streams)", 1.0)
+
+    async def _list(self) -> messages.ListModelsResponse:
+        answer = messages.ListModelsResponse()
+        for name, loaded in self._repository:
+            spec = loaded[max(loaded)].spec
+            objects = [kind.name for kind in spec.objects]
+            answer.models.add(name=name, versions=sorted(loaded), world=spec.world, objects=objects)
+        return answer
+
+    async def _get(self, request: messages.GetModelRequest) -> messages.GetModelResponse:
+        model = self._repository.get(request.model.name, request.model.version)
+        return messages.GetModelResponse(spec=model.spec, version=model.version)
+
+    async def _detect(
+        self, request: messages.DetectRequest, context: Context, *, always: bool
+    ) -> messages.DetectResponse:
+        self._check(request)
+        detectors = [Detector(self._repository.get(m.name, m.version)) for m in request.models]
+        work = partial(detect_frame, request, detectors, self._limits)
+        answer = await self._work.run(work, context.time_remaining(), always=always)
+        spent = answer.milliseconds
+        self._metrics.queue_s.observe(spent.queue / 1e3)
+        self._metrics.decode_s.observe(spent.decode / 1e3)
+        self._metrics.inference_s.observe(spent.inference / 1e3)
+        return answer
+
+    def _check(self, request: messages.DetectRequest) -> None:
+        """Refuse what can be refused without work."""
+        limits = self._limits
+        if not 1 <= len(request.models) <= limits.max_models:
+            raise ArgumentError(
+                f"models names {len(request.models)} models; expected 1 to {limits.max_models} (--max-models)"
+            )
+        if len(request.regions) > limits.max_regions:
+            raise ArgumentError(
+                f"regions has {len(request.regions)} entries; at most {limits.max_regions} are accepted (--max-regions)"
+            )
+        if len(request.request_id) > _MAX_ID_LENGTH:
+            raise ArgumentError(f"request_id has {len(request.request_id)} characters; at most {_MAX_ID_LENGTH}")
+        if request.HasField("max_detections") and not request.max_detections:
+            raise ArgumentError("max_detections is 0; leave it out for no limit, or give at least 1")
+
+
+def detect_frame(
+    request: messages.DetectRequest, detectors: list[Detector], limits: Limits, waited_s: float
+) -> messages.DetectResponse:
+    """Decode a request's frame and run the models on it. On a worker thread.
+
+    Raises:
+        RequestError: The image, the camera or a region is not acceptable.
+        InternalError: A network failed.
+    """
+    begun = time.perf_counter()
+    camera = wire.camera_from_message(request.camera) if request.HasField("camera") else None
+    frame, camera = _decode(request, camera, detectors, limits)
+    decoded = time.perf_counter()
+    regions = [wire.region_from_message(region) for region in request.regions]
+    answer = messages.DetectResponse(
+        request_id=request.request_id or uuid.uuid4().hex, width=frame.width, height=frame.height
+    )
+    for detector in detectors:
+        answer.results.extend(
+            detector.detect(
+                frame.pixels,
+                camera,
+                regions=regions,
+                min_confidence=request.min_confidence if request.HasField("min_confidence") else limits.min_confidence,
+                max_detections=request.max_detections or None,
+                reduction=frame.reduction,
+            )
+        )
+    answer.milliseconds.queue = waited_s * 1e3
+    answer.milliseconds.decode = (decoded - begun) * 1e3
+    answer.milliseconds.inference = (time.perf_counter() - decoded) * 1e3
+    return answer
+
+
+def _decode(
+    request: messages.DetectRequest, camera: PinholeCamera | None, detectors: list[Detector], limits: Limits
+) -> tuple[image.Frame, PinholeCamera | None]:
+    kind = request.WhichOneof("image")
+    if kind is None:
+        raise ImageError("the request has no image; set encoded (JPEG, PNG, WebP) or raw")
+    if kind == "raw":
+        return wire.frame_from_raw(request.raw, limits.max_pixels), camera
+    header = image.open_header(request.encoded, limits.max_pixels)
+    reductions = [1 if limits.full_decode else d.reduction(camera, header.width, header.height) for d in detectors]
+    frame = image.decode(
+        request.encoded,
+        max_pixels=limits.max_pixels,
+        max_reduction=min(reductions),
+        apply_exif_rotation=request.apply_exif_rotation,
+    )
+    if camera is not None:
+        camera = camera.turned(frame.quarter_turns, header.width, header.height)
+    return frame, camera

@@ -1,0 +1,65 @@
+"""Errors and requests as they travel: exceptions to gRPC status, messages to the detector's arguments."""
+
+import grpc
+import numpy as np
+from curio_proto.v1.detector_pb2 import PIXEL_FORMAT_BGR8, PIXEL_FORMAT_GRAY8, PIXEL_FORMAT_RGB8, RawImage
+from curio_proto.v1.detector_pb2 import Camera as CameraMessage
+from curio_proto.v1.detector_pb2 import Region as RegionMessage
+from google.protobuf.any_pb2 import Any as AnyMessage
+from google.protobuf.duration_pb2 import Duration
+from google.rpc import code_pb2, error_details_pb2, status_pb2
+from grpc_status import rpc_status
+
+from curio_serve.camera import PinholeCamera
+from curio_serve.errors import CameraError, CurioError, ImageError, Overloaded, status_of
+from curio_serve.image import Frame, RawFormat, from_raw
+from curio_serve.view import Region
+
+DOMAIN = "curio-pose"
+_MAX_TEXT = 1000  # headers are limited to 8 KiB
+_RAW_FORMATS: dict[int, RawFormat] = {PIXEL_FORMAT_RGB8: "RGB8", PIXEL_FORMAT_BGR8: "BGR8", PIXEL_FORMAT_GRAY8: "GRAY8"}
+
+
+def status_from_error(error: CurioError) -> grpc.Status:
+    """GRPC status with the exception's name as reason, and when to come back where the queue is full."""
+    name = status_of(error)
+    details = [error_details_pb2.ErrorInfo(reason=type(error).__name__, domain=DOMAIN)]
+    if isinstance(error, Overloaded):
+        delay = Duration()
+        delay.FromNanoseconds(int(error.retry_after_s * 1e9))
+        details.append(error_details_pb2.RetryInfo(retry_delay=delay))
+    packed = []
+    for detail in details:
+        packed.append(AnyMessage())
+        packed[-1].Pack(detail)
+    message = str(error)[:_MAX_TEXT]
+    return rpc_status.to_status(status_pb2.Status(code=code_pb2.Code.Value(name), message=message, details=packed))
+
+
+def camera_from_message(message: CameraMessage) -> PinholeCamera:
+    """Intrinsics of a request.
+
+    Raises:
+        CameraError: Not nine values, or an impossible camera.
+    """
+    values = list(message.camera_matrix)
+    if len(values) != 9:
+        raise CameraError(f"camera.camera_matrix has {len(values)} values; expected 9: K row after row")
+    return PinholeCamera(np.reshape(values, (3, 3)), tuple(message.distortion))
+
+
+def region_from_message(message: RegionMessage) -> Region:
+    """A region of interest of a request."""
+    return Region(message.x, message.y, message.width, message.height)
+
+
+def frame_from_raw(message: RawImage, max_pixels: int) -> Frame:
+    """Pixels of a request that came without an encoding.
+
+    Raises:
+        ImageError: No known format, or size and data do not fit together.
+    """
+    if message.format not in _RAW_FORMATS:
+        raise ImageError(f"raw.format is {message.format}; expected RGB8 (1), BGR8 (2) or GRAY8 (3)")
+    raw_format = _RAW_FORMATS[message.format]
+    return from_raw(message.data, raw_format, message.width, message.height, message.stride, max_pixels=max_pixels)
