@@ -6,7 +6,11 @@ deviation s = f r / z in pixels and the sum 2 pi s² over them, so z = f r sqrt(
 """
 
 import hashlib
-from collections.abc import Callable
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -218,3 +222,57 @@ def models_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_model_folder(root / "flat", make_onnx(False))
     write_model_folder(root / "pinhole", make_onnx(True))
     return root
+
+
+@dataclass
+class RunningServer:
+    """A ``curio-serve`` process.
+
+    Attributes:
+        address: host:port of gRPC.
+        metrics_url: Of Prometheus, where the server was started with it.
+        log: File its log goes to.
+    """
+
+    process: "subprocess.Popen[str]"
+    address: str
+    metrics_url: str
+    log: Path
+
+    def stop(self, number: int = signal.SIGTERM) -> int:
+        """Send a signal and wait for the exit status."""
+        self.process.send_signal(number)
+        return self.process.wait(timeout=60)
+
+
+@pytest.fixture(scope="session")
+def start_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., RunningServer]]:
+    """``start_server(models_dir, *flags)``: a real server on a free port of 127.0.0.1; ended after the tests."""
+    running: list[RunningServer] = []
+
+    def start(models: Path, *flags: str) -> RunningServer:
+        log = tmp_path_factory.mktemp("server") / "log"
+        code = "from curio_serve.serve_cli import main; main()"
+        command = [sys.executable, "-c", code, str(models), "--port", "0", *flags]
+        with log.open("w") as stderr:
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True)
+        assert process.stdout is not None
+        lines = [process.stdout.readline() for _ in range(2 if "--metrics-port" in flags else 1)]
+        if not lines[0].startswith("listening on "):
+            raise RuntimeError(f"the server did not start ({process.wait(timeout=60)}): {log.read_text()}")
+        found = RunningServer(process, lines[0].split()[-1], lines[-1].split()[-1], log)
+        running.append(found)
+        return found
+
+    yield start
+    for server in running:
+        if server.process.poll() is None:
+            server.stop()
+        if server.process.stdout is not None:
+            server.process.stdout.close()
+
+
+@pytest.fixture(scope="session")
+def server(start_server: Callable[..., RunningServer], models_dir: Path) -> RunningServer:
+    """One server with the models of ``models_dir``, shared by the tests that leave it as it is."""
+    return start_server(models_dir, "--metrics-port", "0")
