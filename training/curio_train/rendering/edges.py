@@ -54,9 +54,10 @@ def build_edges(meshes: Sequence[tuple[np.ndarray, Adjacency]]) -> EdgeTable:
             clusters.append((*_bound(table), np.full(len(table) // CLUSTER_SIZE, float(fold))))
         counts.append(sum(len(table) for table in edges[-2:]) // CLUSTER_SIZE)
     flat = np.concatenate(edges).astype(np.float32)
-    bounds = [np.concatenate(parts).astype(np.float32) for parts in zip(*clusters, strict=True)]
-    columns = [np.ascontiguousarray(flat[:, i]) for i in range(4)]
-    return EdgeTable(*columns, *bounds, first_cluster=np.concatenate([[0], np.cumsum(counts)]))
+    center, radius, axis, angle, fold = (np.concatenate(c).astype(np.float32) for c in zip(*clusters, strict=True))
+    start, end, normal_a, normal_b = (np.ascontiguousarray(flat[:, i]) for i in range(4))
+    first = np.concatenate([[0], np.cumsum(counts)])
+    return EdgeTable(start, end, normal_a, normal_b, center, radius, axis, angle, fold, first)
 
 
 def _candidates(vertices: np.ndarray, mesh: Adjacency) -> tuple[np.ndarray, np.ndarray]:

@@ -111,8 +111,8 @@ class Renderer:
         expected = (batch, 3, setting.height, setting.width)
         if tuple(backgrounds.shape) != expected or rotation.shape[1] != setting.num_slots:
             raise RendererError(
-                f"rotations {tuple(rotation.shape)} and backgrounds {tuple(backgrounds.shape)} do not fit a renderer of "
-                f"{setting.num_slots} slots and {setting.width}x{setting.height} pixels"
+                f"rotations {tuple(rotation.shape)} and backgrounds {tuple(backgrounds.shape)} do not fit a renderer "
+                f"of {setting.num_slots} slots and {setting.width}x{setting.height} pixels"
             )
         rows = self._pack(rotation, translation_m, light, color, confidence)
         centers = torch.einsum("bnij,nj->bni", rotation, self._center) + translation_m

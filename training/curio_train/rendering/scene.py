@@ -79,41 +79,38 @@ def build_scene(mitsuba: Any, meshes: Sequence[Mesh]) -> StaticScene:
 
 def _shape(mitsuba: Any, name: str, mesh: Mesh, vertices: np.ndarray, neighbours: Adjacency) -> Any:
     source, faces, normals = smooth_normals(vertices, neighbours)
-    textured = mesh.texture is not None and mesh.uv is not None
-    colored = mesh.vertex_colors_srgb is not None and not textured
+    uv = mesh.uv if mesh.texture is not None else None
+    colors = mesh.vertex_colors_srgb if uv is None else None
     properties = mitsuba.Properties()
-    properties["bsdf"] = mitsuba.load_dict(_bsdf(mitsuba, mesh, textured, colored))
+    properties["bsdf"] = mitsuba.load_dict({"type": "diffuse", "reflectance": _reflectance(mitsuba, mesh)})
     shape = mitsuba.Mesh(
         name,
         vertex_count=len(source),
         face_count=len(faces),
         has_vertex_normals=True,
-        has_vertex_texcoords=textured,
+        has_vertex_texcoords=uv is not None,
         props=properties,
     )
-    if colored:
-        shape.add_attribute("vertex_color", 3, _flat(linear_from_srgb(mesh.vertex_colors_srgb[source])))
+    if colors is not None:
+        shape.add_attribute("vertex_color", 3, _flat(linear_from_srgb(colors[source])))
     parameters = mitsuba.traverse(shape)
     parameters["vertex_positions"] = _flat(vertices[source])
     parameters["faces"] = np.ascontiguousarray(faces, dtype=np.uint32).ravel()
     parameters["vertex_normals"] = _flat(normals)
-    if textured:
-        parameters["vertex_texcoords"] = _flat(
-            mesh.uv[source] * [1, -1] + [0, 1]
-        )  # Mitsuba counts v from the upper edge
+    if uv is not None:
+        # Mitsuba counts v from the upper edge.
+        parameters["vertex_texcoords"] = _flat(uv[source] * [1, -1] + [0, 1])
     parameters.update()
     return shape
 
 
-def _bsdf(mitsuba: Any, mesh: Mesh, textured: bool, colored: bool) -> dict[str, Any]:
-    if textured:
-        linear = mitsuba.Bitmap(np.ascontiguousarray(linear_from_srgb(mesh.texture / 255.0)))
-        reflectance: dict[str, Any] = {"type": "bitmap", "bitmap": linear, "raw": True}
-    elif colored:
-        reflectance = {"type": "mesh_attribute", "name": "vertex_color"}
-    else:
-        reflectance = {"type": "rgb", "value": 1.0}
-    return {"type": "diffuse", "reflectance": reflectance}
+def _reflectance(mitsuba: Any, mesh: Mesh) -> dict[str, Any]:
+    if mesh.texture is not None and mesh.uv is not None:
+        linear = mitsuba.Bitmap(np.ascontiguousarray(linear_from_srgb(mesh.texture.astype(np.float32) / 255)))
+        return {"type": "bitmap", "bitmap": linear, "raw": True}
+    if mesh.vertex_colors_srgb is not None:
+        return {"type": "mesh_attribute", "name": "vertex_color"}
+    return {"type": "rgb", "value": 1.0}
 
 
 def _flat(values: np.ndarray) -> np.ndarray:

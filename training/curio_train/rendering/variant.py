@@ -55,7 +55,8 @@ def check_llvm() -> str:
     )
     if path is None or not (os.path.exists(path) or ctypes.util.find_library(path)):
         raise RendererError(
-            f"No libLLVM was found ({path or 'looked in ' + ', '.join(LIBRARY_FOLDERS)}); rendering on the CPU needs version {OLDEST_LLVM} or newer. {remedy}"
+            f"No libLLVM was found ({path or 'looked in ' + ', '.join(LIBRARY_FOLDERS)}); rendering on the CPU needs "
+            f"version {OLDEST_LLVM} or newer. {remedy}"
         )
     version = llvm_version(path)
     if version is not None and version < OLDEST_LLVM:
@@ -78,8 +79,8 @@ def optix_available() -> bool:
 @functools.cache
 def _say_fallback_once() -> None:
     _log.warning(
-        "CUDA is here, but the driver's OptiX library (libnvoptix.so.1) is not: images are rendered on the CPU, networks "
-        "stay on the GPU."
+        "CUDA is here, but the driver's OptiX library (libnvoptix.so.1) is not: images are rendered on the CPU, "
+        "networks stay on the GPU."
     )
 
 
