@@ -1,0 +1,124 @@
+"""Photographs from files: unlabelled training images and backgrounds.
+
+Damaged files are refused here, with their name, instead of entering training as grey or shifted pixels.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from curio_train.errors import DataError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+
+# 50 megapixels: larger than any camera of this trade, small enough to be decoded without harm.
+LARGEST_PIXELS = 50_000_000
+
+
+def read_photograph(path: Path) -> np.ndarray:
+    """The pixels of an image file, [height, width, 3] uint8 sRGB, as they are stored.
+
+    EXIF rotation is ignored, because K belongs to the stored pixels. Grey becomes three equal channels, CMYK is
+    converted, 16 bits are scaled to 8, and an alpha channel is dropped: what lies beneath it is what is seen.
+
+    Raises:
+        DataError: Missing, empty, truncated, no image, or too large to be decoded with a good conscience.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as exc:
+        raise DataError(f"{path}: the image cannot be read ({exc.strerror})") from exc
+    if not content:
+        raise DataError(f"{path}: the image file is empty (0 bytes)")
+    _check(path)
+    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
+    except cv2.error as exc:
+        raise DataError(f"{path}: the image cannot be decoded ({exc.err})") from exc
+    if pixels is None:
+        raise DataError(f"{path}: the image cannot be decoded; expected a PNG, JPEG, WebP, BMP or TIFF file")
+    return _to_rgb8(path, pixels)
+
+
+def _check(path: Path) -> None:
+    """Refuse large images by their header, then truncated ones.
+
+    Pillow decodes once more for that, because OpenCV fills what is missing with grey and says nothing; Pillow alone
+    would not do either, it cuts 16 bits a channel to 8 in some files and clips them in others.
+    """
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+            if width * height > LARGEST_PIXELS:
+                raise DataError(
+                    f"{path}: found {width}x{height} pixels, expected at most {LARGEST_PIXELS:,}; resize it"
+                )
+            image.load()
+    except Image.DecompressionBombError as exc:
+        raise DataError(f"{path}: found an image too large to decode ({exc}); resize it") from exc
+    except (OSError, ValueError, SyntaxError) as exc:
+        raise DataError(f"{path}: not a complete image ({exc}); expected a PNG, JPEG, WebP, BMP or TIFF file") from exc
+
+
+def _to_rgb8(path: Path, pixels: np.ndarray) -> np.ndarray:
+    if pixels.dtype == np.uint16:
+        pixels = ((pixels.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+    if pixels.dtype != np.uint8:
+        raise DataError(f"{path}: found pixels of type {pixels.dtype}, expected 8 or 16 bits a channel")
+    num_channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    conversion = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}.get(num_channels)
+    if conversion is None:
+        raise DataError(f"{path}: found {num_channels} channels, expected 1, 3 or 4")
+    return cv2.cvtColor(pixels, conversion)
+
+
+class Photographs:
+    """The images of a folder (not of its subfolders), in the order of their names.
+
+    Args:
+        folder: Where they lie.
+
+    Raises:
+        DataError: There is no such folder, or no image in it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise DataError(f"{folder}: there is no such folder; expected one with photographs")
+        self.paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        if not self.paths:
+            raise DataError(f"{folder}: found no images, expected files ending in {' '.join(SUFFIXES)}")
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def random_crop(self, width: int, height: int, rng: np.random.Generator) -> np.ndarray:
+        """A part of a random photograph at random scale, mirrored half of the time: a background.
+
+        Args:
+            width: Of the crop, pixels.
+            height: Of the crop, pixels.
+            rng: Draws the photograph, the place, the scale and the mirroring.
+
+        Returns:
+            [height, width, 3] uint8 sRGB.
+
+        Raises:
+            DataError: The photograph drawn is broken.
+        """
+        photograph = read_photograph(self.paths[rng.integers(len(self.paths))])
+        # The largest region of the crop's shape that fits, shrunk by up to two: no border is ever invented.
+        largest = min(photograph.shape[1] / width, photograph.shape[0] / height)
+        scale = largest * rng.uniform(0.5, 1.0)
+        columns, rows = (max(1, int(size * scale)) for size in (width, height))
+        left = rng.integers(photograph.shape[1] - columns + 1)
+        top = rng.integers(photograph.shape[0] - rows + 1)
+        region = photograph[top : top + rows, left : left + columns]
+        if rng.random() < 0.5:
+            region = region[:, ::-1]
+        shrinking = columns >= width and rows >= height
+        interpolation = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
+        return cv2.resize(np.ascontiguousarray(region), (width, height), interpolation=interpolation)
