@@ -1,0 +1,144 @@
+"""Errors of a 6-DoF pose, one estimate against one truth, by the published formulas.
+
+Poses are cam_from_obj (:class:`~curio_train.geometry.Pose`, metres), points are the model's [num_points, 3] in metres,
+object frame. Every error is 0 for a perfect estimate. Rotation and translation errors always stand beside ADD: a wrong
+diameter or unit makes ADD look good when nothing is.
+
+Hinterstoisser et al. 2012, "Model based training, detection and pose estimation of texture-less 3D objects …" (ADD,
+ADD-S); Brachmann et al. 2016, "Uncertainty-driven 6D pose estimation" (projection error); Hodan et al. 2020, "BOP
+Challenge 2020 on 6D Object Localization" (MSSD, MSPD, discretised symmetries).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from curio_train.data.bop import ModelInfo
+from curio_train.geometry import Pose, rotation_angle_deg
+
+ADD_THRESHOLD = 0.1
+"""A pose counts as found where ADD is below this share of the diameter."""
+
+
+def transform(pose: Pose, points: np.ndarray) -> np.ndarray:
+    """The points in the camera frame."""
+    return points @ pose.rotation.T + pose.translation_m
+
+
+def rotation_error_deg(estimate: Pose, truth: Pose) -> float:
+    """Angle between the two rotations, in [0, 180]."""
+    return float(rotation_angle_deg(torch.as_tensor(estimate.rotation), torch.as_tensor(truth.rotation)))
+
+
+def translation_error_m(estimate: Pose, truth: Pose) -> float:
+    """Distance of the two origins."""
+    return float(np.linalg.norm(estimate.translation_m - truth.translation_m))
+
+
+def add_m(estimate: Pose, truth: Pose, points: np.ndarray) -> float:
+    """ADD: mean distance of each model point under the two poses (Hinterstoisser et al. 2012)."""
+    return float(np.linalg.norm(transform(estimate, points) - transform(truth, points), axis=1).mean())
+
+
+def add_s_m(estimate: Pose, truth: Pose, points: np.ndarray) -> float:
+    """ADD-S: mean distance from each true point to the closest estimated one (Hinterstoisser et al. 2012)."""
+    distances, _ = KDTree(transform(estimate, points)).query(transform(truth, points))
+    return float(np.mean(distances))
+
+
+def add_or_add_s_m(estimate: Pose, truth: Pose, points: np.ndarray, info: ModelInfo) -> float:
+    """ADD, or ADD-S where the object has a symmetry: what LineMOD tables report as ADD(-S)."""
+    return (add_s_m if info.is_symmetric else add_m)(estimate, truth, points)
+
+
+def symmetry_poses(info: ModelInfo, max_step: float = 0.01) -> list[Pose]:
+    """All poses of the object that look like the first, the identity; continuous symmetries in steps.
+
+    Args:
+        info: Discrete and continuous symmetries of the object.
+        max_step: The point farthest from a continuous axis moves at most by this share of the diameter a step, which
+            is BOP's choice: 315 steps for the default.
+    """
+    discrete = [Pose(np.eye(3), np.zeros(3))] + [Pose(s[:3, :3], s[:3, 3]) for s in info.symmetries]
+    continuous = [
+        turn for axis, point in info.symmetry_axes for turn in _turns(axis, point, int(np.ceil(np.pi / max_step)))
+    ]
+    turns = continuous or [Pose(np.eye(3), np.zeros(3))]
+    return [
+        Pose(turn.rotation @ pose.rotation, turn.rotation @ pose.translation_m + turn.translation_m)
+        for pose in discrete
+        for turn in turns
+    ]
+
+
+def _turns(axis: np.ndarray, point: np.ndarray, num_steps: int) -> list[Pose]:
+    """Rotations about a line, the identity first."""
+    angles = np.arange(num_steps) * 2 * np.pi / num_steps
+    rotations = Rotation.from_rotvec(angles[:, None] * (axis / np.linalg.norm(axis))).as_matrix()
+    return [Pose(rotation, point - rotation @ point) for rotation in rotations]
+
+
+def mssd_m(estimate: Pose, truth: Pose, points: np.ndarray, symmetries: Sequence[Pose]) -> float:
+    """Maximum symmetry-aware surface distance (BOP Challenge 2020).
+
+    Args:
+        estimate: The pose to judge.
+        truth: The true one.
+        points: Of the evaluation model.
+        symmetries: From :func:`symmetry_poses`.
+    """
+    estimated = transform(estimate, points)
+    same = (transform(truth, transform(symmetry, points)) for symmetry in symmetries)
+    return float(min(np.linalg.norm(estimated - points_of, axis=1).max() for points_of in same))
+
+
+def mspd_px(estimate: Pose, truth: Pose, points: np.ndarray, symmetries: Sequence[Pose], matrix: np.ndarray) -> float:
+    """Maximum symmetry-aware projection distance (BOP Challenge 2020), pixels of the image of K."""
+    estimated = project(transform(estimate, points), matrix)
+    same = (project(transform(truth, transform(symmetry, points)), matrix) for symmetry in symmetries)
+    return float(min(np.linalg.norm(estimated - pixels, axis=1).max() for pixels in same))
+
+
+def projection_error_px(estimate: Pose, truth: Pose, points: np.ndarray, matrix: np.ndarray) -> float:
+    """Mean distance of the projected model points (Brachmann et al. 2016), pixels."""
+    offsets = project(transform(estimate, points), matrix) - project(transform(truth, points), matrix)
+    return float(np.linalg.norm(offsets, axis=1).mean())
+
+
+def project(points_in_camera: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Pixels [n, 2] of points [n, 3]. The estimate may be anywhere: behind the camera the result is infinite."""
+    homogeneous = points_in_camera @ matrix.T
+    ahead = homogeneous[:, 2:] > 0
+    return np.where(ahead, homogeneous[:, :2] / np.where(ahead, homogeneous[:, 2:], 1), np.inf)
+
+
+def recall(errors: Sequence[float], threshold: float) -> float:
+    """Share of the errors below the threshold, in [0, 1]. A missing estimate enters as infinity.
+
+    Raises:
+        ValueError: There is nothing to judge.
+    """
+    if len(errors) == 0:
+        raise ValueError("recall of no estimates: there must be at least one target")
+    return float((np.asarray(errors) < threshold).mean())
+
+
+def bootstrap_interval(
+    values: Sequence[float], seed: int = 0, level: float = 0.95, num_resamples: int = 2000
+) -> tuple[float, float]:
+    """Percentile bootstrap interval of the mean of ``values`` (for a recall: of zeros and ones).
+
+    Raises:
+        ValueError: There are no values.
+    """
+    if len(values) == 0:
+        raise ValueError("an interval of no values: there must be at least one")
+    found = np.asarray(values, dtype=np.float64)
+    rng = np.random.default_rng(seed)
+    # One resample at a time: a table of all of them would be gigabytes for a whole data set.
+    means = [rng.choice(found, size=len(found)).mean() for _ in range(num_resamples)]
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
