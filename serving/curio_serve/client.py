@@ -1,6 +1,6 @@
 """A client for the pose service, blocking and asynchronous.
 
-    with PoseClient("127.0.0.1:8001") as client:
+    with PoseClient("127.0.0.1:8500") as client:
         answer = client.detect("ape", "frame.jpg", camera="camera.json")
 
 Every call has a deadline. A call is repeated only where that is safe and of use: detection changes nothing, so it is
@@ -9,7 +9,6 @@ deadline. Failures come back as the exceptions that the server raised (:mod:`cur
 """
 
 import asyncio
-import random
 import time
 from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
 from dataclasses import dataclass
@@ -19,15 +18,13 @@ from typing import Any, Self
 import grpc
 from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
-from google.rpc import error_details_pb2, status_pb2
 
-from curio_serve.errors import CurioError, ImageError, Overloaded, Unavailable, UsageError, error_from_status
+from curio_serve.errors import UsageError
 from curio_serve.request import CameraLike, ImageLike, RegionLike, detect_request, selector
+from curio_serve.retries import Attempts, error_from_call
 
 __all__ = ["AsyncPoseClient", "PoseClient", "Tls", "detect_request"]
 
-_FIRST_PAUSE_S = 0.1
-_STATUS_DETAILS_KEY = "grpc-status-details-bin"
 # Connect again soon after a server was replaced; gRPC's own first pause is a second.
 _CHANNEL_OPTIONS = (("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_reconnect_backoff_ms", 2000))
 
@@ -58,39 +55,6 @@ class Tls:
         return grpc.ssl_channel_credentials(roots, key, chain)
 
 
-class _Attempts:
-    """One call's deadline, and the decision to try again."""
-
-    def __init__(self, address: str, timeout_s: float, max_attempts: int) -> None:
-        self._address = address
-        self._end = time.monotonic() + timeout_s
-        self._left = max_attempts - 1
-        self._pause_s = _FIRST_PAUSE_S
-
-    @property
-    def remaining_s(self) -> float:
-        return max(0.0, self._end - time.monotonic())
-
-    def pause_after(self, failure: grpc.RpcError) -> float:
-        """Seconds until the next attempt.
-
-        Raises:
-            CurioError: There shall be none; this is why the call failed.
-        """
-        error = _error_from(failure, self._address)
-        if isinstance(error, Overloaded):
-            pause_s = error.retry_after_s
-        elif isinstance(error, Unavailable):
-            pause_s = self._pause_s * random.uniform(0.5, 1.5)  # clients of one server must not come back as one
-        else:
-            raise error from failure
-        if self._left <= 0 or pause_s >= self.remaining_s:
-            raise error from failure
-        self._left -= 1
-        self._pause_s *= 2
-        return pause_s
-
-
 class _Client:
     """What both clients have in common: where the server is and how a call is made, not when."""
 
@@ -112,8 +76,8 @@ class _Client:
         self._tls = tls
         self._metadata = (("authorization", f"Bearer {token}"),) if token else ()
 
-    def _attempts(self, timeout_s: float | None) -> _Attempts:
-        return _Attempts(self.address, self._timeout_s if timeout_s is None else timeout_s, self._max_attempts)
+    def _attempts(self, timeout_s: float | None) -> Attempts:
+        return Attempts(self.address, self._timeout_s if timeout_s is None else timeout_s, self._max_attempts)
 
 
 class PoseClient(_Client):
@@ -149,6 +113,7 @@ class PoseClient(_Client):
         min_confidence: float | None = None,
         max_detections: int | None = None,
         apply_exif_rotation: bool = False,
+        request_id: str = "",
         timeout_s: float | None = None,
     ) -> messages.DetectResponse:
         """Poses in one image.
@@ -162,6 +127,7 @@ class PoseClient(_Client):
             min_confidence: Leave out what is below; None: the server's own threshold.
             max_detections: Most confident first, a region and model; None: no limit.
             apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
+            request_id: Comes back with the answer; empty: the server makes one up.
             timeout_s: Deadline of this call.
 
         Raises:
@@ -175,6 +141,7 @@ class PoseClient(_Client):
             min_confidence=min_confidence,
             max_detections=max_detections,
             apply_exif_rotation=apply_exif_rotation,
+            request_id=request_id,
         )
         return self._call(self._stub.Detect, request, timeout_s)
 
@@ -190,10 +157,13 @@ class PoseClient(_Client):
         Raises:
             CurioError: What the server raised, or that it is out of reach.
         """
+        call = self._stub.DetectStream(iter(requests), timeout=timeout_s, metadata=self._metadata)
         try:
-            yield from self._stub.DetectStream(iter(requests), timeout=timeout_s, metadata=self._metadata)
+            yield from call
         except grpc.RpcError as exc:
-            raise _error_from(exc, self.address) from exc
+            raise error_from_call(exc, self.address) from exc
+        finally:
+            call.cancel()  # the caller may have stopped listening early
 
     def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
         """What the server has loaded."""
@@ -252,11 +222,14 @@ class AsyncPoseClient(_Client):
         self, requests: AsyncIterable[messages.DetectRequest], *, timeout_s: float
     ) -> AsyncIterator[messages.DetectResponse]:
         """Answers in the order of the requests; see :meth:`PoseClient.detect_stream`."""
+        call = self._stub.DetectStream(requests, timeout=timeout_s, metadata=self._metadata)
         try:
-            async for answer in self._stub.DetectStream(requests, timeout=timeout_s, metadata=self._metadata):
+            async for answer in call:
                 yield answer
         except grpc.RpcError as exc:
-            raise _error_from(exc, self.address) from exc
+            raise error_from_call(exc, self.address) from exc
+        finally:
+            call.cancel()
 
     async def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
         """What the server has loaded."""
@@ -274,36 +247,6 @@ class AsyncPoseClient(_Client):
             except grpc.RpcError as exc:
                 pause_s = attempts.pause_after(exc)
             await asyncio.sleep(pause_s)
-
-
-def _error_from(failure: Any, address: str) -> CurioError:
-    """The exception behind a failed call: the server's own where it told which, else what gRPC's status means."""
-    status, text = failure.code().name, failure.details() or ""
-    reason, retry_after_s = _details(failure)
-    if not reason and status == "UNAVAILABLE":
-        return Unavailable(f"no server answers at {address} ({text}); is curio-serve running there?")
-    if not reason and status == "DEADLINE_EXCEEDED":
-        text = f"{address} did not answer in time; give the call a longer timeout_s ({text})"
-    if status == "RESOURCE_EXHAUSTED" and retry_after_s is None:
-        # gRPC's own refusal of a message over its limit carries this status too; that never helps to repeat
-        return ImageError(f"the request is larger than {address} accepts ({text}); send a smaller image")
-    error = error_from_status(status, reason, text)
-    if isinstance(error, Overloaded) and retry_after_s is not None:
-        error.retry_after_s = retry_after_s
-    return error
-
-
-def _details(failure: Any) -> tuple[str, float | None]:
-    """(ErrorInfo's reason, RetryInfo's delay in seconds) of a failed call, as far as it has them."""
-    reason, retry_after_s = "", None
-    packed = dict(failure.trailing_metadata() or ()).get(_STATUS_DETAILS_KEY, b"")
-    info, retry = error_details_pb2.ErrorInfo(), error_details_pb2.RetryInfo()
-    for detail in status_pb2.Status.FromString(packed).details:
-        if detail.Unpack(info):
-            reason = info.reason
-        elif detail.Unpack(retry):
-            retry_after_s = retry.retry_delay.ToMilliseconds() / 1000
-    return reason, retry_after_s
 
 
 def _read(path: Path | None) -> bytes | None:

@@ -16,6 +16,7 @@ from curio_serve.errors import CameraError, CurioError, UsageError
 if TYPE_CHECKING:
     from curio_proto.v1.model_spec_pb2 import ModelSpec
 
+    from curio_serve.client import PoseClient
     from curio_serve.estimators import Estimator, Settings
     from curio_serve.writers import ResultFormat
 
@@ -55,6 +56,14 @@ class DetectArguments:
     """Turn images as EXIF says, and K with them. Otherwise pixels are taken as stored, to which K belongs."""
     jobs: int = len(os.sched_getaffinity(0))
     """Images worked on at the same time; by default the number of processors."""
+    token_file: Path | None = None
+    """File with the bearer token that the server asks for."""
+    server_ca: Path | None = None
+    """Authority (PEM) that signed the server's certificate; turns TLS on."""
+    tls_certificate: Path | None = None
+    """Our own certificate (PEM), for a server that asks for one."""
+    tls_key: Path | None = None
+    """Key of our certificate (PEM)."""
 
 
 def main() -> NoReturn:
@@ -162,7 +171,6 @@ def _check_overlays(folder: Path, images: tuple[str, ...]) -> None:
 
 def _estimator(arguments: DetectArguments, settings: "Settings") -> "Estimator":
     """The model on this machine or behind a server."""
-    from curio_serve.client import PoseClient
     from curio_serve.estimators import LocalEstimator, RemoteEstimator
     from curio_serve.model_folder import open_model
 
@@ -174,8 +182,23 @@ def _estimator(arguments: DetectArguments, settings: "Settings") -> "Estimator":
             f"MODEL {arguments.model}: no such folder or file, nor HOST:PORT/NAME of a server; expected a folder that "
             "curio-export wrote, such as models/ape"
         )
-    client = PoseClient(served["address"], timeout_s=60.0, max_attempts=50)
-    return RemoteEstimator(client, served["model"], settings)
+    return RemoteEstimator(_client(arguments, served["address"]), served["model"], settings)
+
+
+def _client(arguments: DetectArguments, address: str) -> "PoseClient":
+    from curio_serve.client import PoseClient, Tls
+
+    tls = None
+    if arguments.server_ca is not None:
+        tls = Tls(arguments.server_ca, arguments.tls_certificate, arguments.tls_key)
+    elif arguments.tls_certificate is not None or arguments.tls_key is not None:
+        raise UsageError("--tls-certificate and --tls-key need --server-ca: they are shown over TLS only")
+    try:
+        token = "" if arguments.token_file is None else arguments.token_file.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as exc:
+        raise UsageError(f"--token-file {arguments.token_file} cannot be read: {exc}") from exc
+    # Patient: a busy or restarting server shall not end a run over many images.
+    return PoseClient(address, timeout_s=60.0, max_attempts=50, tls=tls, token=token)
 
 
 def _check_camera(arguments: DetectArguments, estimator: "Estimator") -> None:

@@ -1,0 +1,81 @@
+"""Why a call failed, as the exception that the server raised, and whether to try again before its deadline."""
+
+import random
+import time
+from typing import Any
+
+import grpc
+from google.protobuf.message import DecodeError
+from google.rpc import error_details_pb2, status_pb2
+
+from curio_serve.errors import CurioError, ImageError, Overloaded, Unavailable, error_from_status
+
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
+_STATUS_DETAILS_KEY = "grpc-status-details-bin"
+
+
+class Attempts:
+    """One call's deadline, and the decision to try again."""
+
+    def __init__(self, address: str, timeout_s: float, max_attempts: int) -> None:
+        self._address = address
+        self._end = time.monotonic() + timeout_s
+        self._left = max_attempts - 1
+        self._pause_s = _FIRST_PAUSE_S
+
+    @property
+    def remaining_s(self) -> float:
+        return max(0.0, self._end - time.monotonic())
+
+    def pause_after(self, failure: grpc.RpcError) -> float:
+        """Seconds until the next attempt.
+
+        Raises:
+            CurioError: There shall be none; this is why the call failed.
+        """
+        error = error_from_call(failure, self._address)
+        if isinstance(error, Overloaded):
+            pause_s = error.retry_after_s * random.uniform(1.0, 1.5)  # clients of one server must not come back as one
+        elif isinstance(error, Unavailable):
+            pause_s = self._pause_s * random.uniform(0.5, 1.5)
+        else:
+            raise error from failure
+        if self._left <= 0 or pause_s >= self.remaining_s:
+            raise error from failure
+        self._left -= 1
+        self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+        return pause_s
+
+
+def error_from_call(failure: Any, address: str) -> CurioError:
+    """The exception behind a failed call: the server's own where it told which, else what gRPC's status means."""
+    status, text = failure.code().name, failure.details() or ""
+    reason, retry_after_s = _details(failure)
+    if not reason and status == "UNAVAILABLE":
+        return Unavailable(f"no server answers at {address} ({text}); is curio-serve running there?")
+    if not reason and status == "DEADLINE_EXCEEDED":
+        text = f"{address} did not answer in time; give the call a longer timeout_s ({text})"
+    if not reason and status == "RESOURCE_EXHAUSTED" and retry_after_s is None:
+        # gRPC's own refusal of a message over its limit carries this status too; that never helps to repeat
+        return ImageError(f"the request is larger than {address} accepts ({text}); send a smaller image")
+    error = error_from_status(status, reason, text)
+    if isinstance(error, Overloaded) and retry_after_s is not None:
+        error.retry_after_s = retry_after_s
+    return error
+
+
+def _details(failure: Any) -> tuple[str, float | None]:
+    """(ErrorInfo's reason, RetryInfo's delay in seconds) of a failed call, as far as it has them."""
+    reason, retry_after_s = "", None
+    packed = dict(failure.trailing_metadata() or ()).get(_STATUS_DETAILS_KEY, b"")
+    info, retry = error_details_pb2.ErrorInfo(), error_details_pb2.RetryInfo()
+    try:
+        details = status_pb2.Status.FromString(packed).details
+    except DecodeError:  # another server's idea of details
+        return reason, retry_after_s
+    for detail in details:
+        if detail.Unpack(info):
+            reason = info.reason
+        elif detail.Unpack(retry):
+            retry_after_s = retry.retry_delay.ToMilliseconds() / 1000
+    return reason, retry_after_s
