@@ -4,7 +4,7 @@ A new world is one file: a subclass of :class:`World` and a line in ``worlds/__i
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -13,7 +13,8 @@ import numpy as np
 from torch import Tensor
 
 from curio_train.errors import UsageError
-from curio_train.scene_code import Layout, SceneCode
+from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.scene_code import CONFIDENCE, ROTATION_6D, Field, Layout, SceneCode
 
 Split = Literal["train", "validation", "test"]
 
@@ -30,6 +31,7 @@ class ObjectKind:
         mesh_sha256: Of the mesh file, or empty.
         symmetries: Discrete ones, each [4, 4], the identity left out.
         symmetry_axes: Continuous ones, each (unit axis [3], point on it in metres [3]).
+        attribution: Source and licence of the mesh, where it is not ours; goes on the model's card.
     """
 
     name: str
@@ -39,6 +41,7 @@ class ObjectKind:
     mesh_sha256: str = ""
     symmetries: Sequence[np.ndarray] = ()
     symmetry_axes: Sequence[tuple[np.ndarray, np.ndarray]] = ()
+    attribution: str = ""
 
 
 @dataclass(frozen=True)
@@ -77,11 +80,20 @@ class ImageSource(ABC):
 
 @dataclass(frozen=True)
 class Camera:
-    """The canonical pinhole camera: K* [3, 3] in pixels (pixel centres at integers), None in 2D worlds."""
+    """The canonical pinhole camera.
+
+    Attributes:
+        width: Of an image, pixels.
+        height: Of an image, pixels.
+        matrix: K* [3, 3] in pixels (pixel centres at integers), None in 2D worlds.
+        is_default: A frame that comes without K is taken as this camera's, scaled to the frame: so where all images of
+            a world are renderings.
+    """
 
     width: int
     height: int
     matrix: np.ndarray | None = field(default=None)
+    is_default: bool = False
 
 
 class World(ABC):
@@ -92,6 +104,38 @@ class World(ABC):
     camera: Camera
     objects: tuple[ObjectKind, ...]
 
+    @property
+    def model_name(self) -> str:
+        """What a model of this world is called unless its maker names it."""
+        return self.name
+
+    @property
+    def exported_fields(self) -> tuple[Field, ...]:
+        """What the model's specification says of its outputs; the 3x3 ``rotation`` goes without saying."""
+        return self.layout.fields
+
+    def exported(self, code: SceneCode) -> dict[str, Tensor]:
+        """The physical outputs of an exported model, all in the camera frame.
+
+        ``rotation_6d`` comes out as the columns of the rotation [batch, slots, 3, 3] that stands beside it, confidence
+        as [batch, slots]. Worlds with other fields (yaw, light in the world frame) extend this, :attr:`exported_fields`
+        and :meth:`from_exported`.
+        """
+        outputs = dict(code)
+        if ROTATION_6D in code:
+            outputs["rotation"] = matrix_from_rotation_6d(code[ROTATION_6D])
+            outputs[ROTATION_6D] = rotation_6d_from_matrix(outputs["rotation"])
+        if CONFIDENCE in code:
+            outputs[CONFIDENCE] = code[CONFIDENCE].squeeze(-1)
+        return outputs
+
+    def from_exported(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The scene code that :meth:`exported` made these outputs of."""
+        code = {field.name: outputs[field.name] for field in self.layout.fields}
+        if CONFIDENCE in code:
+            code[CONFIDENCE] = code[CONFIDENCE].unsqueeze(-1)
+        return code
+
     @abstractmethod
     def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:
         """Draw ``count`` scene codes from the world's own distribution; the same seed gives the same codes."""
@@ -99,6 +143,10 @@ class World(ABC):
     @abstractmethod
     def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
         """Images [batch, 3, height, width] in sRGB of a batch of codes, differentiable in every field."""
+
+    def disturb(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
+        """What lies between renderings and the data, done to renderings that the network learns to read (sleep)."""
+        return images
 
     @abstractmethod
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> ImageSource:
