@@ -3,6 +3,8 @@
 Damaged files are refused here, with their name, instead of entering training as grey or shifted pixels.
 """
 
+import copy
+import functools
 from pathlib import Path
 
 import cv2
@@ -15,6 +17,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 # 50 megapixels: larger than any camera of this trade, small enough to be decoded without harm.
 LARGEST_PIXELS = 50_000_000
+
+LONGEST_KEPT_PX = 768
 
 
 def read_photograph(path: Path) -> np.ndarray:
@@ -75,6 +79,14 @@ def _to_rgb8(path: Path, pixels: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(pixels, conversion)
 
 
+def _read_shrunk(path: Path) -> np.ndarray:
+    photograph = read_photograph(path)
+    scale = LONGEST_KEPT_PX / max(photograph.shape[:2])
+    if scale >= 1:
+        return photograph
+    return cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+
 class Photographs:
     """The images of a folder (not of its subfolders), in the order of their names.
 
@@ -91,9 +103,17 @@ class Photographs:
         self.paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
         if not self.paths:
             raise DataError(f"{folder}: found no images, expected files ending in {' '.join(SUFFIXES)}")
+        # Decoding costs more than rendering the object in front: a few hundred photographs stay in memory, shrunk.
+        self._read = functools.lru_cache(maxsize=300)(_read_shrunk)
 
     def __len__(self) -> int:
         return len(self.paths)
+
+    def subset(self, part: slice) -> "Photographs":
+        """Some of them, by place in the order."""
+        chosen = copy.copy(self)
+        chosen.paths = self.paths[part]
+        return chosen
 
     def random_crop(self, width: int, height: int, rng: np.random.Generator) -> np.ndarray:
         """A part of a random photograph at random scale, mirrored half of the time: a background.
@@ -109,7 +129,7 @@ class Photographs:
         Raises:
             DataError: The photograph drawn is broken.
         """
-        photograph = read_photograph(self.paths[rng.integers(len(self.paths))])
+        photograph = self._read(self.paths[rng.integers(len(self.paths))])
         # The largest region of the crop's shape that fits, shrunk by up to two: no border is ever invented.
         largest = min(photograph.shape[1] / width, photograph.shape[0] / height)
         scale = largest * rng.uniform(0.5, 1.0)

@@ -9,13 +9,15 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from curio_train.worlds.options import CirclesOptions, WorldOptions
+from curio_train.config import WorldOptions
+from curio_train.worlds.options import CirclesOptions, LinemodOptions
 
 if TYPE_CHECKING:
     from curio_train.worlds.base import World
 
 WORLDS: dict[str, type[WorldOptions]] = {
     "circles": CirclesOptions,
+    "linemod": LinemodOptions,
 }
 
 
