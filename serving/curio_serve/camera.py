@@ -101,7 +101,7 @@ class PinholeCamera:
 
     def ray(self, x: float, y: float) -> Array:
         """Unit direction [3] in the camera frame of what is seen at a pixel."""
-        point = np.array([[[x, y]]])
+        point = np.array([[[x, y]]], float)
         if self.coefficients is not None:
             x, y = cv2.undistortPoints(point, self.matrix, self.coefficients)[0, 0]
             direction = np.array([x, y, 1.0])

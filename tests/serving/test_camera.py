@@ -1,0 +1,173 @@
+"""Intrinsics: what is refused, how they turn with the pixels, and the files they come from."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from curio_serve.camera import PinholeCamera, scaling
+from curio_serve.camera_files import read_camera_file
+from curio_serve.errors import CameraError
+
+K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
+
+
+def _changed(row: int, column: int, value: float) -> np.ndarray:
+    matrix = K.copy()
+    matrix[row, column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("matrix", "words"),
+    [
+        (np.zeros((3, 3)), "last row has to be"),
+        (_changed(0, 0, 0), "singular or mirrored: fx = 0"),
+        (_changed(1, 1, -573), "singular or mirrored"),
+        (_changed(0, 0, np.nan), "not finite"),
+        (_changed(0, 2, np.inf), "not finite"),
+        (_changed(0, 1, 3), "skew of 3 px"),
+        (K.T, "last row has to be"),
+        (K[:2], r"shape \[2, 3\]"),
+    ],
+)
+def test_impossible_matrices(matrix: np.ndarray, words: str) -> None:
+    with pytest.raises(CameraError, match=words):
+        PinholeCamera(matrix)
+
+
+@pytest.mark.parametrize("distortion", [(0.1,), (0.1, 0, 0, float("nan")), (0.0,) * 14])
+def test_impossible_distortion(distortion: tuple[float, ...]) -> None:
+    with pytest.raises(CameraError, match="distortion has"):
+        PinholeCamera(K, distortion)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "size", "words"),
+    [
+        (K, (320, 240), r"principal point \(325.3, 242\) lies outside the frame of 320x240"),
+        (np.diag([0.9, 1.2, 1.0]) + _changed(2, 2, 1) * 0, (640, 480), "fx = 0.9 px is implausible"),
+        (_changed(1, 1, 573_600), (640, 480), "fy = 573600 px is implausible"),
+    ],
+)
+def test_matrices_that_do_not_fit_the_frame(matrix: np.ndarray, size: tuple[int, int], words: str) -> None:
+    with pytest.raises(CameraError, match=words):
+        PinholeCamera(matrix).check_frame(*size)
+
+
+def test_a_camera_of_another_size_is_named() -> None:
+    with pytest.raises(CameraError, match="K belongs to frames of 640x480, this one has 1280x720"):
+        PinholeCamera(K, size=(640, 480)).check_frame(1280, 720)
+
+
+def test_scaling_keeps_the_frames_edges() -> None:
+    corner = scaling(2, 3) @ [-0.5, -0.5, 1]
+    np.testing.assert_allclose(corner, [-0.5, -0.5, 1])
+    np.testing.assert_allclose(scaling(0.5, 0.25) @ [639.5, 479.5, 1], [319.5, 119.5, 1])
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3, 4])
+def test_a_camera_turns_with_its_pixels(turns: int) -> None:
+    """A point projected by the turned camera lies where turning the pixels puts it."""
+    width, height = 640, 480
+    camera = PinholeCamera(K, (0.1, -0.05, 0.003, -0.002, 0.01), (width, height))
+    points = np.random.default_rng(0).uniform([-0.3, -0.2, 1], [0.3, 0.2, 2], (20, 3))
+    pixels, turned_points = camera.project(points), points.copy()
+    size = (width, height)
+    for _ in range(turns % 4):
+        pixels = np.stack([size[1] - 1 - pixels[:, 1], pixels[:, 0]], axis=1)
+        turned_points = np.stack([-turned_points[:, 1], turned_points[:, 0], turned_points[:, 2]], axis=1)
+        size = size[::-1]
+    turned = camera.turned(turns, width, height)
+    assert turned.size == size
+    np.testing.assert_allclose(turned.project(turned_points), pixels, atol=1e-9)
+
+
+@pytest.mark.parametrize("distortion", [(), (0.1, -0.05, 0.003, -0.002, 0.01)])
+def test_rays_and_pixels_are_inverse(distortion: tuple[float, ...]) -> None:
+    camera = PinholeCamera(K, distortion)
+    for pixel in ((0, 0), (100.5, 333), (639, 479)):
+        ray = camera.ray(*pixel)
+        assert np.linalg.norm(ray) == pytest.approx(1)
+        np.testing.assert_allclose(camera.project(ray[None] * 3)[0], pixel, atol=0.05)
+
+
+def test_what_is_behind_has_no_pixel() -> None:
+    pixels = PinholeCamera(K).project(np.array([[0, 0, -1.0], [0, 0, 1.0], [0, 0, 0]]))
+    assert np.isnan(pixels[0]).all()
+    np.testing.assert_allclose(pixels[1], K[:2, 2])
+    assert np.isnan(pixels[2]).all()
+
+
+def test_our_json(tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    content = {"camera_matrix": K.tolist(), "width": 640, "height": 480, "distortion": [0.1, 0, 0, 0, 0]}
+    path.write_text(json.dumps(content))
+    camera = read_camera_file(path).camera_for("any.png")
+    np.testing.assert_array_equal(camera.matrix, K)
+    assert camera.size == (640, 480)
+    assert camera.distortion == (0.1, 0, 0, 0, 0)
+
+
+def test_bop_camera(tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text(
+        '{"cx": 325.3, "cy": 242.0, "depth_scale": 1.0, "fx": 572.4, "fy": 573.6, "height": 480, "width": 640}'
+    )
+    camera = read_camera_file(path).camera_for("any.png")
+    np.testing.assert_array_equal(camera.matrix, K)
+    assert camera.size == (640, 480)
+
+
+def test_bop_scene_camera_is_looked_up_by_the_images_number(tmp_path: Path) -> None:
+    path = tmp_path / "scene_camera.json"
+    entries = {str(n): {"cam_K": [500.0 + n, 0, 320, 0, 500, 240, 0, 0, 1], "depth_scale": 1.0} for n in (0, 7, 12)}
+    path.write_text(json.dumps(entries))
+    file = read_camera_file(path)
+    assert file.camera_for("lm/test/000001/rgb/000007.png").matrix[0, 0] == 507
+    assert file.camera_for(Path("000012.jpg")).matrix[0, 0] == 512
+    with pytest.raises(CameraError, match=r"no K for image 8 .*it has 3 from 0 to 12"):
+        file.camera_for("000008.png")
+    with pytest.raises(CameraError, match="has no number"):
+        file.camera_for("frame.png")
+
+
+def test_opencv_yaml(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.yaml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", K)
+    storage.write("distortion_coefficients", np.array([[0.1, -0.2, 0.001, 0.002, 0.05]]))
+    storage.release()
+    camera = read_camera_file(path).camera_for("x.png")
+    np.testing.assert_array_equal(camera.matrix, K)
+    assert camera.size == (640, 480)
+    assert camera.distortion == pytest.approx((0.1, -0.2, 0.001, 0.002, 0.05))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("c.json", "{", "is not JSON"),
+        ("c.json", "[1, 2]", "unknown format with list"),
+        ("c.json", '{"K": [1]}', r"unknown format with \['K'\]"),
+        ("c.json", '{"camera_matrix": [[1, 2], [3]]}', "cannot be understood"),
+        ("c.json", '{"camera_matrix": "abc"}', "cannot be understood"),
+        ("c.json", '{"camera_matrix": [[500,0,320],[0,500,240],[0,0,0]]}', "last row"),
+        ("c.yaml", "nothing: here", "cannot be understood|no matrix camera_matrix"),
+        ("c.yaml", "%YAML:1.0\n---\nwidth: 640\n", "no matrix camera_matrix"),
+    ],
+)
+def test_bad_files_are_named(tmp_path: Path, name: str, text: str, words: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(CameraError, match=words) as caught:
+        read_camera_file(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CameraError, match=r"none\.json cannot be read"):
+        read_camera_file(tmp_path / "none.json")

@@ -1,0 +1,239 @@
+"""Bytes to pixels: what is accepted, what is refused and with which words, before anything is decoded."""
+
+import struct
+import tracemalloc
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from curio_serve.errors import ImageError
+from curio_serve.image import decode, from_raw
+from curio_serve.image_header import read_header
+
+FORMATS = {".jpg": "jpeg", ".png": "png", ".webp": "webp"}
+
+
+def _scene(width: int = 64, height: int = 48, seed: int = 0) -> np.ndarray:
+    """Smooth random colours, uint8 RGB."""
+    coarse = np.random.default_rng(seed).integers(0, 255, (6, 8, 3)).astype(np.uint8)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def _encode(rgb: np.ndarray, suffix: str, *parameters: int) -> bytes:
+    stored = rgb[..., ::-1] if rgb.ndim == 3 and rgb.shape[2] == 3 else rgb
+    return cv2.imencode(suffix, stored, parameters)[1].tobytes()
+
+
+def _with_exif(jpeg: bytes, orientation: int, order: str = "<") -> bytes:
+    tiff = {"<": b"II", ">": b"MM"}[order] + struct.pack(f"{order}HIH", 42, 8, 1)
+    tiff += struct.pack(f"{order}HHIHHI", 0x0112, 3, 1, orientation, 0, 0)
+    body = b"Exif\x00\x00" + tiff
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
+
+
+def _png(width: int, height: int, depth: int, color_type: int, rows: bytes) -> bytes:
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    head = struct.pack(">IIBBBBB", width, height, depth, color_type, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows, 9)) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_good_images_come_back(suffix: str) -> None:
+    scene = _scene()
+    data = _encode(scene, suffix, *((cv2.IMWRITE_WEBP_QUALITY, 101) if suffix == ".webp" else ()))
+    header = read_header(data)
+    assert (header.format, header.width, header.height) == (FORMATS[suffix], 64, 48)
+    frame = decode(data)
+    assert (frame.width, frame.height, frame.reduction) == (64, 48, 1)
+    assert np.abs(frame.pixels.astype(int) - scene).mean() < (6 if suffix == ".jpg" else 0.5)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.7, 0.99])
+def test_truncated_images_are_refused(suffix: str, share: float) -> None:
+    data = _encode(_scene(320, 240), suffix)
+    with pytest.raises(ImageError):
+        decode(data[: int(len(data) * share)])
+
+
+def test_a_thumbnails_end_is_not_the_pictures_end() -> None:
+    jpeg = _encode(_scene(320, 240), ".jpg")
+    body = b"Exif\x00\x00" + _encode(_scene(32, 24), ".jpg")
+    whole = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
+    assert decode(whole).width == 320
+    with pytest.raises(ImageError, match="cut short"):
+        decode(whole[:-200])
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "empty"),
+        (b"GIF89a" + bytes(100), "not a JPEG, PNG or WebP"),
+        (b"hello world, this is text", "not a JPEG, PNG or WebP"),
+        (b"\xff\xd8\xff", "ends inside its header"),
+        (b"\xff\xd8\xff\xd9", "no picture data"),
+        (b"\x89PNG\r\n\x1a\n", "ends inside its header"),
+        (b"RIFF\x10\x00\x00\x00WEBPVP8 ", "cut short"),
+        (b"RIFF\x04\x00\x00\x00WEBP", "ends inside its header|first chunk"),
+    ],
+)
+def test_what_is_no_image_is_named(data: bytes, words: str) -> None:
+    with pytest.raises(ImageError, match=words):
+        decode(data)
+
+
+def test_a_small_file_of_a_huge_picture_is_refused_before_it_is_decoded() -> None:
+    side = 12_000
+    data = _png(side, side, 8, 0, bytes((side + 1) * side))
+    assert len(data) < 200_000
+    tracemalloc.start()
+    try:
+        with pytest.raises(ImageError, match="12000x12000 = 144000000 pixels"):
+            decode(data)
+        assert tracemalloc.get_traced_memory()[1] < 5_000_000
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (15, 200), (200, 15)])
+def test_tiny_images_are_refused(size: tuple[int, int]) -> None:
+    with pytest.raises(ImageError, match=f"{size[0]}x{size[1]} pixels; each side needs at least 16"):
+        decode(_encode(_scene(*size), ".png"))
+
+
+def test_grey_becomes_three_equal_channels() -> None:
+    grey = cv2.cvtColor(_scene(), cv2.COLOR_RGB2GRAY)
+    for suffix in FORMATS:
+        pixels = decode(_encode(grey, suffix)).pixels
+        assert pixels.shape == (48, 64, 3)
+        assert np.ptp(pixels.astype(int), axis=2).max() <= (8 if suffix == ".webp" else 0)
+
+
+def test_sixteen_bits_lose_their_low_byte() -> None:
+    values = (np.arange(64 * 48).reshape(48, 64) * 21).astype(np.uint16)
+    rows = b"".join(b"\x00" + row.astype(">u2").tobytes() for row in values)
+    pixels = decode(_png(64, 48, 16, 0, rows)).pixels
+    assert np.abs(pixels[..., 0].astype(int) - (values >> 8)).max() <= 1
+
+
+def test_alpha_is_dropped_and_colours_stay_as_stored() -> None:
+    scene = _scene()
+    alpha = np.tile(np.linspace(0, 255, 64).astype(np.uint8), (48, 1))
+    rgba = np.dstack([scene, alpha])
+    rows = b"".join(b"\x00" + row.tobytes() for row in rgba)
+    np.testing.assert_array_equal(decode(_png(64, 48, 8, 6, rows)).pixels, scene)
+
+
+def test_cmyk_is_refused() -> None:
+    jpeg = bytearray(_encode(_scene(), ".jpg"))
+    frame_header = jpeg.find(b"\xff\xc0")
+    # Four components instead of three, as a CMYK file declares them.
+    length = struct.unpack_from(">H", jpeg, frame_header + 2)[0]
+    jpeg[frame_header + 9] = 4
+    jpeg[frame_header + 2 : frame_header + 4] = struct.pack(">H", length + 3)
+    jpeg[frame_header + 2 + length : frame_header + 2 + length] = b"\x04\x11\x00"
+    with pytest.raises(ImageError, match="CMYK"):
+        decode(bytes(jpeg))
+
+
+def test_many_scans_are_refused() -> None:
+    jpeg = _encode(_scene(), ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+    assert decode(jpeg).width == 64
+    scan = jpeg[jpeg.rfind(b"\xff\xda") : -2]
+    with pytest.raises(ImageError, match="scans; at most 64"):
+        decode(jpeg[:-2] + scan * 100 + b"\xff\xd9")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_exif_rotation_is_ignored_unless_asked_for(order: str) -> None:
+    jpeg = _encode(_scene(), ".jpg")
+    stored = decode(jpeg).pixels
+    for orientation, turns in ((1, 0), (6, 1), (3, 2), (8, 3)):
+        turned = _with_exif(jpeg, orientation, order)
+        assert read_header(turned).orientation == orientation
+        np.testing.assert_array_equal(decode(turned).pixels, stored)
+        frame = decode(turned, apply_exif_rotation=True)
+        assert frame.quarter_turns == turns
+        np.testing.assert_array_equal(frame.pixels, np.rot90(stored, -turns))
+        assert (frame.width, frame.height) == ((48, 64) if turns % 2 else (64, 48))
+
+
+def test_mirrored_exif_is_refused_when_asked_for() -> None:
+    mirrored = _with_exif(_encode(_scene(), ".jpg"), 2)
+    assert decode(mirrored).width == 64
+    with pytest.raises(ImageError, match="orientation 2 mirrors"):
+        decode(mirrored, apply_exif_rotation=True)
+
+
+@pytest.mark.parametrize("max_reduction", [1, 2, 4, 8])
+def test_reduced_decoding_shows_the_same_scene(max_reduction: int) -> None:
+    scene = _scene(640, 480)
+    frame = decode(_encode(scene, ".jpg"), max_reduction=max_reduction)
+    assert frame.reduction == max_reduction
+    assert (frame.width, frame.height) == (640, 480)
+    expected = cv2.resize(scene, frame.pixels.shape[1::-1], interpolation=cv2.INTER_AREA)
+    assert np.abs(frame.pixels.astype(int) - expected).mean() < 4
+
+
+def test_reduction_is_used_only_where_it_is_exact() -> None:
+    assert decode(_encode(_scene(644, 484), ".jpg"), max_reduction=8).reduction == 4
+    assert decode(_encode(_scene(641, 480), ".jpg"), max_reduction=8).reduction == 1
+    assert decode(_encode(_scene(640, 480), ".png"), max_reduction=8).reduction == 1
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_damaged_images_never_show_another_images_pixels(suffix: str) -> None:
+    """What a damaged file decodes to (or is refused as) must not depend on what was decoded before."""
+    good = [_encode(_scene(320, 240, seed), suffix) for seed in (1, 2)]
+    victim = _encode(_scene(320, 240, 3), suffix)
+    random = np.random.default_rng(0)
+
+    def outcome(data: bytes) -> bytes:
+        try:
+            return decode(data).pixels.tobytes()
+        except ImageError:
+            return b"refused"
+
+    for _ in range(40):
+        damaged = bytearray(victim)
+        for position in random.integers(len(victim) // 10, len(victim), 8):
+            damaged[position] ^= 1 << int(random.integers(8))
+        seen = []
+        for before in good:
+            decode(before)
+            seen.append(outcome(bytes(damaged)))
+        assert seen[0] == seen[1]
+
+
+def test_raw_pixels_in_all_orders_and_strides() -> None:
+    scene = _scene()
+    height, width, _ = scene.shape
+    padded = np.zeros((height, width * 3 + 13), np.uint8)
+    padded[:, : width * 3] = scene.reshape(height, -1)
+    for data in (padded.tobytes(), padded.tobytes()[:-13]):
+        np.testing.assert_array_equal(from_raw(data, "RGB8", width, height, width * 3 + 13).pixels, scene)
+    np.testing.assert_array_equal(from_raw(scene.tobytes(), "RGB8", width, height).pixels, scene)
+    np.testing.assert_array_equal(from_raw(scene[..., ::-1].tobytes(), "BGR8", width, height).pixels, scene)
+    grey = np.ascontiguousarray(scene[..., 0])
+    np.testing.assert_array_equal(from_raw(grey.tobytes(), "GRAY8", width, height).pixels, np.dstack([grey] * 3))
+
+
+@pytest.mark.parametrize(
+    ("num_bytes", "width", "height", "stride", "words"),
+    [
+        (64 * 48 * 3 - 1, 64, 48, 0, "takes 9216"),
+        (64 * 48 * 3, 64, 48, 100, "shorter than a row of 192"),
+        (0, 64, 48, 0, "0 bytes"),
+        (12, 2, 2, 0, "2x2 pixels"),
+        (100, 1 << 20, 1 << 20, 0, "at most 33554432"),
+    ],
+)
+def test_raw_sizes_that_do_not_fit_are_refused(
+    num_bytes: int, width: int, height: int, stride: int, words: str
+) -> None:
+    with pytest.raises(ImageError, match=words):
+        from_raw(bytes(num_bytes), "RGB8", width, height, stride)
