@@ -40,7 +40,7 @@ def test_formats(tmp_path: Path, suffix: str) -> None:
 
 
 def test_corners_differ_by_bits() -> None:
-    corners = shapes.box((2, 4, 6)).box_corners_m
+    corners = shapes.box((2.0, 4.0, 6.0)).box_corners_m
     assert corners[0].tolist() == [-1, -2, -3]
     assert corners[1].tolist() == [1, -2, -3]
     assert corners[2].tolist() == [-1, 2, -3]
@@ -187,16 +187,16 @@ def test_shapes() -> None:
     np.testing.assert_allclose(np.linalg.norm(ball.vertices_m, axis=1), 0.5)
     assert len(ball.faces) == 320
     for shape, extents in (
-        (shapes.box((1, 2, 3)), (1, 2, 3)),
-        (shapes.cone(0.5, 2), (1, 2, 1)),
-        (shapes.capsule(0.5, 2), (1, 2, 1)),
+        (shapes.box((1.0, 2.0, 3.0)), (1, 2, 3)),
+        (shapes.cone(0.5, 2.0), (1, 2, 1)),
+        (shapes.capsule(0.5, 2.0), (1, 2, 1)),
     ):
         np.testing.assert_allclose(shape.box_corners_m[7], np.array(extents) / 2, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(shape.box_corners_m[0], -np.array(extents) / 2, rtol=1e-6, atol=1e-9)
         solid = trimesh.Trimesh(shape.vertices_m, shape.faces, process=False)
         assert solid.is_watertight
         assert solid.volume > 0, "faces must look outwards"
-    tip = shapes.cone(0.5, 2).vertices_m[:, 1] > 0.99
+    tip = shapes.cone(0.5, 2.0).vertices_m[:, 1] > 0.99
     assert tip.sum() == 1
     with pytest.raises(ValueError, match="at least 1"):
         shapes.capsule(0.5, 0.9)
