@@ -54,7 +54,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a model saw in one image; the camera is the one that was used, of the frame as turned."""
+    """What a model saw in one image.
+
+    Attributes:
+        camera: The one that was used, of the frame as turned.
+        frame: Where the frame was decoded here in its full size.
+    """
 
     width: int
     height: int
@@ -62,6 +67,7 @@ class _Seen:
     results: Sequence[RegionResult]
     decode_ms: float | None
     inference_ms: float
+    frame: images.Frame | None = None
 
 
 class Estimator(ABC):
@@ -123,7 +129,8 @@ class Estimator(ABC):
         return images.Frame(image.pixels, width, height)
 
     def _draw(self, folder: Path, image: SourceImage, data: bytes, seen: _Seen) -> None:
-        pixels = draw(self._frame(image, data).pixels, seen.results, self.spec, seen.camera)
+        frame = seen.frame or self._frame(image, data)
+        pixels = draw(frame.pixels, seen.results, self.spec, seen.camera)
         path = _drawing_path(folder, image, self.settings.sources_root)
         parameters = _FAST_PNG if path.suffix.lower() == ".png" else []
         is_encoded, encoded = cv2.imencode(path.suffix, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), parameters)
@@ -160,7 +167,9 @@ class LocalEstimator(Estimator):
             reduction=frame.reduction,
         )
         decode_ms = None if image.pixels is not None else 1000 * (decoded - started)
-        return _Seen(frame.width, frame.height, camera, results, decode_ms, 1000 * (time.perf_counter() - decoded))
+        inference_ms = 1000 * (time.perf_counter() - decoded)
+        full_size = frame if frame.reduction == 1 else None
+        return _Seen(frame.width, frame.height, camera, results, decode_ms, inference_ms, full_size)
 
 
 class RemoteEstimator(Estimator):
