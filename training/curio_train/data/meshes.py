@@ -117,7 +117,9 @@ def _parse(path: Path, content: bytes) -> Any:
     try:
         return trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
     except _READER_ERRORS as exc:
-        raise MeshError(f"{path}: not a readable {kind.upper()} mesh ({exc}); is the file complete?") from exc
+        # Without its optional packages for odd encodings trimesh names those; they would not make a mesh of garbage.
+        reason = "garbled text" if isinstance(exc, ImportError) else exc
+        raise MeshError(f"{path}: not a readable {kind.upper()} mesh ({reason}); is the file complete?") from exc
 
 
 def _check(path: Path, loaded: Any) -> None:
