@@ -5,21 +5,22 @@ The command line, ``config.json`` of a run folder and the loop read these same c
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Literal
+
+from tyro.conf import OmitArgPrefixes, Suppress
 
 from curio_train.errors import UsageError
 
-Term = Literal["image", "critic", "sleep", "label"]
+Term = Literal["image", "curiosity", "sleep", "label"]
 Method = Literal["our", "noncur", "super", "wake_sleep", "wake_sleep_critic"]
 Preset = Literal["laptop", "paper"]
-T = TypeVar("T")
 
 METHODS: Mapping[Method, frozenset[Term]] = {
-    "our": frozenset({"image", "critic"}),
+    "our": frozenset({"image", "curiosity"}),
     "noncur": frozenset({"image"}),
     "super": frozenset({"label"}),
     "wake_sleep": frozenset({"image", "sleep"}),
-    "wake_sleep_critic": frozenset({"image", "critic", "sleep"}),
+    "wake_sleep_critic": frozenset({"image", "curiosity", "sleep"}),
 }
 """The loss terms of each method; the paper's own are the first three."""
 
@@ -57,8 +58,153 @@ class NetworkConfig:
         hidden: Width of each branch's hidden layer.
     """
 
-    encoder: ConvStack = ConvStack((64, 192, 384, 256, 64), (11, 5, 3, 3, 3), (4, 2, 2, 2, 2), (0, 1, 1, 1, 0))
-    critic: ConvStack = ConvStack((64, 192, 384, 256, 1), (11, 5, 3, 3, 3), (4, 4, 2, 2, 2), (0, 0, 1, 1, 1))
+    encoder: Suppress[ConvStack] = ConvStack(
+        (64, 192, 384, 256, 64), (11, 5, 3, 3, 3), (4, 2, 2, 2, 2), (0, 1, 1, 1, 0)
+    )
+    critic: Suppress[ConvStack] = ConvStack((64, 192, 384, 256, 1), (11, 5, 3, 3, 3), (4, 4, 2, 2, 2), (0, 0, 1, 1, 1))
     critic_normalisation: Literal["batch", "instance"] = "batch"
     row: int = 32
     hidden: int = 64
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """What a user may choose about a world; each world has its own subclass in ``worlds/options.py``."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Hyperparameters of learning; the defaults are the paper's.
+
+    Attributes:
+        batch_size: Images a step.
+        micro_batch_size: Images held in memory at once; gradients add up to those of a whole batch, batch norm sees one
+            micro-batch at a time.
+        learning_rate: Adam's, of encoder and heads.
+        critic_learning_rate: Adam's, of the critic.
+        warm_up_steps: Steps over which learning rates rise linearly from 0.
+        final_learning_rate: Share of the learning rates that is left at the end of the budget, approached along a
+            cosine; 1 keeps them constant.
+        image_weight: Of the squared image error, summed over pixels and channels.
+        critic_weight: Of the curiosity term.
+        gradient_penalty: R1: weight of the critic's squared gradient at data images; 0 is off.
+        gradient_penalty_every: Steps between penalties, each weighted up by as many.
+        sleep_weight: Of the distance between sleep codes and what the network reads from their renderings.
+        sleep_noise: Standard deviation of sleep codes around the network's own predictions, in half ranges.
+        sleep_drawn: Share of sleep codes drawn from the world's known range instead of around own predictions.
+        gradient_clip: Largest L2 norm of a step's gradient, of the network and of the critic each.
+        precision: Of the convolutions; everything else is in float32.
+        budget_images: Images to show where neither --minutes nor --images is given.
+    """
+
+    batch_size: int = 128
+    micro_batch_size: int = 32
+    learning_rate: float = 1e-4
+    critic_learning_rate: float = 1e-6
+    warm_up_steps: int = 0
+    final_learning_rate: float = 1.0
+    image_weight: float = 0.01
+    critic_weight: float = 10.0
+    gradient_penalty: float = 0.0
+    gradient_penalty_every: int = 1
+    sleep_weight: float = 1.0
+    sleep_noise: float = 0.5
+    sleep_drawn: float = 0.5
+    gradient_clip: float = 0.5
+    precision: Literal["float32", "bfloat16"] = "float32"
+    budget_images: int = 6_400_000
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could use."""
+        for name in (
+            "batch_size",
+            "micro_batch_size",
+            "learning_rate",
+            "gradient_clip",
+            "gradient_penalty_every",
+            "budget_images",
+        ):
+            if getattr(self, name) <= 0:
+                raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected more than 0")
+        if self.batch_size % self.micro_batch_size or self.micro_batch_size < 2:
+            raise UsageError(
+                f"--batch-size {self.batch_size} cannot be cut into micro-batches of {self.micro_batch_size}; "
+                "expected --micro-batch-size to divide it and be at least 2, because batch norm needs two images"
+            )
+
+
+PRESETS: Mapping[Preset, Recipe] = {
+    "paper": Recipe(),
+    "laptop": Recipe(
+        batch_size=32,
+        learning_rate=1e-3,
+        critic_learning_rate=1e-4,
+        warm_up_steps=50,
+        final_learning_rate=0.02,
+        critic_weight=0.1,
+        gradient_penalty=10.0,
+        gradient_penalty_every=8,
+        precision="bfloat16",
+        budget_images=48_000,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """All that decides what a run learns; ``config.json`` of its folder.
+
+    Attributes:
+        world: The world's own options.
+        method: our: image loss and critic. noncur: image loss alone. super: true scene codes. Beyond the paper,
+            wake_sleep: image loss, and renderings of self-made codes to regress; wake_sleep_critic: both.
+        labels: Share of the training images that --method super sees, with their true codes (paper: 0.05, 0.1, 1).
+        preset: Hyperparameters to start from: laptop (measured on two cores) or paper (the paper's).
+        seed: Of the initial weights and every random draw.
+        minutes: Budget of training time, in minutes.
+        images: Budget of images shown. Where both budgets are given the first to be reached ends the run.
+        stop_below: Converged, and done, when the image loss (summed squared error an image, smoothed) is below this;
+            0 never is.
+        recipe: Hyperparameters; the preset's unless given.
+        network: Sizes of the networks; the paper's unless given.
+    """
+
+    world: OmitArgPrefixes[WorldOptions]
+    method: Method = "our"
+    labels: float = 1.0
+    preset: Preset = "laptop"
+    seed: int = 0
+    minutes: float | None = None
+    images: int | None = None
+    stop_below: float = 0.0
+    recipe: OmitArgPrefixes[Recipe] = PRESETS["laptop"]
+    network: OmitArgPrefixes[NetworkConfig] = NetworkConfig()
+
+    def __post_init__(self) -> None:
+        """Refuse what contradicts itself."""
+        if not 0 < self.labels <= 1:
+            raise UsageError(f"--labels {self.labels} is no share, expected more than 0 and at most 1")
+        if self.labels != 1 and self.method != "super":
+            raise UsageError(
+                f"--labels {self.labels} with --method {self.method}, which uses none; expected --method super"
+            )
+        for name in ("minutes", "images"):
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
+                raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected more than 0")
+
+    @property
+    def terms(self) -> frozenset[Term]:
+        """The method's loss terms."""
+        return METHODS[self.method]
+
+    def progress(self, images: int, seconds: float) -> float:
+        """Share of the budget that is spent; 1 or more when it is used up."""
+        if self.images is None and self.minutes is None:
+            return images / self.recipe.budget_images
+        by_images = images / self.images if self.images is not None else 0.0
+        by_time = seconds / (60 * self.minutes) if self.minutes is not None else 0.0
+        return max(by_images, by_time)
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")

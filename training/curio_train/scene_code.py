@@ -49,7 +49,9 @@ class Field:
     def __post_init__(self) -> None:
         """Refuse a range that does not fit the size."""
         if len(self.lower) != len(self.upper) or (self.lower and len(self.lower) != self.size):
-            raise ValueError(f"field {self.name}: {len(self.lower)} lower and {len(self.upper)} upper bounds for size {self.size}")
+            raise ValueError(
+                f"field {self.name}: {len(self.lower)} lower and {len(self.upper)} upper bounds for size {self.size}"
+            )
         if not self.lower and self.activation != "linear":
             raise ValueError(f"field {self.name}: activation {self.activation} needs a range")
 
@@ -83,6 +85,15 @@ class Field:
         depth = ((log_near + log_far) / 2 + torch.tanh(raw[..., 2:]) * (log_far - log_near) / 2).exp()
         return torch.cat([slope * depth, depth], dim=-1)
 
+    def relative(self, value: Tensor) -> Tensor:
+        """Physical values in units of the range, so that differences are Eq. 1's with w = 1.
+
+        Shape ``[..., size]`` as given. Where the range is one of (x/z, y/z, z), so is the result.
+        """
+        if self.activation == "perspective":
+            value = torch.cat([value[..., :2] / value[..., 2:], value[..., 2:]], dim=-1)
+        return value / value.new_tensor(self.span)
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -108,6 +119,10 @@ class Layout:
     def shape(self, field: Field, batch: int) -> tuple[int, ...]:
         """Shape of that field's tensor for ``batch`` images."""
         return (batch, self.num_slots, field.size) if field.per_object else (batch, field.size)
+
+    def activate(self, raw: SceneCode) -> dict[str, Tensor]:
+        """Raw head outputs of all fields to the scene code, see :meth:`Field.activate`."""
+        return {field.name: field.activate(raw[field.name]) for field in self.fields}
 
     def check(self, code: SceneCode) -> None:
         """Refuse a code whose names or shapes differ from this layout.

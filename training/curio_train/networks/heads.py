@@ -27,10 +27,13 @@ class Heads(nn.Module):
             {field.name: _branch(row if field.per_object else latent, hidden, field.size) for field in layout.fields}
         )
 
-    def forward(self, latent: Float[Tensor, "batch latent"]) -> dict[str, Tensor]:
-        """The scene code: [batch, slots, size] for each object field, [batch, size] for each scene field."""
+    def raw(self, latent: Float[Tensor, "batch latent"]) -> dict[str, Tensor]:
+        """Outputs before activation: [batch, slots, size] for object fields, [batch, size] for the scene's."""
         rows = self.trunk(latent).unflatten(1, (self.layout.num_slots, self.row))
         return {
-            field.name: field.activate(self.branches[field.name](rows if field.per_object else latent))
-            for field in self.layout.fields
+            field.name: self.branches[field.name](rows if field.per_object else latent) for field in self.layout.fields
         }
+
+    def forward(self, latent: Float[Tensor, "batch latent"]) -> dict[str, Tensor]:
+        """The scene code in physical units, in the shapes of :meth:`raw`."""
+        return self.layout.activate(self.raw(latent))

@@ -1,0 +1,124 @@
+"""The command lines of training. Each imports its heavy packages only once its arguments are understood."""
+
+import argparse
+import dataclasses
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from rich.console import Console
+from tyro.conf import OmitArgPrefixes
+
+from curio_train.config import PRESETS, RunConfig, WorldOptions
+from curio_train.errors import CurioError
+from curio_train.learning.configuration import load_config, refuse_other, world_name
+from curio_train.learning.interruption import Interrupted, Interruption, interruptible
+from curio_train.worlds import WORLDS
+
+
+@dataclass(frozen=True)
+class Session:
+    """Where and how this process trains; may differ between the sessions of one run.
+
+    Attributes:
+        out: Folder of the new run; runs/WORLD-METHOD-SEED unless given.
+        resume: Folder of a run to go on with, with its own configuration; budgets may be given anew.
+        cache: Where image sets that a world draws once are kept.
+        device: auto takes CUDA where there is one.
+        checkpoint_minutes: Minutes of training between checkpoints.
+    """
+
+    out: Path | None = None
+    resume: Path | None = None
+    cache: Path = Path("~/.cache/curio-pose")
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    checkpoint_minutes: float = 1.0
+
+
+@dataclass(frozen=True)
+class TrainCommand:
+    """Learn a world's poses from its images."""
+
+    config: OmitArgPrefixes[RunConfig]
+    session: OmitArgPrefixes[Session] = Session()
+
+
+def train(arguments: Sequence[str] | None = None) -> None:
+    """``curio-train WORLD …``: exit status 0 done, 1 failed, 2 wrong call, 128 + signal when interrupted."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    sys.exit(answer(lambda interruption: _train(_parse(given), interruption)))
+
+
+def answer(work: Callable[[Interruption], int]) -> int:
+    """Do a command's work and return its exit status; each deliberate error is one message on stderr."""
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    with interruptible() as interruption:
+        try:
+            return work(interruption)
+        except CurioError as exc:
+            console.print("error:", str(exc), style="bold red", markup=False)
+            return exc.exit_status
+        except Interrupted as exc:
+            console.print(f"stopped by {exc}; whatever was saved before is intact", markup=False)
+            return exc.exit_status
+
+
+def _parse(arguments: list[str]) -> TrainCommand:
+    """The call as typed; what it leaves out comes from the preset, or from the run it resumes."""
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", nargs="?", default="laptop")
+    first.add_argument("--resume", nargs="?", type=Path)
+    seen, _ = first.parse_known_args(arguments)
+
+    recipe = PRESETS.get(seen.preset, PRESETS["laptop"])  # an unknown preset is tyro's to refuse
+    defaults = {name: RunConfig(_unset(kind), recipe=recipe) for name, kind in WORLDS.items()}
+    stored = load_config(seen.resume) if seen.resume else None
+    if stored is not None:
+        defaults[world_name(stored)] = stored
+    commands = tyro.extras.subcommand_type_from_defaults(
+        {name: TrainCommand(config) for name, config in defaults.items()},
+        {name: (kind.__doc__ or "").partition("\n\n")[0] for name, kind in WORLDS.items()},
+    )
+    command: TrainCommand = tyro.cli(
+        commands,
+        args=arguments,
+        prog="curio-train",
+        description=f"Learn to read poses from images without labels. Worlds: {', '.join(WORLDS)}.",
+    )
+    if stored is not None:
+        refuse_other(stored, command.config, seen.resume)
+    return command
+
+
+def _unset(kind: type[WorldOptions]) -> WorldOptions:
+    """Options of a world with those that the user has to give marked as missing."""
+    required = [field.name for field in dataclasses.fields(kind) if field.default is field.default_factory]
+    return kind(**dict.fromkeys(required, tyro.MISSING))
+
+
+def _train(command: TrainCommand, interruption: Interruption) -> int:
+    from curio_train.learning.loop import Outcome
+    from curio_train.learning.session import learn
+
+    config, session = command.config, command.session
+    path = session.resume or session.out or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
+    outcome, course = learn(
+        config,
+        path,
+        interruption,
+        resume=session.resume is not None,
+        cache=session.cache,
+        device=session.device,
+        checkpoint_minutes=session.checkpoint_minutes,
+    )
+    if int(os.environ.get("RANK", "0")) == 0:
+        loss = "" if course.image_loss is None else f", image loss {course.image_loss:.4g}"
+        print(f"{path}: {outcome.value} after {course.images:,} images in {course.seconds / 60:.1f} minutes{loss}")
+    if outcome is Outcome.INTERRUPTED and interruption.signum is not None:
+        print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
+        return 128 + interruption.signum
+    return 0

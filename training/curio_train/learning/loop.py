@@ -1,0 +1,241 @@
+"""The training step and the loop around it, for every method and world.
+
+A method is a set of loss terms (``config.METHODS``). Every random draw is a function of the seed and the step, so a run
+that is stopped and resumed goes on as if uninterrupted.
+"""
+
+import math
+import time
+from collections import Counter
+from dataclasses import replace
+from enum import Enum
+
+import torch
+from torch import Tensor
+
+from curio_train.config import Recipe, RunConfig
+from curio_train.errors import TrainingError
+from curio_train.learning.checkpoint import RunFolder
+from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, gradient_penalty
+from curio_train.learning.interruption import Interruption
+from curio_train.learning.losses import image_loss, supervised_loss
+from curio_train.learning.parallel import Ranks
+from curio_train.learning.progress import Reporter
+from curio_train.learning.sleep import sleep_codes
+from curio_train.learning.state import TrainState
+from curio_train.worlds.base import Batch, ImageSource, World
+
+_SMOOTHING = 0.98  # of the image loss that convergence is judged by: a memory of about 50 steps
+_NUM_PAIRS = 8
+
+
+class Outcome(Enum):
+    """Why training ended, in words for the user."""
+
+    CONVERGED = "converged: the image loss is below --stop-below"
+    SPENT = "the budget is spent"
+    INTERRUPTED = "interrupted"
+
+
+class Trainer:
+    """One run on one process: a world, its images, the networks, and how they learn.
+
+    Attributes:
+        config: What to learn and how.
+        world: What is seen.
+        ranks: This process among those that train together.
+        state: All that changes.
+    """
+
+    def __init__(self, config: RunConfig, world: World, source: ImageSource, ranks: Ranks) -> None:
+        self.config = config
+        self.world = world
+        self.ranks = ranks
+        self.state = TrainState(config, world, ranks.device)
+        self._source = source
+        self._groups = tuple(kind.slots for kind in world.objects)
+        self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
+        self._share = ranks.share(self._num_micro)
+
+    def step(self, rate: float) -> dict[str, float]:
+        """One whole step: every micro-batch adds its gradients, then all networks move.
+
+        Args:
+            rate: Factor on the learning rates.
+
+        Returns:
+            Each loss term unweighted, and the critic's own loss as "critic"; means over the batch.
+
+        Raises:
+            TrainingError: A loss or a gradient is not finite. The networks are then left as they were.
+        """
+        recipe, terms, critic = self.config.recipe, self.config.terms, self.state.critic
+        weights = {
+            "image": recipe.image_weight,
+            "curiosity": recipe.critic_weight,
+            "sleep": recipe.sleep_weight,
+            "label": 1.0,
+        }
+        sums: Counter[str] = Counter()
+        for learner in self.state.learners.values():
+            learner.optimizer.zero_grad()
+
+        for micro in self._share:
+            number = self.state.course.step * self._num_micro + micro
+            batch = self._to_device(self._source.batch(number, recipe.micro_batch_size))
+            losses: dict[str, Tensor] = {}
+
+            # Awake: read the images, render what was read, compare one by one (image) and as a set (curiosity).
+            raw, code = self._read(batch.images)
+            if terms & {"image", "curiosity"}:
+                rendered = self.world.render(code, batch.backgrounds)
+            if "image" in terms:
+                losses["image"] = image_loss(rendered, batch.images)
+            if critic is not None:
+                with frozen(critic.network):
+                    losses["curiosity"] = curiosity_loss(self._judge, rendered)
+            if "label" in terms and batch.code is not None:
+                losses["label"] = supervised_loss(self.world.layout, code, batch.code, self._groups)
+
+            # Asleep: render codes of one's own making, read them back.
+            if "sleep" in terms:
+                seed = (self.config.seed, number)
+                dream = sleep_codes(self.world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
+                with torch.no_grad():
+                    dreamt = self.world.disturb(self.world.render(dream, batch.backgrounds), seed)
+                    dreamt = self.world.disturb(dreamt, (self.config.seed, number))
+                losses["sleep"] = supervised_loss(self.world.layout, self._read(dreamt)[1], dream, self._groups)
+
+            torch.stack([weights[name] * loss for name, loss in losses.items()]).sum().div(self._num_micro).backward()
+
+            # The critic: tell data from renderings, with the weights it had when it judged above.
+            if critic is not None:
+                losses["critic"] = critic_loss(self._judge, batch.images, rendered)
+                critic_total = losses["critic"]
+                if recipe.gradient_penalty and self.state.course.step % recipe.gradient_penalty_every == 0:
+                    weight = recipe.gradient_penalty * recipe.gradient_penalty_every
+                    critic_total = critic_total + weight * gradient_penalty(self._judge, batch.images)
+                (critic_total / self._num_micro).backward()
+
+            sums.update({name: loss.item() / self._num_micro for name, loss in losses.items()})
+
+        means = self._add_up_over_ranks(sums)
+        self._move(means, rate)
+        return means
+
+    @torch.no_grad()
+    def pairs(self) -> tuple[Tensor, Tensor]:
+        """A few training images, always the same, and what the network as it will be exported makes of them."""
+        batch = self._to_device(self._source.batch(0, _NUM_PAIRS))
+        self.state.pose.network.eval()
+        rendered = self.world.render(self.state.pose.network(batch.images), batch.backgrounds)
+        self.state.pose.network.train()
+        return batch.images, rendered
+
+    def _read(self, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The network's raw outputs and scene codes; positions need float32, convolutions do not."""
+        network = self.state.pose.network
+        with self._autocast():
+            latent = network.encoder(images)
+        raw = network.heads.raw(latent.float())
+        return raw, self.world.layout.activate(raw)
+
+    def _judge(self, images: Tensor) -> Tensor:
+        """The critic's logits."""
+        assert self.state.critic is not None  # only methods with curiosity come here
+        with self._autocast():
+            logits: Tensor = self.state.critic.network(images)
+        return logits.float()
+
+    def _autocast(self) -> torch.autocast:
+        half = self.config.recipe.precision == "bfloat16"
+        return torch.autocast(self.ranks.device.type, torch.bfloat16, enabled=half)
+
+    def _to_device(self, batch: Batch) -> Batch:
+        device = self.ranks.device
+        return replace(
+            batch,
+            images=batch.images.to(device),
+            backgrounds=None if batch.backgrounds is None else batch.backgrounds.to(device),
+            code=None if batch.code is None else {name: value.to(device) for name, value in batch.code.items()},
+        )
+
+    def _add_up_over_ranks(self, sums: Counter[str]) -> dict[str, float]:
+        """Sum gradients and losses over all processes, average batch norm's running statistics."""
+        gradients = [
+            parameter.grad
+            for learner in self.state.learners.values()
+            for parameter in learner.network.parameters()
+            if parameter.grad is not None
+        ]
+        statistics = [value for value in self.state.pose.network.buffers() if value.is_floating_point()]
+        losses = torch.tensor(list(sums.values()), device=self.ranks.device)
+        for value in statistics:
+            value /= self.ranks.size
+        self.ranks.sum([*gradients, *statistics, losses])
+        return dict(zip(sums, losses.tolist(), strict=True))
+
+    def _move(self, losses: dict[str, float], rate: float) -> None:
+        course, recipe = self.state.course, self.config.recipe
+        bad = [name for name, value in losses.items() if not math.isfinite(value)]
+        for who, learner in self.state.learners.items():
+            if not learner.clip_gradient(recipe.gradient_clip):
+                bad.append(f"the gradient of {who}")
+        if bad:
+            raise TrainingError(
+                f"step {course.step + 1}: not finite: {', '.join(bad)}; the step is discarded. "
+                "Go back to the last checkpoint, or start anew with a lower --learning-rate, or --precision float32"
+            )
+        for learner in self.state.learners.values():
+            learner.step(rate)
+        course.step += 1
+        course.images += recipe.batch_size
+        if "image" in losses:
+            before = losses["image"] if course.image_loss is None else course.image_loss
+            course.image_loss = _SMOOTHING * before + (1 - _SMOOTHING) * losses["image"]
+
+
+def train(
+    trainer: Trainer, run: RunFolder, interruption: Interruption, reporter: Reporter | None, checkpoint_minutes: float
+) -> Outcome:
+    """Train until convergence, the end of the budget, or a signal; leaves a checkpoint in each case.
+
+    Only the process with a reporter writes: under torchrun all have the same state.
+
+    Raises:
+        TrainingError: The optimisation broke down; the last checkpoint is the one to go back to.
+        CheckpointError: A checkpoint could not be written; earlier ones are intact.
+    """
+    config, course, ranks = trainer.config, trainer.state.course, trainer.ranks
+    saved_at, clock = course.seconds, time.monotonic()
+    with interruption.deferred():
+        while True:
+            # All processes go by the slowest clock and by anyone's signal, so that they stop at the same step.
+            seconds, signalled = ranks.largest(course.seconds, interruption.signum or 0)
+            progress = config.progress(course.images, seconds)
+            outcome = _outcome(config, course.image_loss, progress, bool(signalled))
+            if reporter and (outcome or seconds - saved_at >= 60 * checkpoint_minutes):
+                run.save(trainer.state)
+                reporter.pictures(course, trainer.pairs())
+                saved_at = seconds
+            if outcome:
+                return outcome
+            losses = trainer.step(learning_rate_factor(config.recipe, course.step, progress))
+            course.seconds, clock = course.seconds + time.monotonic() - clock, time.monotonic()
+            if reporter:
+                reporter.step(course, losses, progress)
+
+
+def _outcome(config: RunConfig, loss: float | None, progress: float, signalled: bool) -> Outcome | None:
+    if loss is not None and loss < config.stop_below:
+        return Outcome.CONVERGED
+    if progress >= 1:
+        return Outcome.SPENT
+    return Outcome.INTERRUPTED if signalled else None
+
+
+def learning_rate_factor(recipe: Recipe, step: int, progress: float) -> float:
+    """Linear warm-up over the first steps, then a cosine from 1 down to ``final_learning_rate`` at the budget's end."""
+    warm = min(1.0, (step + 1) / (recipe.warm_up_steps + 1))
+    cosine = (1 + math.cos(math.pi * min(progress, 1.0))) / 2
+    return warm * (recipe.final_learning_rate + (1 - recipe.final_learning_rate) * cosine)

@@ -1,0 +1,123 @@
+"""What a user sees of a run: progress on stderr, curves and pictures in its folder.
+
+::
+
+    RUN/history.jsonl     one line every few steps: step, images, seconds, and each loss averaged since the line before
+        tensorboard/      the same curves, and input | re-rendering pairs
+        samples.png       the latest pairs: inputs above, re-renderings below
+"""
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from curio_train.errors import CheckpointError
+from curio_train.learning.state import Course
+
+_STEPS_A_LINE = 20  # of history and curves
+_SECONDS_A_LINE = 10  # of the log where stderr is no terminal
+
+
+class Reporter:
+    """Follows one run; see :func:`reporting`."""
+
+    def __init__(self, run: Path, course: Course, console: Console) -> None:
+        self._run = run
+        self._console = console
+        self._curves = SummaryWriter(str(run / "tensorboard"), purge_step=course.step)
+        self._history = (run / "history.jsonl").open("a", encoding="utf-8")
+        self._sums: Counter[str] = Counter()
+        self._since = (course.step, course.seconds)
+        self._logged_at = course.seconds
+        self._bar: Progress | None = None
+        self._task = TaskID(0)
+        if console.is_terminal:
+            self._bar = Progress(
+                BarColumn(), TextColumn("{task.percentage:3.0f} %  {task.description}"), console=console
+            )
+            self._task = self._bar.add_task("starting", total=1.0)
+            self._bar.start()
+
+    def step(self, course: Course, losses: dict[str, float], progress: float) -> None:
+        """Take note of one step."""
+        self._sums.update(losses)
+        steps = course.step - self._since[0]
+        if steps < _STEPS_A_LINE and progress < 1:
+            return
+        means = {name: value / steps for name, value in self._sums.items()}
+        rate = course.images / course.step * steps / max(course.seconds - self._since[1], 1e-9)
+        self._note(course, means, rate)
+        self._show(course, means, rate, progress)
+        self._sums.clear()
+        self._since = (course.step, course.seconds)
+
+    def pictures(self, course: Course, pairs: tuple[Tensor, Tensor]) -> None:
+        """Show inputs and re-renderings, [num, 3, height, width] each."""
+        sheet = torch.cat([torch.cat(list(images.cpu()), dim=2) for images in pairs], dim=1).clamp(0, 1)
+        self._curves.add_image("input above, re-rendering below", sheet, course.step)
+        pixels = (sheet * 255).round().byte().permute(1, 2, 0).numpy()
+        file = self._run / "samples.png"
+        if not cv2.imwrite(str(file), cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)):
+            raise CheckpointError(f"cannot write {file}; is the disk full?")
+
+    def close(self) -> None:
+        """Put everything on disk and leave the terminal in order."""
+        if self._bar is not None:
+            self._bar.stop()
+        self._history.close()
+        self._curves.close()
+
+    def _note(self, course: Course, means: dict[str, float], rate: float) -> None:
+        row = {"step": course.step, "images": course.images, "seconds": round(course.seconds, 3), **means}
+        self._history.write(json.dumps(row) + "\n")
+        self._history.flush()
+        for name, value in means.items():
+            self._curves.add_scalar(f"loss/{name}", value, course.step)
+        self._curves.add_scalar("images_per_second", rate, course.step)
+
+    def _show(self, course: Course, means: dict[str, float], rate: float, progress: float) -> None:
+        losses = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
+        left = course.seconds * (1 / progress - 1)
+        text = f"{course.images:,} images  {losses}  {rate:.0f} images/s  {_clock(left)} left"
+        if self._bar is not None:
+            self._bar.update(self._task, completed=min(progress, 1.0), description=text)
+        elif course.seconds - self._logged_at >= _SECONDS_A_LINE or progress >= 1:
+            self._console.print(f"{_clock(course.seconds)}  {text}", soft_wrap=True)
+            self._logged_at = course.seconds
+
+
+@contextmanager
+def reporting(run: Path, course: Course) -> Iterator[Reporter]:
+    """Follow a run from ``course`` on; what was noted after that point, by a session since killed, is dropped."""
+    try:
+        _drop_after(run / "history.jsonl", course.step)
+        reporter = Reporter(run, course, Console(stderr=True, highlight=False))
+    except OSError as exc:
+        raise CheckpointError(f"cannot write into {run}: {exc.strerror}") from exc
+    try:
+        yield reporter
+    finally:
+        reporter.close()
+
+
+def _drop_after(history: Path, step: int) -> None:
+    if not history.exists():
+        return
+    rows = [line for line in history.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
+    kept = [line for line in rows if json.loads(line)["step"] <= step]
+    history.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

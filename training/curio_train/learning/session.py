@@ -1,0 +1,59 @@
+"""One sitting of training: from a configuration to a run folder, new or resumed."""
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Literal
+
+from curio_train.config import RunConfig
+from curio_train.learning.checkpoint import RunFolder
+from curio_train.learning.interruption import Interruption
+from curio_train.learning.loop import Outcome, Trainer, train
+from curio_train.learning.parallel import ranks
+from curio_train.learning.progress import reporting
+from curio_train.learning.provenance import note_sitting
+from curio_train.learning.state import Course
+from curio_train.worlds import build
+
+
+def learn(
+    config: RunConfig,
+    path: Path,
+    interruption: Interruption,
+    *,
+    resume: bool,
+    cache: Path,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    checkpoint_minutes: float = 1.0,
+) -> tuple[Outcome, Course]:
+    """Train, alone or as one of torchrun's processes.
+
+    Args:
+        config: What to learn; of a resumed run, its own (see ``configuration.refuse_other``).
+        path: The run folder.
+        interruption: How signals arrive.
+        resume: Go on from the folder's last checkpoint instead of starting a run.
+        cache: Where worlds keep the image sets they draw once.
+        device: See ``parallel.ranks``.
+        checkpoint_minutes: Minutes of training between checkpoints.
+
+    Returns:
+        Why training ended, and how far it came.
+
+    Raises:
+        CurioError: Any of this package's errors; checkpoints that were written stay.
+    """
+    with ranks(device) as here:
+        run = RunFolder(path, config)
+        if here.leads:
+            run.write_config(new=not resume)
+            note_sitting(path)
+        world = build(config.world)
+        source = world.source("train", config.seed, with_code="label" in config.terms, cache=cache)
+        if config.labels < 1:
+            source = source.subset(config.labels)
+        trainer = Trainer(config, world, source, here)
+        if resume:
+            run.restore(trainer.state)
+        with reporting(path, trainer.state.course) if here.leads else nullcontext() as reporter:
+            outcome = train(trainer, run, interruption, reporter, checkpoint_minutes)
+        return outcome, trainer.state.course

@@ -1,0 +1,118 @@
+"""Everything that changes while a run learns, and that a checkpoint therefore holds."""
+
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Adam
+
+from curio_train.config import RunConfig
+from curio_train.networks.critic import Critic
+from curio_train.networks.pose import PoseNetwork
+from curio_train.worlds.base import World
+
+N = TypeVar("N", bound=nn.Module)
+_BETAS = (0.9, 0.999)  # paper, appendix, table of hyperparameters
+
+
+class Learner(Generic[N]):
+    """A network with its optimiser.
+
+    Attributes:
+        network: What learns.
+        optimizer: Adam, as in the paper.
+        learning_rate: Before warm-up and decay.
+    """
+
+    def __init__(self, network: N, learning_rate: float) -> None:
+        self.network = network
+        self.optimizer = Adam(network.parameters(), learning_rate, betas=_BETAS)
+        self.learning_rate = learning_rate
+
+    def clip_gradient(self, largest: float) -> bool:
+        """Cut the accumulated gradient to this L2 norm; whether it was finite."""
+        return bool(nn.utils.clip_grad_norm_(self.network.parameters(), largest).isfinite())
+
+    def step(self, rate: float) -> None:
+        """Step along the accumulated gradient with ``rate`` times the learning rate."""
+        self.optimizer.param_groups[0]["lr"] = rate * self.learning_rate
+        self.optimizer.step()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Weights, buffers and Adam's moments by name."""
+        weights = {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        moments = {
+            f"optimizer.{number}.{name}": value
+            for number, entry in self.optimizer.state_dict()["state"].items()
+            for name, value in entry.items()
+        }
+        return weights | moments
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Take over what :meth:`tensors` gave.
+
+        Raises:
+            RuntimeError: Names or shapes differ from this network's.
+        """
+        self.network.load_state_dict(_under("network.", tensors))
+        entries: dict[int, dict[str, Tensor]] = {}
+        for key, value in _under("optimizer.", tensors).items():
+            number, name = key.split(".")
+            entries.setdefault(int(number), {})[name] = value
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": entries})
+
+
+@dataclass
+class Course:
+    """How far a run has come.
+
+    Attributes:
+        step: Steps done. Every random draw is a function of the seed and this number: there is no other random state.
+        images: Images shown.
+        seconds: Time spent training, over all sessions.
+        image_loss: Unweighted and smoothed; None before the first step and for methods without it.
+    """
+
+    step: int = 0
+    images: int = 0
+    seconds: float = 0.0
+    image_loss: float | None = None
+
+
+class TrainState:
+    """The networks, their optimisers, and the course of the run."""
+
+    def __init__(self, config: RunConfig, world: World, device: torch.device) -> None:
+        torch.manual_seed(config.seed)
+        self.course = Course()
+        self.pose = Learner(
+            PoseNetwork(world.layout, world.camera.width, config.network).to(device), config.recipe.learning_rate
+        )
+        self.critic: Learner[Critic] | None = None
+        if "curiosity" in config.terms:
+            critic = Critic(config.network.critic, config.network.critic_normalisation).to(device)
+            self.critic = Learner(critic, config.recipe.critic_learning_rate)
+
+    @property
+    def learners(self) -> dict[str, Learner[Any]]:
+        """All that learn, by name."""
+        return {"pose": self.pose} | ({"critic": self.critic} if self.critic else {})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name, see :meth:`Learner.tensors`."""
+        return {f"{who}.{name}": value for who, one in self.learners.items() for name, value in one.tensors().items()}
+
+    def load(self, tensors: dict[str, Tensor], course: Course) -> None:
+        """Go back to where :meth:`tensors` and ``course`` were taken.
+
+        Raises:
+            RuntimeError: The tensors are not those of these networks.
+        """
+        for who, learner in self.learners.items():
+            learner.load(_under(f"{who}.", tensors))
+        self.course = course
+
+
+def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
