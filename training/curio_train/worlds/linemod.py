@@ -95,6 +95,11 @@ class Linemod(World):
         )
         self._renderer = Renderer([self.mesh], [0], SIDE_PX, SIDE_PX, ambient=AMBIENT)
 
+    @property
+    def model_name(self) -> str:
+        """The class's own name."""
+        return self._options.class_name
+
     def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:
         """Poses from the published range, light from the camera's side."""
         random = np.random.default_rng(seed)
