@@ -47,7 +47,7 @@ class PoseServer:
         self._stopped = asyncio.Event()
 
     async def start(self) -> list[str]:
-        """Load the models and open the ports.
+        """Load the models and open the ports. From here on SIGTERM and SIGINT end the server in good order.
 
         Returns:
             The addresses that answer: gRPC's, and the metrics' URL where they are on.
@@ -57,6 +57,9 @@ class PoseServer:
             Unavailable: A port is taken.
             UsageError: A certificate, key or token file cannot be used.
         """
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self.stop)
         self._report(await asyncio.to_thread(self._repository.refresh))
         if not list(self._repository):
             raise ModelError(
@@ -115,10 +118,7 @@ class PoseServer:
             await self._health.set(name, _SERVING)
 
     async def serve_until_stopped(self) -> None:
-        """Answer calls until SIGTERM, SIGINT or :meth:`stop`; then finish what was accepted."""
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self.stop)
+        """Answer calls until SIGTERM, SIGINT or :meth:`stop`, also one during :meth:`start`; finish what was accepted."""
         watcher = asyncio.create_task(self._watch())
         try:
             await self._stopped.wait()

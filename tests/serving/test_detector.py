@@ -47,8 +47,8 @@ def _picture(draw: DrawSpot, position: np.ndarray, camera: PinholeCamera) -> np.
 
 
 def _check_position(found: Sequence[float], truth: np.ndarray) -> None:
-    """The direction to a tenth of a pixel of the model's input; depth as far as brightness tells it off the axis."""
-    np.testing.assert_allclose(np.array(found)[:2] / found[2], truth[:2] / truth[2], atol=1e-3)
+    """The direction to a fifth of a pixel of the model's input; depth as far as brightness tells it off the axis."""
+    np.testing.assert_allclose(np.array(found)[:2] / found[2], truth[:2] / truth[2], atol=2e-3)
     assert found[2] == pytest.approx(truth[2], rel=0.05)
 
 

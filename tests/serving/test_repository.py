@@ -1,0 +1,121 @@
+"""Models found, loaded, replaced and refused while others go on serving."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from curio_serve.errors import ModelError, ModelNotFound
+from curio_serve.model_check import ChildCheck
+from curio_serve.repository import Repository
+
+MakeOnnx = Callable[..., onnx.ModelProto]
+WriteFolder = Callable[..., Path]
+
+
+@pytest.fixture
+def root(models_dir: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(models_dir, tmp_path / "models"))
+
+
+def _events(repository: Repository, check: ChildCheck | None = None) -> set[tuple[str, str, int]]:
+    return {(change.event, change.name, change.version) for change in repository.refresh(check)}
+
+
+def test_models_are_found_and_named(root: Path) -> None:
+    (root / ".hidden" / "1").mkdir(parents=True)
+    (root / "notes.txt").write_text("not a model")
+    (root / "empty").mkdir()
+    repository = Repository(root)
+    assert _events(repository) == {("loaded", "flat", 1), ("loaded", "pinhole", 1)}
+    assert [name for name, _ in repository] == ["flat", "pinhole"]
+    assert repository.get("flat").version == 1
+    assert repository.get("flat", 1) is repository.get("flat")
+    assert _events(repository) == set()
+
+
+@pytest.mark.parametrize("name", ["", "nothing", "../flat", "flat/1", "flat\0", "x" * 10_000])
+def test_unknown_names(root: Path, name: str) -> None:
+    repository = Repository(root)
+    repository.refresh()
+    with pytest.raises(ModelNotFound, match=r"loaded are \['flat', 'pinhole'\]"):
+        repository.get(name)
+    with pytest.raises(ModelNotFound, match="has no version 9"):
+        repository.get("flat", 9)
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"models folder .*nowhere cannot be read"):
+        Repository(tmp_path / "nowhere").refresh()
+
+
+def test_new_versions_come_and_old_ones_go(root: Path, spot_onnx: MakeOnnx, write_folder: WriteFolder) -> None:
+    repository = Repository(root, num_versions=2)
+    repository.refresh()
+    first = repository.get("flat")
+    write_folder(root / "flat", spot_onnx(False), 2)
+    assert _events(repository, ChildCheck()) == {("loaded", "flat", 1), ("loaded", "flat", 2)}
+    assert repository.get("flat").version == 2
+    write_folder(root / "flat", spot_onnx(False), 3)
+    events = _events(repository)
+    assert ("unloaded", "flat", 1) in events
+    assert ("loaded", "flat", 3) in events
+    # A call that holds a model keeps it alive, whatever happens to the folder.
+    assert first.run(np.zeros((1, 64, 96, 3), np.uint8))
+    shutil.rmtree(root / "flat")
+    assert _events(repository) == {("unloaded", "flat", 2), ("unloaded", "flat", 3)}
+    assert [name for name, _ in repository] == ["pinhole"]
+
+
+def test_a_broken_version_changes_nothing(root: Path, spot_onnx: MakeOnnx, write_folder: WriteFolder) -> None:
+    repository = Repository(root, num_versions=1)
+    repository.refresh()
+    (root / "flat" / "2").mkdir()
+    (root / "flat" / "2" / "model.onnx").write_bytes(b"half a file")
+    [refused] = repository.refresh(ChildCheck())
+    assert (refused.event, refused.version) == ("refused", 2)
+    assert "is not an ONNX file" in refused.reason
+    assert repository.get("flat").version == 1
+    assert repository.refresh(ChildCheck()) == [], "a refused file is not tried again until it changes"
+    # A server that starts now serves the same.
+    late = Repository(root, num_versions=1)
+    assert _events(late) == {("refused", "flat", 2), ("loaded", "flat", 1), ("loaded", "pinhole", 1)}
+    write_folder(root / "flat", spot_onnx(False), 2)
+    assert ("loaded", "flat", 2) in _events(repository, ChildCheck())
+    assert repository.get("flat").version == 2
+
+
+def test_a_file_replaced_in_place_is_checked_before_it_serves(root: Path, spot_onnx: MakeOnnx) -> None:
+    repository = Repository(root)
+    repository.refresh()
+    before = repository.get("pinhole")
+    path = root / "pinhole" / "1" / "model.onnx"
+    good = path.read_bytes()
+    path.write_bytes(good[: len(good) // 2])
+    assert _events(repository, ChildCheck()) == {("refused", "pinhole", 1)}
+    assert repository.get("pinhole") is before
+    path.write_bytes(good)
+    os.utime(path, ns=(1, 1))
+    assert _events(repository, ChildCheck()) == {("loaded", "pinhole", 1)}
+    assert repository.get("pinhole") is not before
+
+
+def test_the_child_check_says_why(root: Path) -> None:
+    check = ChildCheck()
+    check(root / "flat", 1)
+    (root / "flat" / "SHA256SUMS").write_text("0" * 64 + "  1/model.onnx\n")
+    with pytest.raises(ModelError, match="the file is damaged or was replaced"):
+        check(root / "flat", 1)
+
+
+def test_many_replacements(root: Path, spot_onnx: MakeOnnx, write_folder: WriteFolder) -> None:
+    repository = Repository(root, num_versions=1)
+    repository.refresh()
+    for version in range(2, 52):
+        write_folder(root / "flat", spot_onnx(False), version)
+        shutil.rmtree(root / "flat" / str(version - 1))
+        repository.refresh()
+        assert repository.get("flat").version == version

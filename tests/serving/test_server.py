@@ -1,0 +1,264 @@
+"""The server's life: starting, refusing to start, load, replacement, leaving; and who may call."""
+
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import urllib.request
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import grpc
+import numpy as np
+import onnx
+import pytest
+from curio_proto.v1 import detector_pb2 as pb
+from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
+from google.rpc import error_details_pb2
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_status import rpc_status
+
+StartServer = Callable[..., Any]
+SMALL = pb.RawImage(format=pb.PIXEL_FORMAT_GRAY8, width=96, height=64, data=bytes(96 * 64))
+SMALL_REQUEST = pb.DetectRequest(models=[pb.ModelSelector(name="flat")], raw=SMALL)
+
+
+@pytest.fixture(scope="module")
+def slow_request() -> pb.DetectRequest:
+    """A frame that takes long to decode: 25 million pixels in a small file."""
+    data = cv2.imencode(".png", np.zeros((5000, 5000), np.uint8))[1].tobytes()
+    return pb.DetectRequest(models=[pb.ModelSelector(name="flat")], encoded=data)
+
+
+def _run(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    code = "from curio_serve.serve_cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def _metric(url: str, name: str) -> float:
+    with urllib.request.urlopen(url, timeout=10) as page:
+        lines = [line.split() for line in page.read().decode().splitlines()]
+    return next(float(line[1]) for line in lines if line[0] == name)
+
+
+def test_a_taken_port_is_named(server: Any, models_dir: Path) -> None:
+    port = server.address.rsplit(":", 1)[1]
+    ended = _run(str(models_dir), "--port", port)
+    assert ended.returncode == 1
+    assert f"cannot listen on 127.0.0.1:{port}: Address already in use; choose another --port" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["{tmp}/nowhere"], 1, "models folder {tmp}/nowhere cannot be read"),
+        (["{tmp}"], 1, "no model could be loaded from {tmp}"),
+        (["{models}", "--token-file", "{tmp}/none"], 2, "--token-file {tmp}/none cannot be read"),
+        (["{models}", "--tls-key", "{tmp}/k", "--tls-certificate", "{tmp}/c"], 2, "--tls-key {tmp}/k cannot be read"),
+        (["{models}", "--providers", "NoSuchProvider"], 1, "no model could be loaded"),
+        (["{models}", "--queue", "-3"], 2, "--queue is -3"),
+    ],
+)
+def test_what_cannot_start_says_why(
+    arguments: list[str], status: int, words: str, models_dir: Path, tmp_path: Path
+) -> None:
+    names = {"tmp": str(tmp_path), "models": str(models_dir)}
+    ended = _run(*[argument.format(**names) for argument in arguments], "--port", "0")
+    assert ended.returncode == status
+    assert words.format(**names) in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_dump_config(models_dir: Path) -> None:
+    ended = _run(str(models_dir), "--queue", "7", "--dump-config")
+    assert ended.returncode == 0
+    assert "queue = 7\n" in ended.stdout
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_end_an_idle_server(start_server: StartServer, models_dir: Path, number: int) -> None:
+    server = start_server(models_dir)
+    assert server.stop(number) == 0
+    assert "Traceback" not in server.log.read_text()
+
+
+def test_accepted_requests_are_finished_before_it_leaves(
+    start_server: StartServer, models_dir: Path, slow_request: pb.DetectRequest
+) -> None:
+    server = start_server(models_dir, "--workers", "1", "--metrics-port", "0")
+    with grpc.insecure_channel(server.address) as channel:
+        stub = PoseDetectorStub(channel)
+        calls = [stub.Detect.future(slow_request, timeout=60) for _ in range(4)]
+        while _metric(server.metrics_url, "curio_queue_length") < 3:
+            assert server.process.poll() is None
+        assert server.stop() == 0
+        assert [call.result().width for call in calls] == [5000] * 4
+        with pytest.raises(grpc.RpcError) as caught:
+            stub.Detect(SMALL_REQUEST, timeout=10)
+        assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
+
+
+def test_a_full_queue_is_told_with_the_time_to_come_back(
+    start_server: StartServer, models_dir: Path, slow_request: pb.DetectRequest
+) -> None:
+    server = start_server(models_dir, "--workers", "1", "--queue", "1")
+    refused = 0
+    with grpc.insecure_channel(server.address) as channel:
+        stub = PoseDetectorStub(channel)
+        calls = [stub.Detect.future(slow_request, timeout=60) for _ in range(8)]
+        for call in calls:
+            error = call.exception()
+            if error is None:
+                continue
+            refused += 1
+            assert error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+            retry = error_details_pb2.RetryInfo()
+            assert any(detail.Unpack(retry) for detail in rpc_status.from_call(error).details)
+            assert retry.retry_delay.ToNanoseconds() > 0
+        assert 1 <= refused <= 6
+        assert stub.Detect(SMALL_REQUEST, timeout=30).results
+
+
+def test_models_are_replaced_without_a_failed_call(
+    start_server: StartServer, models_dir: Path, tmp_path: Path, spot_onnx: Callable[..., onnx.ModelProto],
+    write_folder: Callable[..., Path],
+) -> None:  # fmt: skip
+    root = Path(shutil.copytree(models_dir, tmp_path / "models"))
+    server = start_server(root, "--refresh-s", "0.05")
+    seen: set[int] = set()
+    done = threading.Event()
+
+    def ask() -> int:
+        num_calls = 0
+        with grpc.insecure_channel(server.address) as channel:
+            stub = PoseDetectorStub(channel)
+            while not done.is_set():
+                seen.add(stub.Detect(SMALL_REQUEST, timeout=30).results[0].model_version)
+                num_calls += 1
+        return num_calls
+
+    with ThreadPoolExecutor(2) as pool:
+        asking = [pool.submit(ask) for _ in range(2)]
+        try:
+            for version in range(2, 6):
+                write_folder(root / "flat", spot_onnx(False), version)
+                while version not in seen and not any(call.done() for call in asking):
+                    done.wait(0.01)
+            (root / "flat" / "9").mkdir()
+            (root / "flat" / "9" / "model.onnx").write_bytes(b"broken")
+            while "is not an ONNX file" not in server.log.read_text() and not any(call.done() for call in asking):
+                done.wait(0.01)
+        finally:
+            done.set()
+        assert all(call.result() > 0 for call in asking)
+    assert {2, 3, 4, 5} <= seen
+    assert 9 not in seen
+
+
+def test_tokens(start_server: StartServer, models_dir: Path, tmp_path: Path) -> None:
+    tokens = tmp_path / "tokens"
+    tokens.write_text("first-token\n\nsecond-token\n")
+    server = start_server(models_dir, "--token-file", str(tokens), "--log-level", "debug")
+    with grpc.insecure_channel(server.address) as channel:
+        stub = PoseDetectorStub(channel)
+        for good in ("first-token", "second-token"):
+            metadata = [("authorization", f"Bearer {good}")]
+            assert stub.Detect(SMALL_REQUEST, timeout=10, metadata=metadata).results
+        for bad in ("Bearer wrong-token", "first-token", "Bearer ", "Bearer first-token ", "Basic first-token"):
+            with pytest.raises(grpc.RpcError) as caught:
+                stub.Detect(SMALL_REQUEST, timeout=10, metadata=[("authorization", bad)])
+            assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
+        with pytest.raises(grpc.RpcError) as caught:
+            list(stub.DetectStream(iter([SMALL_REQUEST]), timeout=10))
+        assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
+        answer = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=10)
+        assert answer.status == health_pb2.HealthCheckResponse.SERVING
+    assert server.stop() == 0
+    assert "token" not in server.log.read_text().replace("bearer token missing", "")
+
+
+class Authority:
+    """A certificate authority of our own, made with the openssl command."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._openssl("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2",
+                      "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=test authority")  # fmt: skip
+
+    def _openssl(self, *arguments: str) -> None:
+        subprocess.run(["openssl", *arguments], cwd=self.folder, check=True, capture_output=True, timeout=60)
+
+    def issue(self, name: str) -> tuple[Path, Path]:
+        """Certificate and key for 127.0.0.1."""
+        (self.folder / "ext").write_text("subjectAltName=IP:127.0.0.1")
+        self._openssl("req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes",
+                      "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", f"/CN={name}")  # fmt: skip
+        self._openssl("x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial",
+                      "-days", "2", "-extfile", "ext", "-out", f"{name}.pem")  # fmt: skip
+        return self.folder / f"{name}.pem", self.folder / f"{name}.key"
+
+
+@pytest.fixture(scope="module")
+def authorities(tmp_path_factory: pytest.TempPathFactory) -> tuple[Authority, Authority]:
+    if shutil.which("openssl") is None:
+        pytest.skip("the openssl command is not installed; it makes the certificates of this test")
+    return Authority(tmp_path_factory.mktemp("ours")), Authority(tmp_path_factory.mktemp("theirs"))
+
+
+def test_tls_and_client_certificates(
+    start_server: StartServer, models_dir: Path, authorities: tuple[Authority, Authority]
+) -> None:
+    ours, theirs = authorities
+    certificate, key = ours.issue("server")
+    roots = (ours.folder / "ca.pem").read_bytes()
+    good, bad = ours.issue("client"), theirs.issue("stranger")
+    server = start_server(models_dir, "--tls-certificate", str(certificate), "--tls-key", str(key),
+                          "--client-ca", str(ours.folder / "ca.pem"))  # fmt: skip
+
+    def status(root: bytes, pair: tuple[Path, Path] | None) -> grpc.StatusCode:
+        shown = (pair[1].read_bytes(), pair[0].read_bytes()) if pair else (None, None)
+        with grpc.secure_channel(server.address, grpc.ssl_channel_credentials(root, *shown)) as channel:
+            try:
+                PoseDetectorStub(channel).Detect(SMALL_REQUEST, timeout=10)
+            except grpc.RpcError as exc:
+                return exc.code()
+        return grpc.StatusCode.OK
+
+    assert status(roots, good) is grpc.StatusCode.OK
+    assert status(roots, None) is grpc.StatusCode.UNAVAILABLE
+    assert status(roots, bad) is grpc.StatusCode.UNAVAILABLE
+    assert status((theirs.folder / "ca.pem").read_bytes(), good) is grpc.StatusCode.UNAVAILABLE
+    with grpc.insecure_channel(server.address) as channel, pytest.raises(grpc.RpcError):
+        PoseDetectorStub(channel).Detect(SMALL_REQUEST, timeout=10)
+
+
+def test_it_serves_where_the_training_stack_cannot_be_imported(models_dir: Path) -> None:
+    code = """
+import sys
+for name in ("torch", "mitsuba", "drjit", "onnx", "trimesh", "curio_train"):
+    sys.modules[name] = None
+import asyncio
+from curio_serve.config import ServeConfig
+from curio_serve.server import PoseServer
+from pathlib import Path
+
+async def main():
+    server = PoseServer(ServeConfig(models=Path(sys.argv[1]), port=0))
+    print(await server.start())
+    asyncio.get_running_loop().call_later(0.1, server.stop)
+    await server.serve_until_stopped()
+
+asyncio.run(main())
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code, str(models_dir)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert "127.0.0.1:" in ended.stdout
