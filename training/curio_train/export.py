@@ -1,0 +1,214 @@
+"""From a run to a model that any runtime can serve: encoder and heads alone, checked against the trained network."""
+
+import copy
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec, ObjectModel, Symmetry
+from curio_proto.v1.model_spec_pb2 import Field as FieldSpec
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from curio_train.errors import ExportError
+from curio_train.learning.checkpoint import RunFolder
+from curio_train.learning.configuration import to_portable
+from curio_train.learning.provenance import sittings
+from curio_train.model_card import Making, card
+from curio_train.model_folder import ModelFolder
+from curio_train.onnx_file import SCHEMA_VERSION, OnnxModel, put_spec, store_half, to_onnx
+from curio_train.scene_code import Field
+from curio_train.worlds import build
+from curio_train.worlds.base import ObjectKind, World
+
+LARGEST_PARITY_ERROR = 1e-4
+"""Largest absolute difference between torch and onnxruntime that an export may have, in any output."""
+
+_NUM_CHECK_IMAGES = 8  # of either kind
+_CHECK_SEED = (20_210,)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What became of an export.
+
+    Attributes:
+        path: The version's folder.
+        parity_error: Largest absolute difference between the network, its weights rounded as stored, and onnxruntime.
+        rounding_error: Largest absolute difference between that network and the one that was trained; 0 in float32.
+        num_bytes: Of model.onnx.
+    """
+
+    path: Path
+    parity_error: float
+    rounding_error: float
+    num_bytes: int
+
+
+class _Graph(nn.Module):
+    """What is traced: pixels as a camera gives them in, physical quantities out."""
+
+    def __init__(self, network: nn.Module, world: World) -> None:
+        super().__init__()
+        self.network = network
+        self._world = world
+        self.eval()
+
+    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+        return tuple(self.outputs(image).values())
+
+    def outputs(self, image: Tensor) -> dict[str, Tensor]:
+        return self._world.exported(self.network(image.permute(0, 3, 1, 2).float() / 255))
+
+
+def export(run: Path, out: Path, name: str | None = None, *, half: bool = False) -> Exported:
+    """Write the network of a run as the next version of a model.
+
+    Args:
+        run: The run folder. Its training images are not needed.
+        out: Folder of models.
+        name: Of the model; the world's choice unless given (a LineMOD model is named after its class).
+        half: Store weights as float16, half as large; they are computed with in float32.
+
+    Raises:
+        UsageError: The name cannot be a model's, or the folder is something else.
+        CheckpointError: The run is missing, damaged or without a checkpoint.
+        ExportError: torch and onnxruntime disagree, or the model cannot be written; nothing is left behind.
+    """
+    folder = RunFolder.open(run)
+    world = build(folder.config.world)
+    target = ModelFolder.named(out, name or world.model_name)
+    state = folder.trained(world)
+    trained = _Graph(state.pose.network, world)
+    deployed = _Graph(_deployable(state.pose.network, half), world)
+    images = check_images(world)
+    with torch.no_grad():
+        learned, expected = trained.outputs(images), deployed.outputs(images)
+    rounding_error = largest_difference(learned, expected) if half else 0.0
+
+    model = to_onnx(deployed, world.camera.width, world.camera.height, list(expected))
+    if half:
+        store_half(model)
+    spec = model_spec(world, target.path.name)
+    spec.recipe = json.dumps(to_portable(folder.config))
+    first = sittings(run)[0]
+    spec.commit, spec.images_seen, spec.training_seconds = first.commit, state.course.images, state.course.seconds
+    put_spec(model, spec)
+
+    found = OnnxModel(model.SerializeToString(), "the exported graph")(images.numpy())
+    spec.parity_max_abs_error = refuse_disparity(expected if half else learned, found)
+    put_spec(model, spec)
+    version = target.next_version()
+    made = Making(run, folder.config, first, state.course, _weights(half, rounding_error))
+    shapes = {name: values.shape[1:] for name, values in expected.items()}
+    path = target.add(version, model, card(version, spec, shapes, world.objects, made))
+    return Exported(path, spec.parity_max_abs_error, rounding_error, model.ByteSize())
+
+
+def _weights(half: bool, rounding_error: float) -> str:
+    if not half:
+        return "float32"
+    return f"stored as float16, computed with in float32; outputs differ by at most {rounding_error:.2g} by that"
+
+
+def _deployable(network: nn.Module, half: bool) -> nn.Module:
+    """The network as it is deployed: batch norm folded into the convolutions, weights rounded as they are stored."""
+    network = copy.deepcopy(network).eval()
+    for module in network.modules():
+        if isinstance(module, nn.Sequential):
+            _fold(module)
+    if half:
+        for parameter in network.parameters():
+            parameter.data = parameter.data.half().float()
+            if not parameter.isfinite().all():
+                raise ExportError("a weight is too large for float16; export without --half")
+    return network
+
+
+def _fold(layers: nn.Sequential) -> None:
+    for number in range(len(layers) - 1):
+        convolution, norm = layers[number], layers[number + 1]
+        if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+            layers[number], layers[number + 1] = fuse_conv_bn_eval(convolution, norm), nn.Identity()
+
+
+@torch.no_grad()
+def check_images(world: World) -> Tensor:
+    """Images that torch and onnxruntime have to agree on, uint8 [batch, height, width, 3]: renderings, then noise."""
+    rendered = world.render(world.sample(_NUM_CHECK_IMAGES, _CHECK_SEED)).clamp(0, 1)
+    size = (_NUM_CHECK_IMAGES, world.camera.height, world.camera.width, 3)
+    noise = np.random.default_rng(_CHECK_SEED).integers(0, 256, size, dtype=np.uint8)
+    return torch.cat([(rendered * 255).round().byte().permute(0, 2, 3, 1).cpu(), torch.from_numpy(noise)])
+
+
+def largest_difference(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
+    """Largest absolute difference of two sets of outputs; infinite where one is not finite or shapes differ."""
+    largest = 0.0
+    for name, values in one.items():
+        if name not in other or values.shape != other[name].shape:
+            return float("inf")
+        difference = (values.double() - other[name].double()).abs().max().item()
+        largest = max(largest, difference if np.isfinite(difference) else float("inf"))
+    return largest
+
+
+def refuse_disparity(expected: dict[str, Tensor], found: dict[str, Tensor]) -> float:
+    """The parity error.
+
+    Raises:
+        ExportError: It is too large; says in which output.
+    """
+    errors = {name: largest_difference({name: values}, found) for name, values in expected.items()}
+    worst = max(errors, key=lambda name: errors[name])
+    if errors[worst] > LARGEST_PARITY_ERROR:
+        raise ExportError(
+            f"torch and onnxruntime differ by {errors[worst]:.3g} in {worst}, expected at most "
+            f"{LARGEST_PARITY_ERROR:g}; nothing was written. Has the training diverged?"
+        )
+    return errors[worst]
+
+
+def model_spec(world: World, name: str) -> ModelSpec:
+    """What a model of this world says about itself, but for where it comes from."""
+    camera = world.camera
+    matrix: Sequence[float] = [] if camera.matrix is None else np.asarray(camera.matrix, float).ravel().tolist()
+    return ModelSpec(
+        schema_version=SCHEMA_VERSION,
+        name=name,
+        world=world.name,
+        num_slots=world.layout.num_slots,
+        fields=[_field_spec(field) for field in world.exported_fields],
+        objects=[_object_model(kind) for kind in world.objects],
+        camera=CanonicalCamera(
+            width=camera.width, height=camera.height, camera_matrix=matrix, is_default=camera.is_default
+        ),
+    )
+
+
+def _field_spec(field: Field) -> FieldSpec:
+    return FieldSpec(
+        name=field.name,
+        size=field.size,
+        per_object=field.per_object,
+        unit=field.unit,
+        frame=field.frame,
+        lower=field.lower,
+        upper=field.upper,
+        activation=field.activation,
+    )
+
+
+def _object_model(kind: ObjectKind) -> ObjectModel:
+    discrete = [Symmetry(transform=np.asarray(matrix, float).ravel()) for matrix in kind.symmetries]
+    continuous = [Symmetry(axis=axis, offset_m=offset) for axis, offset in kind.symmetry_axes]
+    return ObjectModel(
+        name=kind.name,
+        mesh_sha256=kind.mesh_sha256,
+        diameter_m=kind.diameter_m,
+        box_corners_m=np.asarray(kind.box_corners_m, float).ravel(),
+        symmetries=discrete + continuous,
+        slots=kind.slots,
+    )

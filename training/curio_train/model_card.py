@@ -1,0 +1,119 @@
+"""What a person should know of one version of a model, as a section of CARD.md."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from curio_proto.v1.model_spec_pb2 import ModelSpec
+
+from curio_train.config import METHODS, RunConfig
+from curio_train.learning.provenance import Sitting
+from curio_train.learning.state import Course
+from curio_train.worlds.base import ObjectKind
+
+EVALUATION_FILE = "evaluation.json"
+"""What ``curio-eval`` leaves in a run folder, and a card quotes."""
+
+_SUPERVISION = {
+    "label": "true scene codes of training images",
+    "sleep": "codes of its own making, rendered; no label of the data",
+}
+
+
+@dataclass(frozen=True)
+class Making:
+    """Where a version comes from.
+
+    Attributes:
+        run: The run folder.
+        config: What was learned and how.
+        sitting: The first sitting of training.
+        course: How far it came.
+        weights: How they are stored, and what that costs.
+    """
+
+    run: Path
+    config: RunConfig
+    sitting: Sitting
+    course: Course
+    weights: str
+
+
+def card(
+    version: int, spec: ModelSpec, shapes: Mapping[str, Sequence[int]], objects: Sequence[ObjectKind], made: Making
+) -> str:
+    """A section of Markdown.
+
+    Args:
+        version: Of the model.
+        spec: Its specification.
+        shapes: Of the outputs, the batch left out.
+        objects: Of the world, for their attribution.
+        made: Where it comes from.
+    """
+    evaluation = read_evaluation(made.run, made.course.images)
+    parts = [
+        f"## Version {version}\n",
+        _table(("", ""), _origin(spec, made)),
+        _table(("output", "shape", "unit", "frame"), _outputs(spec, shapes)),
+        _table(("object", "diameter", "mesh SHA-256", "source and licence of the mesh"), _objects(spec, objects)),
+        _metrics(evaluation) if evaluation else "Not evaluated when it was exported.\n",
+    ]
+    return "\n".join(parts)
+
+
+def read_evaluation(run: Path, images: int) -> dict[str, Any] | None:
+    """The result that curio-eval left in a run folder, if it is of the checkpoint after ``images`` images."""
+    try:
+        found = json.loads((run / EVALUATION_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) and found.get("images_seen") == images else None
+
+
+def _origin(spec: ModelSpec, made: Making) -> Iterable[tuple[str, str]]:
+    terms = METHODS[made.config.method]
+    supervision = [text for term, text in _SUPERVISION.items() if term in terms] or ["none: images alone"]
+    yield "world", spec.world
+    yield "method", f"{made.config.method}, preset {made.config.preset}, seed {made.config.seed}"
+    yield "supervision", "; ".join(supervision)
+    yield "training", f"`{made.sitting.command}`"
+    yield "commit", made.sitting.commit or "not from a git checkout"
+    yield "images seen", f"{made.course.images:,}"
+    yield "training time", f"{made.course.seconds / 60:.1f} minutes"
+    yield "machine", made.sitting.machine
+    yield "input", f"`image`, uint8 RGB [batch, {spec.camera.height}, {spec.camera.width}, 3]"
+    yield "weights", made.weights
+    yield "torch to onnxruntime", f"differ by at most {spec.parity_max_abs_error:.2g} in any output"
+
+
+def _outputs(spec: ModelSpec, shapes: Mapping[str, Sequence[int]]) -> Iterable[tuple[str, ...]]:
+    fields = {field.name: field for field in spec.fields}
+    for name, shape in shapes.items():
+        field = fields.get(name)
+        sizes = ", ".join(["batch", *map(str, shape)])
+        yield f"`{name}`", f"[{sizes}]", field.unit if field else "1", (field.frame if field else "camera") or "–"
+
+
+def _objects(spec: ModelSpec, objects: Sequence[ObjectKind]) -> Iterable[tuple[str, ...]]:
+    unit = "m" if spec.camera.camera_matrix else "image widths"
+    for kind in objects:
+        digest = f"`{kind.mesh_sha256}`" if kind.mesh_sha256 else "–"
+        yield kind.name, f"{kind.diameter_m:.4g} {unit}", digest, kind.attribution or "ours"
+
+
+def _metrics(evaluation: Mapping[str, Any]) -> str:
+    untrained = evaluation.get("untrained", {})
+    rows = [
+        (name, f"{value:.4g}", f"{untrained[name]:.4g}" if name in untrained else "–")
+        for name, value in evaluation["metrics"].items()
+    ]
+    head = f"On {evaluation['num_images']} held-out images of the {evaluation['split']} split:\n"
+    return f"{head}\n{_table(('metric', 'this model', 'untrained network'), rows)}"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)

@@ -1,0 +1,191 @@
+"""A model's folder in Triton's layout, written whole or not at all.
+
+::
+
+    OUT/NAME/config.pbtxt        the tensors, the same for all versions
+             CARD.md             where each version comes from, newest first
+             SHA256SUMS          of every model.onnx
+             1/model.onnx  2/…   versions; none is ever overwritten
+"""
+
+import hashlib
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import onnx
+from onnx import TensorProto
+
+from curio_train.errors import ExportError, UsageError
+
+MODEL_FILE = "model.onnx"
+_CONFIG, _CARD, _SUMS = "config.pbtxt", "CARD.md", "SHA256SUMS"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # what a server takes for a model's name
+_MAX_BATCH_SIZE = 64
+_TRITON_TYPES: Mapping[int, str] = {TensorProto.UINT8: "TYPE_UINT8", TensorProto.FLOAT: "TYPE_FP32"}
+
+
+@dataclass(frozen=True)
+class ModelFolder:
+    """The folder of one model, which need not exist yet.
+
+    Attributes:
+        path: OUT/NAME.
+    """
+
+    path: Path
+
+    @staticmethod
+    def named(out: Path, name: str) -> "ModelFolder":
+        """The folder for a model of that name.
+
+        Raises:
+            UsageError: The name cannot be a model's, or something else has the folder's place.
+        """
+        if not _NAME.fullmatch(name):
+            raise UsageError(f"--name {name!r}: expected letters, digits, _, - and ., at most 64, no leading dot")
+        folder = ModelFolder(out / name)
+        if folder.path.exists() and not folder.versions():
+            raise UsageError(
+                f"{folder.path} exists and is no model folder (it has no <version>/{MODEL_FILE}); choose another "
+                "--name or --out"
+            )
+        return folder
+
+    def versions(self) -> list[int]:
+        """Versions that are there, ascending."""
+        found = (path.parent.name for path in self.path.glob(f"*/{MODEL_FILE}"))
+        return sorted(int(name) for name in found if name.isdecimal() and int(name) > 0)
+
+    def next_version(self) -> int:
+        """The number after the largest."""
+        return max(self.versions(), default=0) + 1
+
+    def add(self, version: int, model: onnx.ModelProto, card: str) -> Path:
+        """Write a version.
+
+        Args:
+            version: From :meth:`next_version`.
+            model: The graph with its specification.
+            card: Markdown, a section about this version.
+
+        Returns:
+            The version's folder.
+
+        Raises:
+            ExportError: It could not be written, or differs in its tensors from the versions that are there. Nothing
+                of it is left behind, and what was there is as before.
+        """
+        config = triton_config(self.path.name, model)
+        self._refuse_other_tensors(config)
+        content = model.SerializeToString()
+        target = self.path / str(version)
+        try:
+            with _draft(self.path) as draft:
+                if self.path.exists():
+                    self._add_version(draft, target, content, card)
+                else:
+                    _fill(draft, self.path.name, version, content, card, config)
+                    draft.rename(self.path)
+        except OSError as exc:
+            raise ExportError(f"cannot write {target}: {exc.strerror}; name another folder: --out") from exc
+        return target
+
+    def _refuse_other_tensors(self, config: str) -> None:
+        path = self.path / _CONFIG
+        if path.exists() and path.read_text(encoding="utf-8") != config:
+            raise ExportError(
+                f"{self.path} holds a model with other inputs or outputs (see {path}); versions of one model must "
+                "agree in them: choose another --name"
+            )
+
+    def _add_version(self, draft: Path, target: Path, content: bytes, card: str) -> None:
+        """Beside earlier versions: first what speaks of it, at last the version itself, by one rename."""
+        (draft / MODEL_FILE).write_bytes(content)
+        others = [line for line in _lines(self.path / _SUMS) if not line.endswith(f"  {target.name}/{MODEL_FILE}")]
+        sums = "".join(f"{line}\n" for line in [*others, _sum_line(target.name, content)])
+        title, _, earlier = _text(self.path / _CARD).partition("\n\n")
+        _replace(self.path / _SUMS, sums)
+        draft.rename(target)
+        _replace(self.path / _CARD, f"{title or _title(self.path.name)}\n\n{card}\n{earlier}")
+
+
+def find_model(path: Path) -> Path:
+    """The ONNX file of a model folder (latest version), of a version's folder, or the file itself.
+
+    Raises:
+        UsageError: There is none.
+    """
+    if path.is_file():
+        return path
+    if (path / MODEL_FILE).is_file():
+        return path / MODEL_FILE
+    versions = ModelFolder(path).versions()
+    if not versions:
+        raise UsageError(
+            f"{path}: neither a run folder (config.json) nor a model (<version>/{MODEL_FILE}); expected what "
+            "curio-train or curio-export wrote"
+        )
+    return path / str(versions[-1]) / MODEL_FILE
+
+
+def triton_config(name: str, model: onnx.ModelProto) -> str:
+    """Triton's description of the tensors, batch left out."""
+
+    def tensor(value: onnx.ValueInfoProto) -> str:
+        kind = value.type.tensor_type
+        dims = ", ".join(str(dim.dim_value) for dim in kind.shape.dim[1:])
+        return f'  {{ name: "{value.name}" data_type: {_TRITON_TYPES[kind.elem_type]} dims: [ {dims} ] }}'
+
+    inputs = ",\n".join(map(tensor, model.graph.input))
+    outputs = ",\n".join(map(tensor, model.graph.output))
+    head = f'name: "{name}"\nbackend: "onnxruntime"\nmax_batch_size: {_MAX_BATCH_SIZE}\n'
+    return f"{head}input [\n{inputs}\n]\noutput [\n{outputs}\n]\n"
+
+
+@contextmanager
+def _draft(folder: Path) -> Iterator[Path]:
+    """An empty folder on the target's disk, which disappears unless it is renamed. Servers pass over its name."""
+    draft = folder.with_name(f".{folder.name}-{os.getpid()}.tmp")
+    draft.mkdir(parents=True)
+    try:
+        yield draft
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _fill(folder: Path, name: str, version: int, content: bytes, card: str, config: str) -> None:
+    (folder / str(version)).mkdir()
+    (folder / str(version) / MODEL_FILE).write_bytes(content)
+    (folder / _CONFIG).write_text(config, encoding="utf-8")
+    (folder / _SUMS).write_text(_sum_line(str(version), content) + "\n", encoding="utf-8")
+    (folder / _CARD).write_text(f"{_title(name)}\n\n{card}", encoding="utf-8")
+
+
+def _title(name: str) -> str:
+    return f"# {name}"
+
+
+def _sum_line(version: str, content: bytes) -> str:
+    return f"{hashlib.sha256(content).hexdigest()}  {version}/{MODEL_FILE}"
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8") if path.exists() else ""
+
+
+def _lines(path: Path) -> list[str]:
+    return _text(path).splitlines()
+
+
+def _replace(path: Path, text: str) -> None:
+    draft = path.with_name(path.name + ".tmp")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
