@@ -118,7 +118,7 @@ class PoseServer:
             await self._health.set(name, _SERVING)
 
     async def serve_until_stopped(self) -> None:
-        """Answer calls until SIGTERM, SIGINT or :meth:`stop`, also one during :meth:`start`; finish what was accepted."""
+        """Answer calls until a signal or :meth:`stop`, which may have come during :meth:`start`; then drain."""
         watcher = asyncio.create_task(self._watch())
         try:
             await self._stopped.wait()

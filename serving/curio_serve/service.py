@@ -53,7 +53,8 @@ class CallGuard:
             status = wire.status_from_error(exc)
             code = status.code.name
             level = logging.ERROR if isinstance(exc, InternalError) else logging.INFO
-            log(level, "refused", method=method, request_id=request_id, code=code, reason=str(exc), peer=context.peer())
+            reason = str(exc)[: wire.MAX_TEXT]
+            log(level, "refused", method=method, request_id=request_id, code=code, reason=reason, peer=context.peer())
             await context.abort(status.code, status.details, status.trailing_metadata)
         finally:
             self._metrics.requests.labels(method, code).inc()

@@ -16,7 +16,7 @@ from curio_serve.image import Frame, RawFormat, from_raw
 from curio_serve.view import Region
 
 DOMAIN = "curio-pose"
-_MAX_TEXT = 1000  # headers are limited to 8 KiB
+MAX_TEXT = 1000  # headers are limited to 8 KiB
 _RAW_FORMATS: dict[int, RawFormat] = {PIXEL_FORMAT_RGB8: "RGB8", PIXEL_FORMAT_BGR8: "BGR8", PIXEL_FORMAT_GRAY8: "GRAY8"}
 
 
@@ -32,7 +32,7 @@ def status_from_error(error: CurioError) -> grpc.Status:
     for detail in details:
         packed.append(AnyMessage())
         packed[-1].Pack(detail)
-    message = str(error)[:_MAX_TEXT]
+    message = str(error)[:MAX_TEXT]
     return rpc_status.to_status(status_pb2.Status(code=code_pb2.Code.Value(name), message=message, details=packed))
 
 
