@@ -1,0 +1,157 @@
+"""Frames, a bare loop over them, and load on a server. The functions run in processes of their own."""
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import grpc
+import numpy as np
+
+WIDTH, HEIGHT = 640, 480
+K = np.array([[572.4114, 0, 325.2611], [0, 573.57043, 242.04899], [0, 0, 1]])
+MODEL = "paper"
+DEADLINE_S = 1.0
+_METHOD = "/curio.v1.PoseDetector/Detect"
+
+
+def make_frames(num_frames: int = 24) -> list[bytes]:
+    """640x480 JPEGs with about the spectrum of photographs (amplitude falling as 1/f)."""
+    rng = np.random.default_rng(0)
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(WIDTH), np.fft.fftfreq(HEIGHT)))
+    frequency[0, 0] = 1
+    frames = []
+    for _ in range(num_frames):
+        planes = np.fft.ifft2(np.fft.fft2(rng.normal(size=(3, HEIGHT, WIDTH))) / frequency**1.35).real
+        pixels = np.clip(127 + 45 * planes / planes.std(), 0, 255).astype(np.uint8).transpose(1, 2, 0)
+        frames.append(cv2.imencode(".jpg", np.ascontiguousarray(pixels), [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+    return frames
+
+
+def bare_loop(model_folder: Path) -> Callable[[bytes], None]:
+    """Decode, warp and session alone, for one frame; called from several threads."""
+    from curio_serve.camera import PinholeCamera
+    from curio_serve.detector import Detector
+    from curio_serve.image import decode, open_header
+    from curio_serve.model_folder import open_model
+    from curio_serve.view import PinholeFrame, Region
+
+    cv2.setNumThreads(1)
+    model = open_model(model_folder)
+    camera, region = PinholeCamera(K), Region(0, 0, WIDTH, HEIGHT)
+    detector = Detector(model)
+
+    def one(data: bytes) -> None:
+        header = open_header(data)
+        frame = decode(data, max_reduction=detector.reduction(camera, header.width, header.height))
+        view = PinholeFrame(frame.pixels, camera, model.camera, frame.reduction).look(region)
+        model.run(view.image[None])
+
+    return one
+
+
+def bare_cpu_ms(model_folder: Path, frames: list[bytes], num_threads: int, seconds: float) -> float:
+    """CPU milliseconds a frame of the bare loop, in as many threads as the server has workers."""
+    one = bare_loop(model_folder)
+
+    def work_until(end: float) -> int:
+        num_done = 0
+        while time.perf_counter() < end:
+            one(frames[num_done % len(frames)])
+            num_done += 1
+        return num_done
+
+    with ThreadPoolExecutor(num_threads) as threads:
+        list(threads.map(one, frames[: 4 * num_threads]))  # warm
+        before = time.process_time()
+        end = time.perf_counter() + seconds
+        num_done = sum(threads.map(work_until, [end] * num_threads))
+        return 1000 * (time.process_time() - before) / num_done
+
+
+def bare_folder(model_folder: str, frames: str, num_threads: str) -> None:
+    """The bare loop over the files of a folder, as a program of its own."""
+    one = bare_loop(Path(model_folder))
+    with ThreadPoolExecutor(int(num_threads)) as threads:
+        for _ in threads.map(lambda path: one(path.read_bytes()), sorted(Path(frames).iterdir())):
+            pass
+
+
+def closed_loop(address: str, frames: list[bytes], concurrency: int, seconds: float) -> dict[str, Any]:
+    """That many callers, each of whom sends the next frame when it has the answer to the last."""
+    return asyncio.run(_closed_loop(address, frames, concurrency, seconds))
+
+
+def open_loop(address: str, frames: list[bytes], rate: float, seconds: float) -> dict[str, Any]:
+    """Frames that come evenly, whether or not earlier ones are answered. Latency counts from when one was due."""
+    return asyncio.run(_open_loop(address, frames, rate, seconds))
+
+
+async def _closed_loop(address: str, frames: list[bytes], concurrency: int, seconds: float) -> dict[str, Any]:
+    async with grpc.aio.insecure_channel(address) as channel:
+        record = _Record(channel, frames)
+        begun = time.perf_counter()
+        end = begun + seconds
+
+        async def caller() -> None:
+            while time.perf_counter() < end:
+                await record.call(time.perf_counter())
+
+        await asyncio.gather(*(caller() for _ in range(concurrency)))
+        return record.summary(time.perf_counter() - begun)
+
+
+async def _open_loop(address: str, frames: list[bytes], rate: float, seconds: float) -> dict[str, Any]:
+    async with grpc.aio.insecure_channel(address) as channel:
+        record = _Record(channel, frames)
+        begun = time.perf_counter()
+        calls = set()
+        due = begun
+        while due < begun + seconds:
+            await asyncio.sleep(max(0.0, due - time.perf_counter()))
+            call = asyncio.create_task(record.call(due))
+            calls.add(call)
+            call.add_done_callback(calls.discard)
+            due = max(due + 1 / rate, time.perf_counter() - 0.1)  # what cannot be made is not owed for ever
+        made_in = time.perf_counter() - begun
+        await asyncio.gather(*calls)
+        return record.summary(made_in)
+
+
+class _Record:
+    """Calls on one channel, with serialised requests, and what became of them."""
+
+    def __init__(self, channel: grpc.aio.Channel, frames: list[bytes]) -> None:
+        from curio_proto.v1.detector_pb2 import Camera, DetectRequest, ModelSelector
+
+        camera, models = Camera(camera_matrix=K.ravel()), [ModelSelector(name=MODEL)]
+        self._requests = [
+            DetectRequest(models=models, camera=camera, encoded=frame).SerializeToString() for frame in frames
+        ]
+        self._call = channel.unary_unary(_METHOD)
+        self._codes: Counter[str] = Counter()
+        self._latencies_ms: list[float] = []
+
+    async def call(self, due: float) -> None:
+        request = self._requests[self._codes.total() % len(self._requests)]
+        try:
+            await self._call(request, timeout=DEADLINE_S)
+        except grpc.aio.AioRpcError as exc:
+            self._codes[exc.code().name] += 1
+            return
+        self._codes["OK"] += 1
+        self._latencies_ms.append(1000 * (time.perf_counter() - due))
+
+    def summary(self, seconds: float) -> dict[str, Any]:
+        """Codes, latencies of good answers, and rates a second."""
+        good = sum(latency <= 1000 * DEADLINE_S for latency in self._latencies_ms)
+        return {
+            "codes": dict(self._codes),
+            "latencies_ms": self._latencies_ms,
+            "goodput": good / seconds,
+            "offered": self._codes.total() / seconds,
+        }

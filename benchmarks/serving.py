@@ -1,0 +1,173 @@
+"""What serving costs over the bare model, and how it behaves below and beyond its limit.
+
+    python benchmarks/serving.py [--json] [--seconds 6] [--rounds 3]
+
+Everything is measured on this machine, over the loopback: 640x480 JPEGs, the paper's network, a real ``curio-serve``
+process, and a load generator in a process of its own.
+
+served_over_raw   CPU time a frame of a bare loop (same decode, warp and session; as many threads as the server has
+                  workers) over the server process's CPU time a request at concurrency 4; median of alternating rounds
+frame_ms          one frame end to end at concurrency 1, median
+ready_s           from starting the process until its health service says SERVING, median of three starts
+rss_mb            the server's resident memory after that load; ``peak_rss_mb`` its largest
+p50_ms, p99_ms    latency at half the saturating rate, frames coming evenly, counted from when a frame was due
+goodput_at_3x     good answers a second while three times the saturating rate is offered, over those at saturation
+
+For the last two lines the server has one half of the cores and the load generator the other, so that making load does
+not pass for the server's weakness. ``offered_over_peak`` says what load was really made.
+"""
+
+import json
+import multiprocessing
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import tyro
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from load.generator import MODEL, WIDTH, K, bare_cpu_ms, closed_loop, make_frames, open_loop
+from load.network import write_model
+
+_START_LIMIT_S = 60.0
+_WARM_UP_S = 2.0
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Measure what serving costs over the bare model."""
+
+    json: bool = False
+    """Print one JSON object on the last line instead of a table."""
+    seconds: float = 6.0
+    """Length of each measurement."""
+    rounds: int = 3
+    """How often bare loop and server are measured in turn."""
+
+
+def main() -> None:
+    """Measures, prints, and leaves nothing behind."""
+    arguments = tyro.cli(Arguments)
+    frames = make_frames()
+    with tempfile.TemporaryDirectory() as folder:
+        models = Path(folder)
+        write_model(models / MODEL, K, WIDTH)
+        figures = {"ready_s": round(statistics.median(start_time_s(models) for _ in range(3)), 3)}
+        figures |= cost(models, frames, arguments)
+        figures |= limits(models, frames, arguments.seconds)
+    if arguments.json:
+        print(json.dumps(figures))
+        return
+    for name, value in figures.items():
+        print(f"{name:20} {value}")
+
+
+def cost(models: Path, frames: list[bytes], arguments: Arguments) -> dict[str, Any]:
+    """Latency of one caller, CPU time a request beside the bare loop's, memory."""
+    cores = sorted(os.sched_getaffinity(0))
+    raw_ms, served_ms = [], []
+    with running_server(models, cores) as (address, pid), worker(cores) as load:
+        load(closed_loop, address, frames, 4, _WARM_UP_S)
+        alone = load(closed_loop, address, frames, 1, arguments.seconds)
+        for _ in range(arguments.rounds):
+            with worker(cores) as bare:
+                raw_ms.append(bare(bare_cpu_ms, models / MODEL, frames, len(cores), arguments.seconds))
+            before_s = cpu_s(pid)
+            served = load(closed_loop, address, frames, 4, arguments.seconds)
+            served_ms.append(1000 * (cpu_s(pid) - before_s) / served["codes"]["OK"])
+        rss_mb, peak_rss_mb = memory_mb(pid)
+    return {
+        "served_over_raw": round(statistics.median(np.divide(raw_ms, served_ms)), 3),
+        "raw_cpu_ms": round(statistics.median(raw_ms), 3),
+        "served_cpu_ms": round(statistics.median(served_ms), 3),
+        "frame_ms": round(statistics.median(alone["latencies_ms"]), 3),
+        "rss_mb": rss_mb,
+        "peak_rss_mb": peak_rss_mb,
+    }
+
+
+def limits(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any]:
+    """Latency below saturation, and goodput beyond it."""
+    cores = sorted(os.sched_getaffinity(0))
+    half = max(1, len(cores) // 2)
+    with running_server(models, cores[:half]) as (address, _), worker(cores[half:] or cores) as load:
+        load(closed_loop, address, frames, 4, _WARM_UP_S)
+        peak = max(load(closed_loop, address, frames, c * half, seconds)["goodput"] for c in (2, 8))
+        calm = load(open_loop, address, frames, peak / 2, seconds)
+        flood = load(open_loop, address, frames, 3 * peak, seconds)
+    p50_ms, p99_ms = np.percentile(calm["latencies_ms"], (50, 99))
+    return {
+        "p50_ms": round(float(p50_ms), 3),
+        "p99_ms": round(float(p99_ms), 3),
+        "peak_per_s": round(peak, 1),
+        "goodput_at_3x": round(flood["goodput"] / peak, 3),
+        "offered_over_peak": round(flood["offered"] / peak, 2),
+        "codes_at_3x": flood["codes"],
+    }
+
+
+def start_time_s(models: Path) -> float:
+    """Seconds from starting a server until it says that it serves."""
+    begun = time.perf_counter()
+    with running_server(models, sorted(os.sched_getaffinity(0))):
+        return time.perf_counter() - begun
+
+
+@contextmanager
+def running_server(models: Path, cores: Sequence[int]) -> Iterator[tuple[str, int]]:
+    """Address and process id of a server on these cores, once its health service says SERVING."""
+    program = "from curio_serve.serve_cli import main; main()"
+    call = [sys.executable, "-c", program, str(models), "--port", "0", "--log-level", "warning"]
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)  # inherited
+    try:
+        process = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
+    finally:
+        os.sched_setaffinity(0, before)
+    try:
+        assert process.stdout is not None
+        address = process.stdout.readline().removeprefix("listening on ").strip()
+        with grpc.insecure_channel(address) as channel:
+            check = health_pb2_grpc.HealthStub(channel).Check
+            answer = check(health_pb2.HealthCheckRequest(), timeout=_START_LIMIT_S, wait_for_ready=True)
+        if answer.status != health_pb2.HealthCheckResponse.SERVING:
+            raise RuntimeError(f"the server at {address} answers its health check with {answer.status}")
+        yield address, process.pid
+    finally:
+        process.terminate()
+        process.wait(timeout=_START_LIMIT_S)
+
+
+@contextmanager
+def worker(cores: Sequence[int]) -> Iterator[Callable[..., Any]]:
+    """A fresh process on these cores; what it is called with runs there."""
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, spawn, os.sched_setaffinity, (0, cores)) as pool:
+        yield lambda function, *arguments: pool.submit(function, *arguments).result()
+
+
+def cpu_s(pid: int) -> float:
+    """User and system time that a process has used, all threads."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def memory_mb(pid: int) -> tuple[float, float]:
+    """Resident memory of a process now and at its largest, MB."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    sizes_kb = {line.split(":")[0]: int(line.split()[1]) for line in lines if line.startswith(("VmRSS", "VmHWM"))}
+    return round(sizes_kb["VmRSS"] / 1000, 1), round(sizes_kb["VmHWM"] / 1000, 1)
+
+
+if __name__ == "__main__":
+    main()
