@@ -72,7 +72,8 @@ class ClutterBackgrounds(Backgrounds):
         """
         recipe = json.dumps([POOL_SIZE, POOL_WIDTH, POOL_HEIGHT, HEAPS, NUM_SLOTS, _SEED, "v1"])
         path = cache.expanduser() / f"clutter-{hashlib.sha256(recipe.encode()).hexdigest()[:16]}.npy"
-        if not path.exists():
+        if not path.is_file():
+            _make_folder(path.parent)  # before half a minute is spent on the pictures
             _save(path, render_pool(POOL_SIZE, _SEED))
         return cls(np.load(path, mmap_mode="r"))
 
@@ -197,13 +198,19 @@ def _noise(random: np.random.Generator) -> np.ndarray:
     return np.clip(image, 0, 1)
 
 
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise DataError(f"cannot make {folder}: {exc.strerror}; name a writable folder: --cache") from exc
+
+
 def _save(path: Path, pool: np.ndarray) -> None:
     partial = path.with_suffix(".tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("wb") as file:
             np.save(file, pool)
         partial.replace(path)
     except OSError as exc:
         partial.unlink(missing_ok=True)
-        raise DataError(f"cannot write {path}: {exc.strerror}; name a writable folder with space: --cache") from exc
+        raise DataError(f"cannot write {path}: {exc.strerror}; name a folder with space: --cache") from exc

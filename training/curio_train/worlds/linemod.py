@@ -69,8 +69,14 @@ class Linemod(World):
             ),
         )
         camera = dataset.camera
-        self.camera = Camera(SIDE_PX, SIDE_PX, _squeezed(camera.matrix, camera.width, camera.height))
-        reach = (camera.width / camera.matrix[0, 0] / 2, camera.height / camera.matrix[1, 1] / 2)
+        matrix = _squeezed(camera.matrix, camera.width, camera.height)
+        self.camera = Camera(SIDE_PX, SIDE_PX, matrix)
+        self._matrix = matrix
+        center = camera.matrix[[0, 1], 2]
+        focal = camera.matrix[[0, 1], [0, 1]]
+        first, last = (
+            (np.array(corner) - center) / focal for corner in ((0, 0), (camera.width - 1, camera.height - 1))
+        )
         self.layout = Layout(
             (
                 Field(
@@ -79,8 +85,8 @@ class Linemod(World):
                     unit="m",
                     frame="camera",
                     activation="perspective",
-                    lower=(-reach[0], -reach[1], NEAR_M),
-                    upper=(*reach, FAR_M),
+                    lower=(*first.tolist(), NEAR_M),
+                    upper=(*last.tolist(), FAR_M),
                 ),
                 Field(ROTATION_6D, 6, frame="camera"),
                 Field(
@@ -121,7 +127,7 @@ class Linemod(World):
         return self._renderer(
             matrix_from_rotation_6d(code[ROTATION_6D].float()),
             code[TRANSLATION].float(),
-            camera_matrix=self.camera.matrix,
+            camera_matrix=self._matrix,
             backgrounds=behind,
             light=code[LIGHT].float(),
             seed=_seed_of(code[TRANSLATION]),

@@ -1,0 +1,52 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+from curio_train.data.backgrounds import POOL_HEIGHT, POOL_WIDTH, ClutterBackgrounds, PhotographBackgrounds, render_pool
+from curio_train.data.photographs import Photographs
+from curio_train.errors import DataError
+
+
+@pytest.fixture(scope="module")
+def pool():
+    return render_pool(10, seed=5)
+
+
+def test_clutter_is_varied_and_repeatable(pool):
+    assert pool.shape == (10, POOL_HEIGHT, POOL_WIDTH, 3)
+    assert pool.dtype == np.uint8
+    assert pool.reshape(10, -1).std(1).min() > 8
+    assert np.array_equal(pool[:3], render_pool(10, seed=5)[:3])
+    assert not np.array_equal(pool, render_pool(10, seed=6))
+
+
+def test_draws_are_a_function_of_the_seed(pool):
+    source = ClutterBackgrounds(pool)
+    first, again, other = (source.draw(4, 48, 32, seed) for seed in ((1, 2), (1, 2), (1, 3)))
+    assert first.shape == (4, 3, 32, 48)
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert first.min() >= 0
+    assert first.max() <= 1
+
+
+def test_training_and_test_backgrounds_are_different_pictures():
+    marked = np.zeros((10, POOL_HEIGHT, POOL_WIDTH, 3), np.uint8)
+    marked[8:] = 255
+    source = ClutterBackgrounds(marked)
+    assert source.split(train=True).draw(40, 8, 8, (0,)).max() == 0
+    assert source.split(train=False).draw(40, 8, 8, (0,)).min() == 1
+
+
+def test_cached_pool_is_written_where_it_can_be(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="--cache"):
+        ClutterBackgrounds.cached(tmp_path / "file" / "below")
+
+
+def test_photographs_as_backgrounds(tmp_path):
+    for number in range(5):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((60, 80, 3), 50 * number, np.uint8))
+    source = PhotographBackgrounds(Photographs(tmp_path))
+    assert source.split(train=False).draw(10, 16, 16, (0,)).min() == pytest.approx(200 / 255)
+    assert source.split(train=True).draw(30, 16, 16, (0,)).max() == pytest.approx(150 / 255)

@@ -1,0 +1,101 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from curio_train.errors import DataError, UsageError
+from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
+from curio_train.worlds import build
+from curio_train.worlds.linemod import FAR_M, NEAR_M, STRONGEST_LIGHT, WEAKEST_LIGHT
+from curio_train.worlds.options import LinemodOptions
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    """A data set in BOP's layout with an ape of our own: an ellipsoid, in millimetres."""
+    root = tmp_path_factory.mktemp("lm")
+    (root / "models").mkdir()
+    shape = trimesh.creation.icosphere(subdivisions=2)
+    shape.apply_scale([30, 40, 50])
+    shape.export(root / "models" / "obj_000001.ply")
+    (root / "models" / "models_info.json").write_text(json.dumps({"1": {"diameter": 100.0}}))
+    camera = {"fx": 572.4, "fy": 573.6, "cx": 325.3, "cy": 242.0, "width": 640, "height": 480}
+    (root / "camera.json").write_text(json.dumps(camera))
+    return root
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory) -> Path:
+    import cv2
+
+    folder = tmp_path_factory.mktemp("photographs")
+    random = np.random.default_rng(0)
+    for number in range(5):
+        cv2.imwrite(str(folder / f"{number}.png"), random.integers(0, 90, (96, 96, 3), dtype=np.uint8))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def world(data, photographs):
+    return build(LinemodOptions("ape", data, photographs))
+
+
+def test_poses_come_from_the_published_range(world):
+    code = world.sample(400, (1,))
+    world.layout.check(code)
+    position = code[TRANSLATION][:, 0]
+    assert position[:, 2].min() >= NEAR_M
+    assert position[:, 2].max() <= FAR_M
+    pixels = position @ torch.from_numpy(world.camera.matrix).float().T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    assert pixels.min() > -1
+    assert pixels.max() < 128
+    strength = code[LIGHT].norm(dim=1)
+    assert strength.min() >= WEAKEST_LIGHT - 1e-5
+    assert strength.max() <= STRONGEST_LIGHT + 1e-5
+    rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
+    camera_in_object = -(rotation.transpose(1, 2) @ position[..., None])[..., 0]
+    assert camera_in_object[:, 2].min() > -1e-4, "a camera below the table"
+
+
+def test_the_whole_frame_fits_the_canonical_camera(world):
+    """The frame's corners keep their place: 640 pixels become 128, the 480 lie in the middle."""
+    frame = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
+    corners = np.array([[-0.5, -0.5, 1], [639.5, 479.5, 1]]).T
+    seen = world.camera.matrix @ np.linalg.solve(frame, corners)
+    assert pytest.approx(np.array([[-0.5, 15.5], [127.5, 111.5]])) == seen[:2].T
+
+
+def test_batches_are_a_function_of_the_step_and_keep_labels_to_themselves(world, tmp_path):
+    source = world.source("train", 0, with_code=False, cache=tmp_path)
+    first, again, other = source.batch(5, 4), source.batch(5, 4), source.batch(6, 4)
+    assert first.code is None
+    assert torch.equal(first.images, again.images)
+    assert not torch.equal(first.images, other.images)
+    held_out = world.source("test", 0, with_code=True, cache=tmp_path).batch(5, 4)
+    assert held_out.code is not None
+    assert not torch.equal(first.images, held_out.images)
+    redrawn = world.render(held_out.code, held_out.backgrounds)
+    assert torch.equal(redrawn, held_out.images)
+    assert not torch.equal(held_out.images, held_out.backgrounds), "no object in any picture"
+
+
+def test_gradients_reach_every_field(world, tmp_path):
+    batch = world.source("train", 0, with_code=True, cache=tmp_path).batch(0, 4)
+    moved = {name: (value + 0.01).requires_grad_() for name, value in batch.code.items()}
+    (world.render(moved, batch.backgrounds) - batch.images).square().sum().backward()
+    for name, value in moved.items():
+        assert value.grad.isfinite().all(), name
+        assert value.grad.abs().sum() > 0, name
+
+
+def test_unknown_class_and_missing_data_are_named(data, tmp_path):
+    with pytest.raises(UsageError, match="ape"):
+        build(LinemodOptions("teapot", data))
+    with pytest.raises(DataError, match="driller"):
+        build(LinemodOptions("driller", data))
+    with pytest.raises(DataError, match="hf download"):
+        build(LinemodOptions("ape", tmp_path / "nothing"))
