@@ -2,16 +2,17 @@
 
 import argparse
 import dataclasses
+import json
 import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
-from tyro.conf import OmitArgPrefixes
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from curio_train.config import PRESETS, RunConfig, WorldOptions
 from curio_train.errors import CurioError
@@ -121,4 +122,88 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     if outcome is Outcome.INTERRUPTED and interruption.signum is not None:
         print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
         return 128 + interruption.signum
+    return 0
+
+
+@dataclass(frozen=True)
+class EvaluateCommand:
+    """Score a run or a model on held-out images of its world, beside the same network untrained.
+
+    Attributes:
+        path: A run folder, a model folder (its latest version), a version's folder, or an .onnx file.
+        split: Which images of the world.
+        num_images: How many images.
+        data: BOP data set whose real frames are scored as well; needed for an exported LineMOD model.
+        bop_results: Folder for a results file of the real frames in BOP's format.
+        json: Print the result as one JSON object on the last line.
+        cache: Where image sets that a world draws once are kept.
+    """
+
+    path: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
+    split: Literal["train", "validation", "test"] = "test"
+    num_images: int = 500
+    data: Path | None = None
+    bop_results: Path | None = None
+    json: FlagCreatePairsOff[bool] = False
+    cache: Path = Session.cache
+
+
+def evaluate(arguments: Sequence[str] | None = None) -> None:
+    """``curio-eval RUN_OR_MODEL …``; exit status as of :func:`train`."""
+    command = tyro.cli(EvaluateCommand, args=arguments, prog="curio-eval")
+    sys.exit(answer(lambda _: _evaluate(command)))
+
+
+def _evaluate(command: EvaluateCommand) -> int:
+    from curio_train.evaluation.evaluate import evaluate
+    from curio_train.evaluation.tables import print_evaluation
+
+    with Console(stderr=True).status("") as status:
+        result = evaluate(
+            command.path,
+            split=command.split,
+            num_images=command.num_images,
+            data=command.data,
+            bop_results=command.bop_results,
+            cache=command.cache,
+            progress=status.update,
+        )
+    print_evaluation(result, Console())
+    if command.json:
+        print(json.dumps(result))
+    return 0
+
+
+@dataclass(frozen=True)
+class ExportCommand:
+    """Write a run's network as the next version of a model that any ONNX runtime can serve.
+
+    Attributes:
+        run: The run folder. Its training images are not needed.
+        out: Folder of models; the model goes to OUT/NAME/VERSION/model.onnx.
+        name: Of the model; the world's name, or LineMOD's class, unless given.
+        half: Store weights as float16: half the size, computed with in float32.
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    out: Path = Path("models")
+    name: str | None = None
+    half: FlagCreatePairsOff[bool] = False
+
+
+def export(arguments: Sequence[str] | None = None) -> None:
+    """``curio-export RUN …``; exit status as of :func:`train`."""
+    command = tyro.cli(ExportCommand, args=arguments, prog="curio-export")
+    sys.exit(answer(lambda _: _export(command)))
+
+
+def _export(command: ExportCommand) -> int:
+    from curio_train.export import export
+
+    with Console(stderr=True).status("tracing, and comparing torch with onnxruntime"):
+        done = export(command.run, command.out, command.name, half=command.half)
+    print(
+        f"{done.path}: {done.num_bytes / 1e6:.1f} MB, differs from torch by at most {done.parity_error:.2g}"
+        + (f", from the float32 weights by {done.rounding_error:.2g}" if command.half else "")
+    )
     return 0

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from torch import Tensor
@@ -15,6 +15,9 @@ from torch import Tensor
 from curio_train.errors import UsageError
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, Field, Layout, SceneCode
+
+if TYPE_CHECKING:
+    from curio_train.data.meshes import Mesh
 
 Split = Literal["train", "validation", "test"]
 
@@ -97,12 +100,21 @@ class Camera:
 
 
 class World(ABC):
-    """A family of scenes that can be described, drawn at random, and rendered."""
+    """A family of scenes that can be described, drawn at random, and rendered.
+
+    Attributes:
+        name: As on the command line.
+        layout: Of its scene code.
+        camera: What its images are taken with.
+        objects: The kinds of object there are.
+        mesh: The object's, in worlds of one object, whose poses are scored by its points.
+    """
 
     name: str
     layout: Layout
     camera: Camera
     objects: tuple[ObjectKind, ...]
+    mesh: "Mesh | None" = None
 
     @property
     def model_name(self) -> str:

@@ -1,0 +1,211 @@
+"""Score pose estimates on the real frames of a BOP data set: whole frames in, nothing but RGB and K.
+
+Frames are looked at as serving looks at them: averaged down, then warped to the canonical camera by K* R K⁻¹, where R
+turns the ray through the frame's centre to the one through the canonical centre. Labels are used for scoring alone.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from curio_train.camera import scale_matrix
+from curio_train.data.bop import Annotation, BopDataset, Frame, ModelInfo
+from curio_train.data.photographs import read_photograph
+from curio_train.errors import DataError, UsageError
+from curio_train.evaluation.scores import add_errors, model_info, pose_scores, poses
+from curio_train.evaluation.subject import Subject
+from curio_train.geometry import Pose, rotation_between
+from curio_train.metrics.poses import ADD_THRESHOLD, bootstrap_interval, mspd_px, mssd_m, recall, symmetry_poses
+from curio_train.scene_code import CONFIDENCE
+from curio_train.worlds.base import Camera
+
+SPLIT = "test"
+_VISIBILITY_BINS = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0))
+_MSSD_THRESHOLDS = [0.05 * step for step in range(1, 11)]  # of the diameter, BOP Challenge 2020
+_MSPD_THRESHOLDS = [5.0 * step for step in range(1, 11)]  # pixels in an image 640 wide, BOP Challenge 2020
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What was found in a frame.
+
+    Attributes:
+        frame: The frame.
+        pose: cam_from_obj, metres.
+        confidence: 1 where the model has none.
+        seconds: Spent on the frame, reading included.
+    """
+
+    frame: Frame
+    pose: Pose
+    confidence: float
+    seconds: float
+
+
+def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None) -> dict[str, Any]:
+    """Score on the targets of the object in a data set.
+
+    Args:
+        subject: Reads poses of one object.
+        data: In BOP's layout.
+        bop_results: Folder for a results file in BOP's format, or None.
+
+    Raises:
+        UsageError: The world has no camera, or the data set does not know the object.
+        DataError: The data set is incomplete or has no frame of it.
+    """
+    dataset = BopDataset(data)
+    kind = subject.world.objects[0]
+    targets = _targets(dataset, kind.name)
+    estimates = _estimates(subject, dataset, targets)
+    if bop_results is not None:
+        _write_bop(bop_results, subject.config.method, data.resolve().name, dataset.object_id(kind.name), estimates)
+    found = {(e.frame.scene_id, e.frame.image_id): e for e in estimates}
+    pairs = [(found[target.scene_id, target.image_id], target) for target in targets]
+    points = dataset.evaluation_mesh(kind.name).vertices_m
+    info = model_info(kind)
+    return {
+        "dataset": data.resolve().name,
+        "split": SPLIT,
+        "num_targets": len(targets),
+        "metrics": _metrics(pairs, points, info),
+        "by_visibility": _by_visibility(pairs, points, info),
+    }
+
+
+def _targets(dataset: BopDataset, name: str) -> list[Annotation]:
+    """One annotation an image: BOP's targets where the data set names them, else every labelled image."""
+    chosen = None
+    if (dataset.root / "test_targets_bop19.json").exists():
+        number = dataset.object_id(name)
+        chosen = {(t.scene_id, t.image_id) for t in dataset.targets() if t.object_id == number}
+    targets = {
+        (a.scene_id, a.image_id): a
+        for a in dataset.annotations(SPLIT, name)
+        if chosen is None or (a.scene_id, a.image_id) in chosen
+    }
+    if not targets:
+        raise DataError(f"{dataset.root / SPLIT}: found no labelled frame of {name}, expected at least one")
+    return list(targets.values())
+
+
+def _estimates(subject: Subject, dataset: BopDataset, targets: Sequence[Annotation]) -> list[Estimate]:
+    """One estimate for each frame with a target."""
+    wanted = {(target.scene_id, target.image_id) for target in targets}
+    estimates = []
+    for scene_id in sorted({scene for scene, _ in wanted}):
+        for frame in dataset.frames(SPLIT, scene_id):
+            if (frame.scene_id, frame.image_id) in wanted:
+                estimates.append(_estimate(subject, frame))
+    missing = wanted - {(e.frame.scene_id, e.frame.image_id) for e in estimates}
+    if missing:
+        scene, image = min(missing)
+        raise DataError(
+            f"{dataset.root / SPLIT}: {len(missing)} labelled images are missing, the first is image {image} of scene "
+            f"{scene}; download the split again"
+        )
+    return estimates
+
+
+def _estimate(subject: Subject, frame: Frame) -> Estimate:
+    start = time.perf_counter()
+    image, canonical_from_cam = look(read_photograph(frame.path), frame.matrix, subject.world.camera)
+    code = subject.predict(torch.from_numpy(image).permute(2, 0, 1)[None].contiguous())
+    seen = poses(code)[0]
+    back = canonical_from_cam.T
+    confidence = float(code[CONFIDENCE][0, 0]) if CONFIDENCE in code else 1.0
+    pose = Pose(back @ seen.rotation, back @ seen.translation_m)
+    return Estimate(frame, pose, confidence, time.perf_counter() - start)
+
+
+def look(pixels: np.ndarray, matrix: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """A whole frame as the canonical camera sees it.
+
+    Args:
+        pixels: uint8 RGB [height, width, 3].
+        matrix: K of the frame.
+        camera: The canonical one.
+
+    Returns:
+        The image, uint8 [canonical height, canonical width, 3], and the rotation canonical_from_cam [3, 3].
+
+    Raises:
+        UsageError: The canonical camera is none.
+    """
+    if camera.matrix is None:
+        raise UsageError("--data: this world is flat and has no camera to look at real frames through")
+    height, width = pixels.shape[:2]
+    scales = [camera.matrix[i, i] / matrix[i, i] for i in (0, 1)]
+    size = (min(width, round(width * scales[0])), min(height, round(height * scales[1])))
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA) if size != (width, height) else pixels
+    small_matrix = scale_matrix(matrix, (width, height), size)
+    rotation = rotation_between(
+        _central_ray(matrix, width, height), _central_ray(camera.matrix, camera.width, camera.height)
+    )
+    turn = rotation.numpy()
+    view_to_small = small_matrix @ turn.T @ np.linalg.inv(camera.matrix)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    target = (camera.width, camera.height)
+    return cv2.warpPerspective(small, view_to_small, target, flags=flags, borderMode=cv2.BORDER_REPLICATE), turn
+
+
+def _central_ray(matrix: np.ndarray, width: int, height: int) -> torch.Tensor:
+    return torch.from_numpy(np.linalg.solve(matrix, [(width - 1) / 2, (height - 1) / 2, 1.0]))
+
+
+def _metrics(pairs: Sequence[tuple[Estimate, Annotation]], points: np.ndarray, info: ModelInfo) -> dict[str, float]:
+    estimates, truths = [e.pose for e, _ in pairs], [target.pose for _, target in pairs]
+    scores = pose_scores(estimates, truths, points, info)
+    hits = np.array(add_errors(estimates, truths, points, info)) < ADD_THRESHOLD
+    low, high = bootstrap_interval(hits.astype(float).tolist())
+    alike = symmetry_poses(info)
+    surface = [mssd_m(e, t, points, alike) / info.diameter_m for e, t in zip(estimates, truths, strict=True)]
+    pixels = [mspd_px(e.pose, target.pose, points, alike, e.frame.matrix) * 640 / e.frame.width for e, target in pairs]
+    return scores | {
+        "add_recall_low": low,
+        "add_recall_high": high,
+        "mssd_recall": float(np.mean([recall(surface, threshold) for threshold in _MSSD_THRESHOLDS])),
+        "mspd_recall": float(np.mean([recall(pixels, threshold) for threshold in _MSPD_THRESHOLDS])),
+    }
+
+
+def _by_visibility(
+    pairs: Sequence[tuple[Estimate, Annotation]], points: np.ndarray, info: ModelInfo
+) -> list[dict[str, float]]:
+    """ADD(-S) recall in bins of the visible share; empty where the data set doesn't say it."""
+    rows = []
+    for low, high in _VISIBILITY_BINS:
+        inside = [
+            (e.pose, target.pose)
+            for e, target in pairs
+            if target.visible_fraction is not None
+            and (low <= target.visible_fraction < high or target.visible_fraction == high == 1)
+        ]
+        if inside:
+            estimates, truths = zip(*inside, strict=True)
+            errors = add_errors(estimates, truths, points, info)
+            share = recall(errors, ADD_THRESHOLD)
+            rows.append({"from": low, "to": high, "num_targets": len(inside), "add_recall": share})
+    return rows
+
+
+def _write_bop(folder: Path, method: str, dataset: str, object_id: int, estimates: Sequence[Estimate]) -> None:
+    """METHOD_DATASET-SPLIT.csv: rotations row by row, millimetres, seconds an image."""
+    lines = ["scene_id,im_id,obj_id,score,R,t,time"]
+    for e in estimates:
+        rotation = " ".join(f"{value:.9g}" for value in e.pose.rotation.ravel())
+        translation = " ".join(f"{value * 1000:.9g}" for value in e.pose.translation_m)
+        frame = f"{e.frame.scene_id},{e.frame.image_id},{object_id}"
+        lines.append(f"{frame},{e.confidence:.6g},{rotation},{translation},{e.seconds:.4f}")
+    path = folder / f"{method.replace('_', '-')}_{dataset}-{SPLIT}.csv"  # the first underscore ends the method's name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as exc:
+        raise UsageError(f"--bop-results: cannot write {path}: {exc.strerror}") from exc

@@ -1,0 +1,122 @@
+"""What is evaluated: the network of a run folder or an exported model, as a function from images to scene codes."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from curio_train.config import RunConfig
+from curio_train.errors import ExportError, UsageError
+from curio_train.learning.checkpoint import RunFolder
+from curio_train.learning.configuration import CONFIG_FILE, from_json
+from curio_train.learning.provenance import sittings
+from curio_train.learning.state import TrainState
+from curio_train.model_folder import find_model
+from curio_train.networks.pose import PoseNetwork
+from curio_train.onnx_file import OnnxModel
+from curio_train.worlds import WORLDS, build
+from curio_train.worlds.base import World
+
+Predict = Callable[[Tensor], dict[str, Tensor]]
+"""uint8 images [batch, 3, height, width] to their scene codes."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Something that reads poses from images.
+
+    Attributes:
+        config: What it was trained with.
+        world: In which it was trained.
+        predict: Reads images.
+        images_seen: In training.
+        training_seconds: Spent.
+        commit: Of the code that trained it.
+    """
+
+    config: RunConfig
+    world: World
+    predict: Predict
+    images_seen: int
+    training_seconds: float
+    commit: str
+
+    def untrained(self) -> Predict:
+        """The network as it was before the first step, from the same seed."""
+        return _reader(TrainState(self.config, self.world, torch.device("cpu")).pose.network.eval())
+
+
+def load_subject(path: Path, data: Path | None = None) -> Subject:
+    """The network behind a path.
+
+    Args:
+        path: A run folder, a model folder (its latest version), a version's folder, or an .onnx file.
+        data: Data folder, for models of worlds that need one: an exported model doesn't name its maker's.
+
+    Raises:
+        UsageError: It is neither, or ``data`` is missing.
+        CheckpointError: The run is damaged or has no checkpoint.
+        ExportError: The model cannot be used.
+        DataError: What the world needs cannot be read.
+    """
+    if not path.exists():
+        raise UsageError(f"{path}: there is no such file or folder; expected a run folder or an exported model")
+    if (path / CONFIG_FILE).exists():
+        return _from_run(path)
+    return _from_model(find_model(path), data)
+
+
+def _from_run(path: Path) -> Subject:
+    run = RunFolder.open(path)
+    world = build(run.config.world)
+    state = run.trained(world)
+    course = state.course
+    return Subject(
+        run.config, world, _reader(state.pose.network), course.images, course.seconds, sittings(path)[0].commit
+    )
+
+
+def _reader(network: PoseNetwork) -> Predict:
+    @torch.no_grad()
+    def predict(images: Tensor) -> dict[str, Tensor]:
+        code: dict[str, Tensor] = network(images.float() / 255)
+        return code
+
+    return predict
+
+
+def _from_model(file: Path, data: Path | None) -> Subject:
+    model = OnnxModel.open(file)
+    config = _config_of(model, file, data)
+    world = build(config.world)
+
+    def predict(images: Tensor) -> dict[str, Tensor]:
+        return world.from_exported(model(images.permute(0, 2, 3, 1).contiguous().numpy()))
+
+    spec = model.spec
+    return Subject(config, world, predict, spec.images_seen, spec.training_seconds, spec.commit)
+
+
+def _config_of(model: OnnxModel, file: Path, data: Path | None) -> RunConfig:
+    """The configuration in a model's specification, with this machine's data folder."""
+    try:
+        recipe = json.loads(model.spec.recipe)
+        options = recipe["world"]
+        kind = WORLDS[options["name"]]
+        recipe["world"] = options | _data_option(kind, options, data, file)
+        return from_json(recipe)
+    except (ValueError, TypeError, KeyError) as exc:
+        raise ExportError(f"{file}: its recipe is no configuration of this version ({exc}); export it again") from exc
+
+
+def _data_option(kind: type[Any], options: Mapping[str, Any], data: Path | None, file: Path) -> dict[str, str]:
+    if "data" not in {field.name for field in dataclasses.fields(kind)}:
+        return {}
+    if data is None:
+        raise UsageError(f"{file} is a model of world {options['name']}, which needs its data: --data DIR")
+    return {"data": str(data)}

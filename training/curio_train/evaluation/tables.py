@@ -1,0 +1,62 @@
+"""Results as tables for people."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+_LABELS: Mapping[str, str] = {
+    "scene_error": "scene error, Eq. 1",
+    "position_image_widths": "position, image widths",
+    "position_px": "position, pixels",
+    "position_px_median": "position, pixels, median",
+    "position_mm": "position, mm",
+    "color_mse": "colour, squared error",
+    "rotation_deg": "rotation, degrees",
+    "confidence_mse": "confidence, squared error",
+    "light_deg": "light direction, degrees",
+    "add_recall": "ADD(-S) below 0.1 diameters, share",
+    "add_recall_low": "   95 % interval from",
+    "add_recall_high": "   to",
+    "rotation_deg_median": "rotation, degrees, median",
+    "translation_mm_median": "position, mm, median",
+    "lateral_mm_median": "   across the view (x, y)",
+    "depth_mm_median": "   along it (z)",
+    "mssd_recall": "MSSD, average recall",
+    "mspd_recall": "MSPD, average recall",
+}
+
+
+def print_evaluation(result: Mapping[str, Any], console: Console) -> None:
+    """The result of :func:`~curio_train.evaluation.evaluate.evaluate`."""
+    objects, minutes = ", ".join(result["objects"]), result["training_seconds"] / 60
+    console.print(
+        f"{result['source']}: {result['world']} ({objects}), method {result['method']}, preset {result['preset']}, "
+        f"seed {result['seed']}, {result['images_seen']:,} images seen in {minutes:.1f} minutes",
+        markup=False,
+        soft_wrap=True,
+    )
+    table = Table(title=f"{result['num_images']} images of the {result['split']} split", title_justify="left")
+    table.add_column("metric")
+    table.add_column("this", justify="right")
+    table.add_column("untrained", justify="right")
+    for name, value in result["metrics"].items():
+        table.add_row(_LABELS.get(name, name), f"{value:.4g}", f"{result['untrained'][name]:.4g}")
+    console.print(table)
+    if "real" in result:
+        _print_real(result["real"], console)
+
+
+def _print_real(real: Mapping[str, Any], console: Console) -> None:
+    table = Table(
+        title=f"{real['num_targets']} real targets of {real['dataset']}, {real['split']}", title_justify="left"
+    )
+    table.add_column("metric")
+    table.add_column("this", justify="right")
+    for name, value in real["metrics"].items():
+        table.add_row(_LABELS.get(name, name), f"{value:.4g}")
+    for row in real["by_visibility"]:
+        label = f"ADD(-S), {100 * row['from']:.0f}–{100 * row['to']:.0f} % visible, {row['num_targets']} targets"
+        table.add_row(label, f"{row['add_recall']:.4g}")
+    console.print(table)
