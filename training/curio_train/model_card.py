@@ -101,7 +101,7 @@ def _objects(spec: ModelSpec, objects: Sequence[ObjectKind]) -> Iterable[tuple[s
     unit = "m" if spec.camera.camera_matrix else "image widths"
     for kind in objects:
         digest = f"`{kind.mesh_sha256}`" if kind.mesh_sha256 else "–"
-        yield kind.name, f"{kind.diameter_m:.4g} {unit}", digest, kind.attribution or "ours"
+        yield kind.name, f"{kind.diameter_m:.4g} {unit}", digest, kind.attribution or "–"
 
 
 def _metrics(evaluation: Mapping[str, Any]) -> str:

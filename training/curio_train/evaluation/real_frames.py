@@ -167,9 +167,11 @@ def _metrics(pairs: Sequence[tuple[Estimate, Annotation]], points: np.ndarray, i
     alike = symmetry_poses(info)
     surface = [mssd_m(e, t, points, alike) / info.diameter_m for e, t in zip(estimates, truths, strict=True)]
     pixels = [mspd_px(e.pose, target.pose, points, alike, e.frame.matrix) * 640 / e.frame.width for e, target in pairs]
-    return scores | {
+    return {
+        "add_recall": scores.pop("add_recall"),
         "add_recall_low": low,
         "add_recall_high": high,
+        **scores,
         "mssd_recall": float(np.mean([recall(surface, threshold) for threshold in _MSSD_THRESHOLDS])),
         "mspd_recall": float(np.mean([recall(pixels, threshold) for threshold in _MSPD_THRESHOLDS])),
     }
