@@ -4,6 +4,7 @@ OpenCV's frame: x right, y down, z forward. Pixel centres lie at integer coordin
 p' + 1/2 = s (p + 1/2).
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -63,7 +64,7 @@ class PinholeCamera:
                 f"K belongs to frames of {self.size[0]}x{self.size[1]}, this one has {width}x{height}; "
                 "calibrate at the size you use, or scale K with the image"
             )
-        (fx, _, cx), (_, fy, cy), _ = self.matrix
+        (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
         if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
             raise CameraError(
                 f"the principal point ({cx:g}, {cy:g}) lies outside the frame of {width}x{height} pixels; "
@@ -101,22 +102,25 @@ class PinholeCamera:
 
     def ray(self, x: float, y: float) -> Array:
         """Unit direction [3] in the camera frame of what is seen at a pixel."""
-        point = np.array([[[x, y]]], float)
+        (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
+        slope_x, slope_y = (x - cx) / fx, (y - cy) / fy
         if self.coefficients is not None:
-            x, y = cv2.undistortPoints(point, self.matrix, self.coefficients)[0, 0]
-            direction = np.array([x, y, 1.0])
-        else:
-            direction = np.linalg.solve(self.matrix, [x, y, 1.0])
-        return direction / np.linalg.norm(direction)
+            point = np.array([[[x, y]]], float)
+            slope_x, slope_y = cv2.undistortPoints(point, self.matrix, self.coefficients)[0, 0].tolist()
+        direction = np.array([slope_x, slope_y, 1.0])
+        return direction / math.hypot(slope_x, slope_y, 1.0)
 
     def project(self, points: Array) -> Array:
         """Pixels [n, 2] of points [n, 3] in the camera frame, metres; NaN for points not in front of the camera."""
         in_front = points[:, 2] > 1e-9
-        pixels = np.full((len(points), 2), np.nan)
-        if in_front.any():
-            zero = np.zeros(3)
-            found, _ = cv2.projectPoints(points[in_front], zero, zero, self.matrix, self.coefficients)
-            pixels[in_front] = found[:, 0]
+        safe = points if in_front.all() else np.where(in_front[:, None], points, (0.0, 0.0, 1.0))
+        if self.coefficients is None:
+            seen = safe @ self.matrix.T
+            pixels = seen[:, :2] / seen[:, 2:]
+        else:
+            found, _ = cv2.projectPoints(safe, np.zeros(3), np.zeros(3), self.matrix, self.coefficients)
+            pixels = found[:, 0]
+        pixels[~in_front] = np.nan
         return pixels
 
 

@@ -9,11 +9,11 @@ from curio_proto.v1.detector_pb2 import (
     REGION_STATUS_OUTSIDE_FRAME,
     RegionResult,
 )
-from scipy.spatial.transform import Rotation
 
 from curio_serve.camera import PinholeCamera
 from curio_serve.errors import ArgumentError, CameraMissing, ImageError
 from curio_serve.model import Model, Outputs, Slot
+from curio_serve.rotation import quaternion_xyzw
 from curio_serve.view import FlatFrame, PinholeFrame, Region, View
 
 Array = np.ndarray
@@ -127,7 +127,6 @@ def _fill(result: RegionResult, view: View, slots: Sequence[Slot], outputs: Outp
     rotations = np.broadcast_to(np.eye(3), (len(slots), 3, 3))
     if "rotation" in outputs:
         rotations = view.turn(outputs["rotation"].astype(float))
-        quaternions = Rotation.from_matrix(rotations).as_quat()
     for row, slot in enumerate(slots):
         detection = result.detections.add(object=slot.object, translation_m=translations[row])
         detection.confidence = float(np.clip(outputs["confidence"][row], 0, 1)) if "confidence" in outputs else 1.0
@@ -136,7 +135,7 @@ def _fill(result: RegionResult, view: View, slots: Sequence[Slot], outputs: Outp
         if "rotation" in outputs:
             detection.rotation.extend(rotations[row].ravel().tolist())
             detection.rotation_6d.extend(rotations[row, :, :2].T.ravel().tolist())
-            detection.quaternion_xyzw.extend(quaternions[row].tolist())
+            detection.quaternion_xyzw.extend(quaternion_xyzw(rotations[row]))
         if len(slot.box_corners):
             corners = slot.box_corners @ rotations[row].T + translations[row]
             detection.box_px.extend(view.project(corners).ravel().tolist())

@@ -75,12 +75,18 @@ def open_header(data: bytes, max_pixels: int = MAX_PIXELS) -> Header:
 
 
 def decode(
-    data: bytes, *, max_pixels: int = MAX_PIXELS, max_reduction: int = 1, apply_exif_rotation: bool = False
+    data: bytes,
+    *,
+    header: Header | None = None,
+    max_pixels: int = MAX_PIXELS,
+    max_reduction: int = 1,
+    apply_exif_rotation: bool = False,
 ) -> Frame:
     """Decode a JPEG, PNG or WebP image.
 
     Args:
         data: The file's bytes.
+        header: From :func:`open_header`, where the caller has it already.
         max_pixels: Most pixels accepted, checked before anything is decoded.
         max_reduction: 1, 2, 4 or 8: a JPEG may be decoded this much smaller, which costs far less. Used as far as it
             divides both sides, so that the scale is exact.
@@ -89,7 +95,7 @@ def decode(
     Raises:
         ImageError: Says what is wrong with it.
     """
-    header = open_header(data, max_pixels)
+    header = header or open_header(data, max_pixels)
     turns = _turns(header) if apply_exif_rotation else 0
     reduction = _reduction(header, max_reduction)
     pixels = _decode_pixels(data, header, reduction)

@@ -15,6 +15,7 @@ ImageFormat = Literal["jpeg", "png", "webp"]
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _EXIF_ORIENTATION = 0x0112
 _SOF_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_PROGRESSIVE = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
 _BARE_MARKERS = frozenset(range(0xD0, 0xD8)) | {0x01}
 MAX_JPEG_SCANS = 64
 
@@ -63,7 +64,7 @@ def read_header(data: bytes) -> Header:
 def _read_jpeg(data: bytes) -> Header:
     """Walk the marker segments up to the first scan (ITU-T T.81, annex B)."""
     size: tuple[int, int, int] | None = None
-    orientation, position = 1, 2
+    is_progressive, orientation, position = False, 1, 2
     while True:
         marker, position = _next_marker(data, position)
         if marker in _BARE_MARKERS:
@@ -81,12 +82,15 @@ def _read_jpeg(data: bytes) -> Header:
             if precision != 8:
                 raise ImageError(f"the JPEG has {precision} bits a sample; expected 8: convert it")
             size = (width, height, num_channels)
+            is_progressive = marker in _PROGRESSIVE
         elif marker == 0xE1 and segment[:6] == b"Exif\x00\x00":
             orientation = exif_orientation(segment[6:])
         position += length
     if size is None:
         raise ImageError("the JPEG has no frame header before its first scan; the file is damaged")
-    _check_jpeg_body(data, position)
+    _check_jpeg_end(data, position)
+    if is_progressive or data[position + 2] < size[2]:
+        _check_jpeg_scans(data, position)
     return Header("jpeg", *size, orientation)
 
 
@@ -98,13 +102,20 @@ def _next_marker(data: bytes, position: int) -> tuple[int, int]:
     return data[position], position + 1
 
 
-def _check_jpeg_body(data: bytes, first_scan: int) -> None:
-    """Refuse a picture without its end (decoders fill in grey) and one with absurdly many scans.
+def _check_jpeg_end(data: bytes, first_scan: int) -> None:
+    """Refuse a picture without its end: decoders fill in grey.
 
-    In entropy-coded data 0xFF is followed by 0 or a restart marker alone, so both byte pairs are true markers there.
+    In entropy-coded data 0xFF is followed by 0 or a restart marker alone, so this byte pair is a true marker there.
     """
-    if data.find(b"\xff\xd9", first_scan) < 0:
+    if data.rfind(b"\xff\xd9", first_scan) < 0:
         raise ImageError(f"the JPEG is cut short: no end marker in its {len(data)} bytes; send the whole file")
+
+
+def _check_jpeg_scans(data: bytes, first_scan: int) -> None:
+    """Refuse absurdly many scans, each of which costs a pass over the picture.
+
+    Decoders read further scans only in files that are progressive or whose first scan has not all components.
+    """
     num_scans = 1 + data.count(b"\xff\xda", first_scan)
     if num_scans > MAX_JPEG_SCANS:
         raise ImageError(f"the JPEG has {num_scans} scans; at most {MAX_JPEG_SCANS} are accepted: save it as baseline")

@@ -186,7 +186,7 @@ def _decode(
     reductions = [1 if limits.full_decode else d.reduction(camera, header.width, header.height) for d in detectors]
     frame = image.decode(
         request.encoded,
-        max_pixels=limits.max_pixels,
+        header=header,
         max_reduction=min(reductions),
         apply_exif_rotation=request.apply_exif_rotation,
     )

@@ -23,12 +23,14 @@ from its centre.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 
 from curio_serve.camera import PinholeCamera, scaling
 from curio_serve.errors import CameraError
+from curio_serve.rotation import smallest_rotation
 
 Array = np.ndarray
 _MIN_RAY_DEPTH = 0.05  # cosine to the optical axis: 87 degrees
@@ -60,6 +62,19 @@ class CanonicalCamera:
     height: int
     matrix: Array | None = None
     is_default: bool = False
+
+    @cached_property
+    def inverse(self) -> Array:
+        """K*⁻¹ [3, 3]."""
+        return np.linalg.inv(np.asarray(self.matrix))
+
+    @cached_property
+    def rays(self) -> Array:
+        """Unit directions [3, 5] to the middle of the image and to its corners."""
+        right, bottom = self.width - 1.0, self.height - 1.0
+        pixels = [(right / 2, bottom / 2), (0, 0), (right, 0), (0, bottom), (right, bottom)]
+        rays = self.inverse @ np.array([(x, y, 1.0) for x, y in pixels]).T
+        return rays / np.linalg.norm(rays, axis=0)
 
     def for_frame(self, width: int, height: int) -> PinholeCamera | None:
         """K* scaled to a frame's size, where the model allows that as a default."""
@@ -169,21 +184,18 @@ class PinholeFrame:
         x = float(np.clip(region.x + region.width / 2, 0, self.width)) - 0.5
         y = float(np.clip(region.y + region.height / 2, 0, self.height)) - 0.5
         size = self._canonical.width, self._canonical.height
-        middle = np.linalg.solve(self._target, [(size[0] - 1) / 2, (size[1] - 1) / 2, 1.0])
-        turn = smallest_rotation(self._camera.ray(x, y), middle / np.linalg.norm(middle))
-        self._check_in_front(turn, size)
+        turn = smallest_rotation(self._camera.ray(x, y), self._canonical.rays[:, 0])
+        self._check_in_front(turn)
         distortion = self._camera.coefficients
         if distortion is None:
-            image = _sample(self._pixels, self._matrix @ turn.T @ np.linalg.inv(self._target), size)
+            image = _sample(self._pixels, self._matrix @ turn.T @ self._canonical.inverse, size)
         else:
             maps = cv2.initUndistortRectifyMap(self._matrix, distortion, turn, self._target, size, cv2.CV_32FC1)
             image = cv2.remap(self._pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return PinholeView(image, self._camera, turn)
 
-    def _check_in_front(self, turn: Array, size: tuple[int, int]) -> None:
-        corners = np.array([[x, y, 1.0] for x in (0, size[0] - 1) for y in (0, size[1] - 1)])
-        rays = np.linalg.solve(self._target, corners.T)
-        depths = (turn.T @ (rays / np.linalg.norm(rays, axis=0)))[2]
+    def _check_in_front(self, turn: Array) -> None:
+        depths = turn[:, 2] @ self._canonical.rays
         if depths.min() < _MIN_RAY_DEPTH:
             raise CameraError(
                 "the model's view of this region would reach more than 87 degrees away from the camera's axis; "
@@ -209,16 +221,6 @@ class FlatFrame:
         return FlatView(image, region, (self.width, self.height))
 
 
-def smallest_rotation(source: Array, target: Array) -> Array:
-    """Rotation [3, 3] that takes one unit vector [3] to another on the shortest way (Rodrigues' formula).
-
-    Both look forward (z > 0), so they are never opposite.
-    """
-    axis = np.cross(source, target)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + source @ target)
-
-
 def _average_down(pixels: Array, width: float, height: float) -> Array:
     """Pixels averaged over areas down to that size; sides that would grow stay as they are."""
     size = (
@@ -233,7 +235,7 @@ def _average_down(pixels: Array, width: float, height: float) -> Array:
 def _sample(pixels: Array, pixels_from_view: Array, size: tuple[int, int]) -> Array:
     """Image of ``size`` whose pixel p shows ``pixels`` at the homography's ``pixels_from_view`` p."""
     same_size = size == (pixels.shape[1], pixels.shape[0])
-    if same_size and np.allclose(pixels_from_view / pixels_from_view[2, 2], np.eye(3), atol=1e-6):
+    if same_size and np.abs(pixels_from_view / pixels_from_view[2, 2] - np.eye(3)).max() < 1e-6:
         return pixels
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpPerspective(pixels, pixels_from_view, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from curio_serve.camera import PinholeCamera, scaling
 from curio_serve.errors import CameraError
-from curio_serve.view import CanonicalCamera, FlatFrame, PinholeFrame, Region, smallest_rotation
+from curio_serve.rotation import quaternion_xyzw, smallest_rotation
+from curio_serve.view import CanonicalCamera, FlatFrame, PinholeFrame, Region
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 CANONICAL = CanonicalCamera(128, 96, np.array([[140.0, 0, 66.0], [0, 143.0, 45.0], [0, 0, 1]]))
 K = np.array([[640.0, 0, 350.0], [0, 650.0, 230.0], [0, 0, 1]])
@@ -102,6 +104,22 @@ def test_the_smallest_rotation_is_one_and_is_smallest(source: np.ndarray, target
     np.testing.assert_allclose(turn @ source, target, atol=1e-9)
     # Trace is 1 + 2 cos(angle), and no rotation between them has a smaller angle than theirs.
     assert (np.trace(turn) - 1) / 2 == pytest.approx(source @ target, abs=1e-9)
+
+
+@settings(deadline=None)
+@given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 1e-3))
+def test_quaternions_are_those_of_scipy(values: tuple[float, ...]) -> None:
+    matrix = Rotation.from_quat(values).as_matrix()
+    found = np.array(quaternion_xyzw(matrix))
+    assert np.linalg.norm(found) == pytest.approx(1)
+    assert found[3] >= 0
+    np.testing.assert_allclose(Rotation.from_quat(found).as_matrix(), matrix, atol=1e-9)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.6, 0, 0.8), (-0.6, 0, 0.8)])
+def test_half_turns_have_quaternions(axis: tuple[float, ...]) -> None:
+    matrix = Rotation.from_rotvec(np.pi * np.array(axis)).as_matrix()
+    np.testing.assert_allclose(np.abs(quaternion_xyzw(matrix)), np.abs([*axis, 0]), atol=1e-7)
 
 
 def test_views_behind_the_camera_are_refused() -> None:

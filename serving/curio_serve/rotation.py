@@ -1,0 +1,35 @@
+"""Rotations as serving needs them: few, small, and without a package that takes half a second to load."""
+
+import math
+
+import numpy as np
+
+Array = np.ndarray
+
+
+def smallest_rotation(source: Array, target: Array) -> Array:
+    """Rotation [3, 3] that takes one unit vector [3] to another on the shortest way (Rodrigues' formula).
+
+    Both look forward (z > 0), so they are never opposite.
+    """
+    (a, b, c), (p, q, r) = source.tolist(), target.tolist()
+    x, y, z = b * r - c * q, c * p - a * r, a * q - b * p
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + a * p + b * q + c * r)
+
+
+def quaternion_xyzw(rotation: Array) -> tuple[float, float, float, float]:
+    """Unit quaternion of a rotation matrix [3, 3], by its largest component (Shepperd 1978), w not negative."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    w, x, y, z = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz  # four times their squares
+    largest = max(w, x, y, z)
+    if largest == w:
+        w, x, y, z = w, zy - yz, xz - zx, yx - xy
+    elif largest == x:
+        w, x, y, z = zy - yz, x, yx + xy, xz + zx
+    elif largest == y:
+        w, x, y, z = xz - zx, yx + xy, y, zy + yz
+    else:
+        w, x, y, z = yx - xy, xz + zx, zy + yz, z
+    scale = math.copysign(1 / math.hypot(w, x, y, z), w)
+    return x * scale, y * scale, z * scale, w * scale
