@@ -1,6 +1,6 @@
 """Image in, poses out: one loaded model over the regions of a frame. No gRPC here."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from curio_proto.v1.detector_pb2 import (
@@ -18,6 +18,7 @@ from curio_serve.view import FlatFrame, PinholeFrame, Region, View
 
 Array = np.ndarray
 _REDUCTIONS = (8, 4, 2)
+_MAX_BATCH = 8
 
 
 class Detector:
@@ -60,19 +61,23 @@ class Detector:
         frame = self._frame(pixels, camera, reduction)
         looks = regions or [Region(0, 0, frame.width, frame.height)]
         views = [frame.look(region) if region.overlaps(frame.width, frame.height) else None for region in looks]
-        images = [view.image for view in views if view is not None]
-        outputs = self.model.run(np.stack(images)) if images else {}
+        answers = self._answers([view.image for view in views if view is not None])
         results = []
         for index, view in enumerate(views):
             result = RegionResult(model=self.model.name, model_version=self.model.version, region=index)
             if view is None:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
-                row = len([earlier for earlier in views[:index] if earlier is not None])
-                _fill(result, view, self.model.slots, {name: value[row] for name, value in outputs.items()})
-                _select(result, min_confidence, max_detections)
+                _fill(result, view, self.model.slots, next(answers), min_confidence, max_detections)
             results.append(result)
         return results
+
+    def _answers(self, images: list[Array]) -> Iterator[Outputs]:
+        """The network's outputs for each image, computed a few at a time: memory stays flat however many there are."""
+        for start in range(0, len(images), _MAX_BATCH):
+            outputs = self.model.run(np.stack(images[start : start + _MAX_BATCH]))
+            for row in range(len(outputs["translation_m"])):
+                yield {name: value[row] for name, value in outputs.items()}
 
     def reduction(self, camera: PinholeCamera | None, width: int, height: int) -> int:
         """How much smaller a frame may be decoded (1, 2, 4, 8) without going below the model's own resolution.
@@ -119,32 +124,33 @@ def _check_arguments(pixels: Array, regions: Sequence[Region], min_confidence: f
             )
 
 
-def _fill(result: RegionResult, view: View, slots: Sequence[Slot], outputs: Outputs) -> None:
-    """Turn one image's outputs back into the frame's camera and write them down."""
+def _fill(
+    result: RegionResult,
+    view: View,
+    slots: Sequence[Slot],
+    outputs: Outputs,
+    min_confidence: float,
+    max_detections: int | None,
+) -> None:
+    """Turn one image's outputs back into the frame's camera; write down the most confident, best first."""
     translations = view.translation(outputs["translation_m"].astype(float))
+    rotations = view.turn(outputs["rotation"].astype(float)) if "rotation" in outputs else None
     if "light" in outputs:
-        result.light.extend(view.turn(outputs["light"].astype(float)[:, None])[:, 0])
-    rotations = np.broadcast_to(np.eye(3), (len(slots), 3, 3))
-    if "rotation" in outputs:
-        rotations = view.turn(outputs["rotation"].astype(float))
-    for row, slot in enumerate(slots):
-        detection = result.detections.add(object=slot.object, translation_m=translations[row])
-        detection.confidence = float(np.clip(outputs["confidence"][row], 0, 1)) if "confidence" in outputs else 1.0
+        result.light.extend(view.turn(outputs["light"].astype(float)[:, None])[:, 0].tolist())
+    confidences = outputs["confidence"].clip(0, 1).tolist() if "confidence" in outputs else [1.0] * len(slots)
+    confident = [row for row in range(len(slots)) if confidences[row] >= min_confidence]
+    for row in sorted(confident, key=lambda row: -confidences[row])[:max_detections]:
+        found = result.detections.add(object=slots[row].object, confidence=confidences[row])
+        found.translation_m.extend(translations[row].tolist())
         if "color" in outputs:
-            detection.color.extend(outputs["color"][row].tolist())
-        if "rotation" in outputs:
-            detection.rotation.extend(rotations[row].ravel().tolist())
-            detection.rotation_6d.extend(rotations[row, :, :2].T.ravel().tolist())
-            detection.quaternion_xyzw.extend(quaternion_xyzw(rotations[row]))
-        if len(slot.box_corners):
-            corners = slot.box_corners @ rotations[row].T + translations[row]
-            detection.box_px.extend(view.project(corners).ravel().tolist())
-
-
-def _select(result: RegionResult, min_confidence: float, max_detections: int | None) -> None:
-    """Keep the detections that are confident enough, best first."""
-    kept = sorted((d for d in result.detections if d.confidence >= min_confidence), key=lambda d: -d.confidence)
-    kept = kept[:max_detections]
-    result.status = REGION_STATUS_DETECTED if kept else REGION_STATUS_NO_OBJECT
-    del result.detections[:]
-    result.detections.extend(kept)
+            found.color.extend(outputs["color"][row].tolist())
+        rotation = np.eye(3)
+        if rotations is not None:
+            rotation = rotations[row]
+            found.rotation.extend(rotation.ravel().tolist())
+            found.rotation_6d.extend(rotation[:, :2].T.ravel().tolist())
+            found.quaternion_xyzw.extend(quaternion_xyzw(rotation))
+        if len(slots[row].box_corners):
+            corners = slots[row].box_corners @ rotation.T + translations[row]
+            found.box_px.extend(view.project(corners).ravel().tolist())
+    result.status = REGION_STATUS_DETECTED if result.detections else REGION_STATUS_NO_OBJECT

@@ -157,6 +157,18 @@ def test_regions_keep_their_order_and_status(flat: Detector, spot_image: DrawSpo
     np.testing.assert_allclose(position, [(500 - 319.5) / 640, (100 - 239.5) / 640, 0], atol=1e-3)
 
 
+def test_many_regions_are_answered_each_with_its_own(flat: Detector, spot_image: DrawSpot) -> None:
+    picture = spot_image(640, 480, 320, 240, 12, 12, COLOR)
+    regions = [Region(20 * i, 10 * i, 320, 240) for i in range(20)]
+    together = flat.detect(picture, None, regions=regions)
+    for index, region in enumerate(regions):
+        [alone] = flat.detect(picture, None, regions=[region])
+        assert (together[index].region, together[index].status) == (index, alone.status)
+        found, expected = together[index].detections[0], alone.detections[0]
+        np.testing.assert_allclose(found.translation_m, expected.translation_m, atol=1e-6)
+        np.testing.assert_allclose(found.box_px, expected.box_px, atol=1e-3)
+
+
 def test_missing_k_is_refused_and_a_default_is_only_the_specs(
     pinhole: Detector, spot_onnx: Callable[..., onnx.ModelProto], spot_spec: Callable[[bool], ModelSpec], tmp_path: Path
 ) -> None:
