@@ -103,7 +103,6 @@ class Trainer:
                 dream = sleep_codes(self.world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
                 with torch.no_grad():
                     dreamt = self.world.disturb(self.world.render(dream, batch.backgrounds), seed)
-                    dreamt = self.world.disturb(dreamt, (self.config.seed, number))
                 losses["sleep"] = supervised_loss(self.world.layout, self._read(dreamt)[1], dream, self._groups)
 
             torch.stack([weights[name] * loss for name, loss in losses.items()]).sum().div(self._num_micro).backward()
@@ -216,14 +215,14 @@ def train(
             outcome = _outcome(config, course.image_loss, progress, bool(signalled))
             if reporter and (outcome or seconds - saved_at >= 60 * checkpoint_minutes):
                 run.save(trainer.state)
-                reporter.pictures(course, trainer.pairs())
+                reporter.pictures(trainer.pairs())
                 saved_at = seconds
             if outcome:
                 return outcome
             losses = trainer.step(learning_rate_factor(config.recipe, course.step, progress))
             course.seconds, clock = course.seconds + time.monotonic() - clock, time.monotonic()
             if reporter:
-                reporter.step(course, losses, progress)
+                reporter.step(losses, config.progress(course.images, course.seconds))
 
 
 def _outcome(config: RunConfig, loss: float | None, progress: float, signalled: bool) -> Outcome | None:

@@ -32,11 +32,12 @@ class Reporter:
 
     def __init__(self, run: Path, course: Course, console: Console) -> None:
         self._run = run
+        self._course = course
         self._console = console
         self._curves = SummaryWriter(str(run / "tensorboard"), purge_step=course.step)
         self._history = (run / "history.jsonl").open("a", encoding="utf-8")
         self._sums: Counter[str] = Counter()
-        self._since = (course.step, course.seconds)
+        self._since = (course.step, course.images, course.seconds)
         self._logged_at = course.seconds
         self._bar: Progress | None = None
         self._task = TaskID(0)
@@ -47,66 +48,78 @@ class Reporter:
             self._task = self._bar.add_task("starting", total=1.0)
             self._bar.start()
 
-    def step(self, course: Course, losses: dict[str, float], progress: float) -> None:
-        """Take note of one step."""
+    def step(self, losses: dict[str, float], progress: float) -> None:
+        """Take note of one step, after which ``progress`` of the budget is spent."""
         self._sums.update(losses)
-        steps = course.step - self._since[0]
-        if steps < _STEPS_A_LINE and progress < 1:
-            return
-        means = {name: value / steps for name, value in self._sums.items()}
-        rate = course.images / course.step * steps / max(course.seconds - self._since[1], 1e-9)
-        self._note(course, means, rate)
-        self._show(course, means, rate, progress)
-        self._sums.clear()
-        self._since = (course.step, course.seconds)
+        if self._course.step - self._since[0] >= _STEPS_A_LINE:
+            with _writing_into(self._run):
+                text = self._note()
+            self._show(text, progress)
 
-    def pictures(self, course: Course, pairs: tuple[Tensor, Tensor]) -> None:
+    def pictures(self, pairs: tuple[Tensor, Tensor]) -> None:
         """Show inputs and re-renderings, [num, 3, height, width] each."""
         sheet = torch.cat([torch.cat(list(images.cpu()), dim=2) for images in pairs], dim=1).clamp(0, 1)
-        self._curves.add_image("input above, re-rendering below", sheet, course.step)
         pixels = (sheet * 255).round().byte().permute(1, 2, 0).numpy()
-        file = self._run / "samples.png"
-        if not cv2.imwrite(str(file), cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)):
-            raise CheckpointError(f"cannot write {file}; is the disk full?")
+        _, png = cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
+        with _writing_into(self._run):
+            self._curves.add_image("input above, re-rendering below", sheet, self._course.step)
+            (self._run / "samples.png").write_bytes(png.tobytes())
 
     def close(self) -> None:
         """Put everything on disk and leave the terminal in order."""
         if self._bar is not None:
             self._bar.stop()
-        self._history.close()
-        self._curves.close()
+        with _writing_into(self._run), self._history, self._curves:
+            if self._sums:
+                self._note()
 
-    def _note(self, course: Course, means: dict[str, float], rate: float) -> None:
-        row = {"step": course.step, "images": course.images, "seconds": round(course.seconds, 3), **means}
+    def _note(self) -> str:
+        """Write down what was gathered since the last line; returns it in words."""
+        now = self._course
+        steps, images, seconds = now.step - self._since[0], now.images - self._since[1], now.seconds - self._since[2]
+        means = {name: value / steps for name, value in self._sums.items()}
+        rate = images / max(seconds, 1e-9)
+        row = {"step": now.step, "images": now.images, "seconds": round(now.seconds, 3), **means}
         self._history.write(json.dumps(row) + "\n")
         self._history.flush()
         for name, value in means.items():
-            self._curves.add_scalar(f"loss/{name}", value, course.step)
-        self._curves.add_scalar("images_per_second", rate, course.step)
-
-    def _show(self, course: Course, means: dict[str, float], rate: float, progress: float) -> None:
+            self._curves.add_scalar(f"loss/{name}", value, now.step)
+        self._curves.add_scalar("images_per_second", rate, now.step)
+        self._sums.clear()
+        self._since = (now.step, now.images, now.seconds)
         losses = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
-        left = course.seconds * (1 / progress - 1)
-        text = f"{course.images:,} images  {losses}  {rate:.0f} images/s  {_clock(left)} left"
+        return f"{now.images:,} images  {losses}  {rate:.0f} images/s"
+
+    def _show(self, text: str, progress: float) -> None:
+        seconds = self._course.seconds
+        text += f"  {_clock(seconds * max(0.0, 1 / progress - 1))} left"
         if self._bar is not None:
             self._bar.update(self._task, completed=min(progress, 1.0), description=text)
-        elif course.seconds - self._logged_at >= _SECONDS_A_LINE or progress >= 1:
-            self._console.print(f"{_clock(course.seconds)}  {text}", soft_wrap=True)
-            self._logged_at = course.seconds
+        elif seconds - self._logged_at >= _SECONDS_A_LINE:
+            self._console.print(f"{_clock(seconds)}  {text}", soft_wrap=True)
+            self._logged_at = seconds
 
 
 @contextmanager
 def reporting(run: Path, course: Course) -> Iterator[Reporter]:
     """Follow a run from ``course`` on; what was noted after that point, by a session since killed, is dropped."""
-    try:
+    with _writing_into(run):
         _drop_after(run / "history.jsonl", course.step)
         reporter = Reporter(run, course, Console(stderr=True, highlight=False))
-    except OSError as exc:
-        raise CheckpointError(f"cannot write into {run}: {exc.strerror}") from exc
     try:
         yield reporter
     finally:
         reporter.close()
+
+
+@contextmanager
+def _writing_into(run: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as exc:
+        raise CheckpointError(
+            f"cannot write into {run}: {exc.strerror}; make room, then go on with --resume {run}"
+        ) from exc
 
 
 def _drop_after(history: Path, step: int) -> None:

@@ -1,0 +1,239 @@
+"""Run folders: what is saved is restored bit for bit, and nothing that goes wrong costs what was saved."""
+
+import json
+import resource
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from curio_train.config import ConvStack, NetworkConfig, Recipe, RunConfig
+from curio_train.errors import CheckpointError, ResumeMismatch, UsageError
+from curio_train.learning.checkpoint import RunFolder
+from curio_train.learning.configuration import load_config, refuse_other
+from curio_train.learning.interruption import Interrupted, Interruption, interruptible
+from curio_train.learning.loop import Outcome
+from curio_train.learning.session import learn
+from curio_train.learning.state import TrainState
+from curio_train.worlds.circles import Circles
+from curio_train.worlds.options import CirclesOptions, LinemodOptions
+from torch import Tensor
+
+CONFIG = RunConfig(
+    CirclesOptions(),
+    method="wake_sleep_critic",
+    images=48,
+    recipe=Recipe(batch_size=8, micro_batch_size=4, gradient_penalty=1.0, gradient_penalty_every=2, warm_up_steps=3),
+    network=NetworkConfig(
+        encoder=ConvStack((8, 16, 16, 32, 32), (11, 5, 3, 3, 3), (4, 2, 2, 2, 2), (0, 1, 1, 1, 0)),
+        critic=ConvStack((8, 8, 16, 16, 1), (11, 5, 3, 3, 3), (4, 4, 2, 2, 2), (0, 0, 1, 1, 1)),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Sums over several threads have no fixed order."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def train(path: Path, cache: Path, config: RunConfig = CONFIG, *, resume: bool = False) -> None:
+    learn(config, path, Interruption(), resume=resume, cache=cache)
+
+
+def last_tensors(path: Path) -> dict[str, Tensor]:
+    run = RunFolder.open(path)
+    state = TrainState(run.config, Circles(), torch.device("cpu"))
+    run.restore(state)
+    return state.tensors()
+
+
+def assert_same(one: dict[str, Tensor], other: dict[str, Tensor]) -> None:
+    assert one.keys() == other.keys()
+    assert [name for name in one if not torch.equal(one[name], other[name])] == []
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(tmp_path: Path, cache: Path) -> None:
+    train(tmp_path / "whole", cache)
+    train(tmp_path / "pieces", cache, replace(CONFIG, images=16))
+    train(tmp_path / "pieces", cache, replace(CONFIG, images=40), resume=True)
+    train(tmp_path / "pieces", cache, resume=True)
+    assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "pieces"))
+    courses = [
+        json.loads((RunFolder.open(tmp_path / name).checkpoints()[-1] / "course.json").read_text())
+        for name in ("whole", "pieces")
+    ]
+    assert courses[0].pop("seconds") > 0
+    assert courses[1].pop("seconds") > 0
+    assert courses[0] == courses[1]
+
+
+def test_two_checkpoints_are_kept(tmp_path: Path, cache: Path) -> None:
+    learn(CONFIG, tmp_path / "run", Interruption(), resume=False, cache=cache, checkpoint_minutes=0)
+    kept = [path.name for path in sorted((tmp_path / "run/checkpoints").iterdir())]
+    assert kept == ["00000005", "00000006"]
+
+
+@contextmanager
+def largest_file(num_bytes: int) -> Iterator[None]:
+    """A disk with room for so much: beyond it every write fails, as on a full one."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+
+
+def test_a_full_disk_costs_no_earlier_checkpoint(tmp_path: Path, cache: Path) -> None:
+    train(tmp_path / "run", cache)
+    run = RunFolder.open(tmp_path / "run")
+    before = last_tensors(run.path)
+    state = run.trained(Circles())
+    state.course.step += 1
+    with largest_file(50_000), pytest.raises(CheckpointError, match=r"cannot write checkpoint .*00000006 is intact"):
+        run.save(state)
+    assert [path.name for path in run.path.joinpath("checkpoints").iterdir()] == ["00000006"]
+    assert_same(before, last_tensors(run.path))
+
+
+def test_a_full_disk_ends_training_with_that_error(tmp_path: Path, cache: Path) -> None:
+    Circles().source("train", 0, with_code=False, cache=cache)
+    with largest_file(100_000), pytest.raises(CheckpointError, match="there is no earlier one"):
+        train(tmp_path / "run", cache)
+
+
+def test_what_a_killed_writer_left_is_no_checkpoint(tmp_path: Path, cache: Path) -> None:
+    train(tmp_path / "run", cache)
+    draft = tmp_path / "run/checkpoints/draft.tmp"
+    draft.mkdir()
+    (draft / "tensors.safetensors").write_bytes(b"half")
+    train(tmp_path / "run", cache, replace(CONFIG, images=56), resume=True)
+    assert RunFolder.open(tmp_path / "run").checkpoints()[-1].name == "00000007"
+    assert not draft.exists()
+
+
+def test_a_run_killed_before_its_first_checkpoint_starts_again(tmp_path: Path, cache: Path) -> None:
+    train(tmp_path / "whole", cache)
+    RunFolder(tmp_path / "killed", CONFIG).write_config(new=True)
+    train(tmp_path / "killed", cache, resume=True)
+    assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "killed"))
+
+
+@pytest.mark.parametrize("file", ["tensors.safetensors", "course.json"])
+def test_a_damaged_checkpoint_is_named(tmp_path: Path, cache: Path, file: str) -> None:
+    train(tmp_path / "run", cache)
+    damaged = tmp_path / "run/checkpoints/00000006" / file
+    damaged.write_bytes(damaged.read_bytes()[:-7])
+    with pytest.raises(CheckpointError, match=r"00000006 cannot be read .*delete this folder to go on"):
+        train(tmp_path / "run", cache, resume=True)
+
+
+def test_history_has_no_line_twice_after_a_kill(tmp_path: Path, cache: Path) -> None:
+    train(tmp_path / "run", cache)
+    with (tmp_path / "run/history.jsonl").open("a") as file:
+        file.write('{"step": 7, "images": 56, "seconds": 1.0, "image": 1.0}\n{"step": 8, "ima')
+    train(tmp_path / "run", cache, replace(CONFIG, images=64), resume=True)
+    rows = [json.loads(line) for line in (tmp_path / "run/history.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [6, 8]
+
+
+def test_a_run_folder_is_not_written_over(tmp_path: Path, cache: Path) -> None:
+    RunFolder(tmp_path, CONFIG).write_config(new=True)
+    with pytest.raises(UsageError, match=r"holds a run already.*--resume.*--out"):
+        RunFolder(tmp_path, CONFIG).write_config(new=True)
+
+
+def test_a_folder_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(CheckpointError, match=r"cannot write the run folder .*--out"):
+        RunFolder(tmp_path / "file/run", CONFIG).write_config(new=True)
+
+
+def test_a_run_without_checkpoints_has_no_network(tmp_path: Path) -> None:
+    RunFolder(tmp_path, CONFIG).write_config(new=True)
+    with pytest.raises(CheckpointError, match="has no checkpoint yet"):
+        RunFolder.open(tmp_path).trained(Circles())
+
+
+@pytest.mark.parametrize(
+    "config",
+    [CONFIG, RunConfig(LinemodOptions("ape", Path("some/where"), None), minutes=1.5, method="super", labels=0.1)],
+)
+def test_configurations_survive_their_file(tmp_path: Path, config: RunConfig) -> None:
+    RunFolder(tmp_path, config).write_config(new=True)
+    assert load_config(tmp_path) == config
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "is no run folder"),
+        ("{", "is no configuration of this version"),
+        ('{"world": {"name": "atlantis"}}', "is no configuration of this version"),
+        ('{"world": {"name": "circles"}, "methods": "our"}', "is no configuration of this version"),
+        ('{"world": {"name": "circles"}, "labels": 7.0}', "is no share"),
+        ("[]", "is no configuration of this version"),
+    ],
+)
+def test_damaged_configurations_are_named(tmp_path: Path, content: str | None, message: str) -> None:
+    if content is not None:
+        (tmp_path / "config.json").write_text(content)
+    with pytest.raises(CheckpointError, match=message):
+        load_config(tmp_path)
+
+
+def test_another_configuration_is_refused_field_by_field(tmp_path: Path) -> None:
+    wanted = replace(CONFIG, method="our", seed=3, recipe=replace(CONFIG.recipe, learning_rate=0.5))
+    with pytest.raises(ResumeMismatch) as caught:
+        refuse_other(CONFIG, wanted, tmp_path)
+    text = str(caught.value)
+    assert "method (run: wake_sleep_critic, now: our)" in text
+    assert "recipe.learning_rate (run: 0.0001, now: 0.5)" in text
+    assert "seed (run: 0, now: 3)" in text
+    assert "batch_size" not in text
+    assert caught.value.exit_status == 2
+
+
+def test_budgets_may_be_given_anew(tmp_path: Path) -> None:
+    refuse_other(CONFIG, replace(CONFIG, images=None, minutes=3.0, stop_below=5.0), tmp_path)
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_signals_wait_for_the_step_at_hand_and_a_second_one_does_not(signum: signal.Signals) -> None:
+    with interruptible() as interruption, interruption.deferred():
+        signal.raise_signal(signum)
+        assert interruption.signum == signum
+        with pytest.raises(Interrupted) as caught:
+            signal.raise_signal(signum)
+    assert caught.value.exit_status == 128 + signum
+
+
+def test_outside_training_a_signal_stops_at_once_and_handlers_are_put_back() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(Interrupted), interruptible():
+        signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, cache: Path) -> None:
+    stopped = Interruption()
+    stopped.signum = signal.SIGTERM
+    outcome, _ = learn(CONFIG, tmp_path / "run", stopped, resume=False, cache=cache)
+    assert outcome is Outcome.INTERRUPTED
+    train(tmp_path / "run", cache, resume=True)
+    train(tmp_path / "whole", cache)
+    assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "run"))

@@ -1,0 +1,257 @@
+"""The loop: every method learns, accumulates, clips, stops, and sees no label it should not see."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+from curio_train.config import PRESETS, ConvStack, Method, NetworkConfig, Recipe, RunConfig
+from curio_train.errors import DataError, TrainingError, UsageError
+from curio_train.learning.interruption import Interruption
+from curio_train.learning.loop import Outcome, Trainer, learning_rate_factor
+from curio_train.learning.parallel import Ranks
+from curio_train.learning.session import learn
+from curio_train.worlds.base import Batch, ImageSource
+from curio_train.worlds.circles import Circles
+from curio_train.worlds.options import CirclesOptions
+from torch import Tensor
+
+THIN = NetworkConfig(
+    encoder=ConvStack((8, 16, 16, 32, 32), (11, 5, 3, 3, 3), (4, 2, 2, 2, 2), (0, 1, 1, 1, 0)),
+    critic=ConvStack((8, 8, 16, 16, 1), (11, 5, 3, 3, 3), (4, 4, 2, 2, 2), (0, 0, 1, 1, 1)),
+)
+FAST = Recipe(batch_size=8, micro_batch_size=8, learning_rate=3e-3, critic_learning_rate=1e-4, critic_weight=0.1)
+ALONE = Ranks(0, 1, torch.device("cpu"))
+
+
+class SameBatch(ImageSource):
+    """The same few circles at every step, however many are asked for."""
+
+    def __init__(self, *, with_code: bool) -> None:
+        world = Circles()
+        self.code = world.sample(8, (3,))
+        self.images = world.render(self.code)
+        self.with_code = with_code
+
+    def batch(self, step: int, size: int) -> Batch:
+        rows = torch.arange(size) % 8
+        code = {name: value[rows] for name, value in self.code.items()}
+        return Batch(self.images[rows], code=code if self.with_code else None)
+
+
+def configuration(method: Method = "our", recipe: Recipe = FAST, **others: object) -> RunConfig:
+    return RunConfig(CirclesOptions(), method=method, recipe=recipe, network=THIN, **others)
+
+
+def trainer(config: RunConfig) -> Trainer:
+    return Trainer(config, Circles(), SameBatch(with_code=config.method == "super"), ALONE)
+
+
+def weights(trainer: Trainer) -> Tensor:
+    return torch.cat(
+        [p.detach().flatten() for one in trainer.state.learners.values() for p in one.network.parameters()]
+    )
+
+
+def gradients(trainer: Trainer) -> list[Tensor]:
+    return [p.grad for one in trainer.state.learners.values() for p in one.network.parameters()]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.mark.parametrize("method", get_args(Method))
+def test_every_method_learns_a_fixed_batch(method: Method) -> None:
+    one = trainer(configuration(method))
+    rows = [one.step(1.0) for _ in range(25)]
+    assert all(math.isfinite(value) for row in rows for value in row.values())
+    term = "label" if method == "super" else "image"
+    assert rows[-1][term] < 0.8 * rows[0][term]
+
+
+@pytest.mark.parametrize(
+    ("method", "terms"),
+    [
+        ("our", {"image", "curiosity", "critic"}),
+        ("noncur", {"image"}),
+        ("super", {"label"}),
+        ("wake_sleep", {"image", "sleep"}),
+        ("wake_sleep_critic", {"image", "curiosity", "critic", "sleep"}),
+    ],
+)
+def test_a_method_is_its_loss_terms(method: Method, terms: set[str]) -> None:
+    one = trainer(configuration(method))
+    assert set(one.step(1.0)) == terms
+    assert (one.state.critic is None) == ("critic" not in terms)
+
+
+def test_micro_batches_add_up_to_the_gradient_of_the_whole() -> None:
+    whole = trainer(configuration("our", FAST))
+    pieces = trainer(configuration("our", replace(FAST, batch_size=24)))  # three times the same micro-batch of eight
+    for one in (whole, pieces):
+        one.step(1.0)
+    for one, other in zip(*(gradients(t) for t in (whole, pieces)), strict=True):
+        assert torch.allclose(one, other, atol=1e-5, rtol=1e-3)
+    assert pieces.state.course.images == 24
+
+
+def test_each_micro_batch_holds_its_own_images(cache: Path) -> None:
+    seen = []
+
+    class Recording(ImageSource):
+        def batch(self, step: int, size: int) -> Batch:
+            seen.append((step, size))
+            return SameBatch(with_code=False).batch(step, size)
+
+    one = Trainer(
+        configuration("noncur", replace(FAST, batch_size=6, micro_batch_size=2)), Circles(), Recording(), ALONE
+    )
+    one.step(1.0)
+    one.step(1.0)
+    assert seen == [(number, 2) for number in range(6)]
+
+
+def test_gradients_are_clipped_to_the_recipes_norm() -> None:
+    one = trainer(configuration("our", replace(FAST, gradient_clip=1e-3)))
+    one.step(1.0)
+    for learner in one.state.learners.values():
+        norm = torch.stack([p.grad.norm() for p in learner.network.parameters()]).norm()
+        assert norm.item() == pytest.approx(1e-3, rel=1e-2)
+
+
+def test_gradient_penalty_acts_on_its_steps_alone() -> None:
+    plain = trainer(configuration("our", FAST))
+    rare = trainer(configuration("our", replace(FAST, gradient_penalty=10.0, gradient_penalty_every=3)))
+    plain.step(1.0), rare.step(1.0)
+    assert not torch.equal(weights(plain), weights(rare))
+    rare.state.load({k: v.clone() for k, v in plain.state.tensors().items()}, replace(plain.state.course))
+    plain.step(1.0), rare.step(1.0)
+    assert torch.equal(weights(plain), weights(rare))
+
+
+def test_two_runs_of_a_seed_are_equal_and_another_seed_is_not() -> None:
+    runs = [trainer(configuration("wake_sleep_critic", seed=seed)) for seed in (5, 5, 6)]
+    for one in runs:
+        one.step(1.0)
+    assert torch.equal(weights(runs[0]), weights(runs[1]))
+    assert not torch.equal(weights(runs[0]), weights(runs[2]))
+
+
+def test_a_step_that_is_not_finite_is_discarded_and_named() -> None:
+    one = trainer(configuration("our"))
+    one.step(1.0)
+    with torch.no_grad():
+        one.state.pose.network.heads.trunk[0].bias[0] = math.inf
+    before = weights(one)
+    with pytest.raises(TrainingError, match=r"step 2: not finite: .*image.*the gradient of pose"):
+        one.step(1.0)
+    assert torch.equal(weights(one), before)
+    assert one.state.course.step == 1
+
+
+def test_learning_rate_warms_up_and_decays_along_a_cosine() -> None:
+    recipe = Recipe(warm_up_steps=3, final_learning_rate=0.1)
+    assert [learning_rate_factor(recipe, step, 0.0) for step in (0, 1, 2, 3, 9)] == [0.25, 0.5, 0.75, 1, 1]
+    assert learning_rate_factor(recipe, 9, 0.5) == pytest.approx(0.55)
+    assert learning_rate_factor(recipe, 9, 1.2) == pytest.approx(0.1)
+    assert learning_rate_factor(PRESETS["paper"], 0, 0.7) == 1
+
+
+@pytest.fixture
+def interruption() -> Interruption:
+    return Interruption()
+
+
+def test_a_run_ends_with_its_budget_of_images(tmp_path: Path, cache: Path, interruption: Interruption) -> None:
+    outcome, course = learn(configuration(images=20), tmp_path / "run", interruption, resume=False, cache=cache)
+    assert (outcome, course.step, course.images) == (Outcome.SPENT, 3, 24)
+    assert (tmp_path / "run/samples.png").stat().st_size > 0
+    assert (tmp_path / "run/history.jsonl").read_text().count("\n") == 1
+    assert list((tmp_path / "run/tensorboard").iterdir())
+
+
+def test_a_run_ends_with_its_budget_of_minutes(tmp_path: Path, cache: Path, interruption: Interruption) -> None:
+    outcome, course = learn(configuration(minutes=1e-6), tmp_path / "run", interruption, resume=False, cache=cache)
+    assert (outcome, course.step) == (Outcome.SPENT, 1)
+
+
+def test_a_run_ends_when_the_image_loss_is_low_enough(tmp_path: Path, cache: Path, interruption: Interruption) -> None:
+    config = configuration(stop_below=1e9)
+    outcome, course = learn(config, tmp_path / "run", interruption, resume=False, cache=cache)
+    assert (outcome, course.step) == (Outcome.CONVERGED, 1)
+
+
+def test_a_signal_ends_a_run_after_a_whole_step(tmp_path: Path, cache: Path, interruption: Interruption) -> None:
+    interruption.signum = 15
+    outcome, _ = learn(configuration(images=800), tmp_path / "run", interruption, resume=False, cache=cache)
+    assert outcome is Outcome.INTERRUPTED
+    assert list((tmp_path / "run/checkpoints").iterdir())
+
+
+def test_label_free_methods_do_not_open_the_labels(tmp_path: Path, interruption: Interruption) -> None:
+    Circles().source("train", 0, with_code=False, cache=tmp_path)
+    for labels in tmp_path.glob("circles-*/*.codes.npz"):
+        labels.unlink()
+        labels.mkdir()  # whoever opens it fails, root too
+    for method in ("our", "noncur", "wake_sleep", "wake_sleep_critic"):
+        config = configuration(method, images=8)
+        outcome, _ = learn(config, tmp_path / method, interruption, resume=False, cache=tmp_path)
+        assert outcome is Outcome.SPENT
+    with pytest.raises(DataError):
+        learn(configuration("super", images=8), tmp_path / "super", interruption, resume=False, cache=tmp_path)
+
+
+def test_supervision_sees_only_its_share_of_the_images(tmp_path: Path, cache: Path, interruption: Interruption) -> None:
+    few, all_ = (configuration("super", images=8, labels=labels) for labels in (0.05, 1.0))
+    for number, config in enumerate((few, all_)):
+        learn(config, tmp_path / str(number), interruption, resume=False, cache=cache)
+    source = Circles().source("train", 0, with_code=True, cache=cache).subset(0.05)
+    shown = source.batch(0, 8).images
+    assert all(any(torch.equal(image, one) for one in source.images[:100].float() / 255) for image in shown)
+    histories = [(tmp_path / str(number) / "history.jsonl").read_text() for number in range(2)]
+    assert histories[0] != histories[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"labels": 0.5}, "expected --method super"),
+        ({"method": "super", "labels": 1.5}, "is no share"),
+        ({"minutes": 0.0}, "--minutes is 0.0, expected more than 0"),
+        ({"images": -1}, "--images is -1, expected more than 0"),
+    ],
+)
+def test_configurations_that_make_no_sense_are_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        RunConfig(CirclesOptions(), **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"batch_size": 10, "micro_batch_size": 4}, "cannot be cut into micro-batches of 4"),
+        ({"micro_batch_size": 1}, "batch norm needs two images"),
+        ({"learning_rate": 0.0}, "--learning-rate is 0.0"),
+    ],
+)
+def test_recipes_that_make_no_sense_are_refused(change: dict[str, float], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Recipe(**change)
+
+
+def test_the_paper_preset_is_the_papers_table() -> None:
+    paper = PRESETS["paper"]
+    assert (paper.batch_size, paper.learning_rate, paper.critic_learning_rate) == (128, 1e-4, 1e-6)
+    assert (paper.image_weight, paper.critic_weight, paper.gradient_clip) == (0.01, 10, 0.5)
+
+
+def test_processes_share_micro_batches_evenly_or_not_at_all() -> None:
+    shares = [list(Ranks(rank, 2, torch.device("cpu")).share(4)) for rank in range(2)]
+    assert np.array(shares).tolist() == [[0, 2], [1, 3]]
+    with pytest.raises(UsageError, match="3 micro-batches a step cannot be shared by 2 processes"):
+        Ranks(0, 2, torch.device("cpu")).share(3)

@@ -1,0 +1,142 @@
+"""curio-train as a user meets it: a real process, killed, interrupted, called wrongly."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+COMMAND = Path(sys.executable).with_name("curio-train")
+PATIENCE_S = 300  # ends a test that hangs; nothing is measured by it
+SMALL = ["--batch-size", "4", "--micro-batch-size", "2", "--precision", "float32", "--gradient-penalty-every", "2"]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    return subprocess.Popen(
+        [COMMAND, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=one_thread
+    )
+
+
+def call(*arguments: object) -> tuple[int, str, str]:
+    process = start(*arguments)
+    output, errors = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, output, errors
+
+
+def checkpoints(run: Path) -> list[Path]:
+    return sorted(run.glob("checkpoints/0*"))
+
+
+def wait_for_checkpoint(process: subprocess.Popen[str], run: Path, step: int) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not any(int(path.name) >= step for path in checkpoints(run)):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def assert_same_end(one: Path, other: Path) -> None:
+    ends = [load_file(checkpoints(run)[-1] / "tensors.safetensors") for run in (one, other)]
+    assert ends[0].keys() == ends[1].keys()
+    assert [name for name in ends[0] if not torch.equal(ends[0][name], ends[1][name])] == []
+
+
+def test_a_run_killed_outright_goes_on_as_if_uninterrupted(tmp_path: Path, cache: Path) -> None:
+    common = ["circles", "--images", 96, "--cache", cache, *SMALL]
+    assert call(*common, "--out", tmp_path / "whole")[0] == 0
+    killed = tmp_path / "killed"
+    process = start(*common, "--out", killed, "--checkpoint-minutes", 0)
+    wait_for_checkpoint(process, killed, 5)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert checkpoints(killed)[-1].name < "00000024"
+    status, output, _ = call("circles", "--resume", killed, "--cache", cache)
+    assert status == 0
+    assert f"{killed}: the budget is spent after 96 images" in output
+    assert_same_end(tmp_path / "whole", killed)
+
+
+@pytest.mark.parametrize(("signum", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_polite_signal_leaves_a_checkpoint_and_says_how_to_go_on(
+    tmp_path: Path, cache: Path, signum: signal.Signals, status: int
+) -> None:
+    run = tmp_path / "run"
+    process = start("circles", "--method", "noncur", "--images", 10**6, "--cache", cache, "--out", run, *SMALL,
+                    "--checkpoint-minutes", 0)  # fmt: skip
+    wait_for_checkpoint(process, run, 1)
+    process.send_signal(signum)
+    _output, errors = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == status, errors
+    assert f"go on with: curio-train circles --resume {run}" in errors
+    assert "Traceback" not in errors
+    last = checkpoints(run)[-1]
+    assert json.loads((last / "course.json").read_text())["step"] == int(last.name)
+    budget = 4 * int(last.name) + 4
+    assert call("circles", "--resume", run, "--images", budget, "--cache", cache)[0] == 0
+    assert int(checkpoints(run)[-1].name) == int(last.name) + 1
+
+
+def test_help_names_worlds_flags_and_defaults_without_torch() -> None:
+    script = (
+        "import sys; from curio_train.cli import train\n"
+        "try: train(sys.argv[1:])\n"
+        "finally: print(sorted({'torch', 'mitsuba', 'cv2', 'scipy'} & set(sys.modules)), file=sys.stderr)"
+    )
+    for arguments, expected in (
+        (["--help"], ["circles", "linemod"]),
+        (["circles", "--help"], ["--method", "(default: our)", "--minutes", "--learning-rate", "(default: laptop)"]),
+        (["circles", "--preset", "paper", "--help"], ["--learning-rate FLOAT", "(default: 0.0001)", "(default: 128)"]),
+    ):
+        done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False)
+        assert done.returncode == 0
+        assert done.stderr.strip() == "[]"
+        shown = " ".join(done.stdout.replace("│", " ").split())
+        assert [text for text in expected if text not in shown] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        ([], 2, "circles"),
+        (["atlantis"], 2, "atlantis"),
+        (["circles", "--method", "magic"], 2, "magic"),
+        (["circles", "--labels", "0.1"], 2, "--labels 0.1 with --method our, which uses none; expected --method super"),
+        (["circles", "--minutes", "-1"], 2, "--minutes is -1.0, expected more than 0"),
+        (["circles", "--batch-size", "10"], 2, "cannot be cut into micro-batches of 32"),
+        (["circles", "--resume", "nowhere"], 1, "nowhere is no run folder: cannot read nowhere/config.json"),
+        (["circles", "--resume"], 2, "--resume"),
+        (["linemod"], 2, "--class"),
+        (["circles", "--out", "/proc/run"], 1, "cannot write the run folder /proc/run"),
+        (["circles", "--device", "cuda"], 2, "torch finds no CUDA device"),
+    ],
+)
+def test_wrong_calls_get_one_clear_message(arguments: list[str], status: int, message: str, tmp_path: Path) -> None:
+    found, output, errors = call(*arguments, *(["--cache", tmp_path] if arguments[:1] == ["circles"] else []))
+    assert found == status, errors
+    assert message in " ".join(errors.replace("│", " ").split())
+    assert "Traceback" not in errors
+    assert output == ""
+
+
+def test_runs_are_neither_overwritten_nor_continued_as_something_else(tmp_path: Path, cache: Path) -> None:
+    run = tmp_path / "run"
+    common = ["circles", "--method", "noncur", "--images", 4, "--cache", cache, *SMALL]
+    assert call(*common, "--out", run)[0] == 0
+    status, _, errors = call(*common, "--out", run)
+    assert (status, "holds a run already" in errors) == (2, True)
+    status, _, errors = call("circles", "--resume", run, "--seed", 9, "--preset", "paper")
+    assert status == 2
+    assert "preset (run: laptop, now: paper), seed (run: 0, now: 9)" in errors
+    assert call("circles", "--resume", run, "--cache", cache)[0] == 0  # spent already: nothing to do, nothing lost
