@@ -6,6 +6,7 @@ import logging
 import signal
 import socket
 
+import cv2
 import grpc
 from curio_proto.inference import inference_pb2
 from curio_proto.inference.inference_pb2_grpc import add_GRPCInferenceServiceServicer_to_server
@@ -60,6 +61,8 @@ class PoseServer:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.stop)
+        # Frames run in parallel already, one a core; OpenCV's own threads would only get in their way.
+        cv2.setNumThreads(1)
         self._report(await asyncio.to_thread(self._repository.refresh))
         if not list(self._repository):
             raise ModelError(

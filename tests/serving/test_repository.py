@@ -3,6 +3,7 @@
 import os
 import shutil
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,19 @@ def test_the_child_check_says_why(root: Path) -> None:
     (root / "flat" / "SHA256SUMS").write_text("0" * 64 + "  1/model.onnx\n")
     with pytest.raises(ModelError, match="the file is damaged or was replaced"):
         check(root / "flat", 1)
+
+
+def test_a_check_that_is_killed_refuses_the_candidate(root: Path) -> None:
+    """The candidate's file is a pipe that nobody fills, so the check would wait for ever."""
+    (root / "flat" / "2").mkdir()
+    os.mkfifo(root / "flat" / "2" / "model.onnx")
+    check = ChildCheck()
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(check, root / "flat", 2)
+        while not waiting.done():
+            check.stop()
+        assert isinstance(waiting.exception(), ModelError)
+        assert "its check ended with status -9" in str(waiting.exception())
 
 
 def test_many_replacements(root: Path, spot_onnx: MakeOnnx, write_folder: WriteFolder) -> None:
