@@ -1,5 +1,7 @@
 """Shapes that need no file. Centred at the origin, in metres; round ones stand along y, which is up in the worlds."""
 
+import hashlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -42,3 +44,41 @@ def _standing(shape: Any) -> Mesh:
 
 def _as_mesh(shape: Any) -> Mesh:
     return Mesh(np.asarray(shape.vertices, dtype=np.float64), np.asarray(shape.faces, dtype=np.int64))
+
+
+def chair(height_m: float) -> Mesh:
+    """A chair of six boxes that overlap: seat, back rest at its rear edge (-z), four legs; the sitter looks along +z.
+
+    It is as high as given, half as wide and half as deep; the origin is its middle.
+    """
+    half, leg, thick = 0.25, 0.04, 0.03
+    parts = [
+        ((0.0, 0.0, 0.0), (2 * half, 2 * thick, 2 * half)),
+        ((0.0, 0.25, thick - half), (2 * half, 0.5, 2 * thick)),
+    ]
+    parts += [
+        ((x, -0.25, z), (2 * leg, 0.5, 2 * leg)) for x in (leg - half, half - leg) for z in (leg - half, half - leg)
+    ]
+    pieces = []
+    for center, extents in parts:
+        piece = trimesh.creation.box(extents=np.array(extents) * height_m)
+        piece.apply_translation(np.array(center) * height_m)
+        pieces.append(piece)
+    return _as_mesh(trimesh.util.concatenate(pieces))
+
+
+def standing(mesh: Mesh) -> Mesh:
+    """The mesh with its lowest point at y = 0, so that its origin touches the ground."""
+    return replace(mesh, vertices_m=mesh.vertices_m - [0.0, mesh.vertices_m[:, 1].min(), 0.0], sha256="")
+
+
+def painted(mesh: Mesh, darkest: float) -> Mesh:
+    """The mesh in greys that fade from white at its front (+z) to ``darkest`` (sRGB) at its back.
+
+    Capsules and cones look alike from all sides; paint makes their yaw something that can be seen.
+    """
+    z = mesh.vertices_m[:, 2]
+    share = (z - z.min()) / (z.max() - z.min())
+    grey = np.repeat((darkest + share * (1 - darkest))[:, None], 3, axis=1)
+    content = (mesh.sha256 + grey.astype("<f8").tobytes().hex()).encode()
+    return replace(mesh, vertex_colors_srgb=grey, sha256=hashlib.sha256(content).hexdigest())

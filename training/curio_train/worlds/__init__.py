@@ -10,13 +10,15 @@ import importlib
 from typing import TYPE_CHECKING
 
 from curio_train.config import WorldOptions
-from curio_train.worlds.options import CirclesOptions, LinemodOptions
+from curio_train.worlds.options import CirclesOptions, LinemodOptions, SpheresOptions, VariedOptions
 
 if TYPE_CHECKING:
     from curio_train.worlds.base import World
 
 WORLDS: dict[str, type[WorldOptions]] = {
     "circles": CirclesOptions,
+    "spheres": SpheresOptions,
+    "varied": VariedOptions,
     "linemod": LinemodOptions,
 }
 

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from curio_train.errors import UsageError
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
-from curio_train.scene_code import CONFIDENCE, ROTATION_6D, Field, Layout, SceneCode
+from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 
 if TYPE_CHECKING:
     from curio_train.data.meshes import Mesh
@@ -160,6 +161,16 @@ class World(ABC):
         """What lies between renderings and the data, done to renderings that the network learns to read (sleep)."""
         return images
 
+    def novel_view(self, code: SceneCode) -> Tensor:
+        """Scenes as scored by the paper's image error: from 90° round their centre, where a world has such a view."""
+        return self.render(code)
+
     @abstractmethod
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> ImageSource:
         """Images of a split. Without ``with_code`` no label file is opened and ``Batch.code`` is None."""
+
+
+def jitter_seed(code: SceneCode) -> int:
+    """For jitter that differs from step to step and yet is a function of what is rendered: resumed runs repeat it."""
+    bits = code[TRANSLATION].detach().cpu().float().contiguous().view(torch.int32)
+    return int(bits.long().sum().item()) & 0x7FFFFFFF

@@ -25,7 +25,7 @@ from curio_train.data.photographs import Photographs
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_between
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
-from curio_train.worlds.base import Batch, Camera, ImageSource, ObjectKind, Split, World
+from curio_train.worlds.base import Batch, Camera, ImageSource, ObjectKind, Split, World, jitter_seed
 from curio_train.worlds.options import LinemodOptions
 
 SIDE_PX = 128
@@ -130,7 +130,7 @@ class Linemod(World):
             camera_matrix=self._matrix,
             backgrounds=behind,
             light=code[LIGHT].float(),
-            seed=_seed_of(code[TRANSLATION]),
+            seed=jitter_seed(code),
         )
 
     def disturb(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
@@ -198,8 +198,3 @@ def _lights(count: int, random: np.random.Generator) -> np.ndarray:
     direction[:, 2] = -np.abs(direction[:, 2])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return direction * random.uniform(WEAKEST_LIGHT, STRONGEST_LIGHT, (count, 1))
-
-
-def _seed_of(translation: Tensor) -> int:
-    """Jitter that differs from step to step and yet is a function of what is rendered: resumed runs repeat it."""
-    return int(translation.detach().cpu().float().contiguous().view(torch.int32).long().sum().item()) & 0x7FFFFFFF

@@ -15,6 +15,31 @@ class CirclesOptions(WorldOptions):
 
 
 @dataclass(frozen=True)
+class SpheresOptions(WorldOptions):
+    """Three spheres on black: 3D position and colour of each. Needs no data."""
+
+
+@dataclass(frozen=True)
+class ChairsOptions(WorldOptions):
+    """Five chairs on the ground: position and yaw of each. Needs no data."""
+
+
+@dataclass(frozen=True)
+class VariedOptions(WorldOptions):
+    """Two to five spheres on black: position, colour and confidence of each. Needs no data."""
+
+
+@dataclass(frozen=True)
+class MultiOptions(WorldOptions):
+    """Two each of the letters W, X, Y, Z on the ground: position, yaw and colour of each. Needs no data."""
+
+
+@dataclass(frozen=True)
+class LightOptions(WorldOptions):
+    """Two to ten capsules, boxes and cones on the ground: all of the above, and where the sun is. Needs no data."""
+
+
+@dataclass(frozen=True)
 class LinemodOptions(WorldOptions):
     """One object of the LineMOD data set in six degrees of freedom, over cluttered backgrounds.
 
@@ -27,3 +52,9 @@ class LinemodOptions(WorldOptions):
     class_name: Annotated[str, tyro.conf.arg(name="class")]
     data: Path
     backgrounds: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Make paths absolute: a run is evaluated and exported from other folders than it was started in."""
+        for name in ("data", "backgrounds"):
+            if isinstance(path := getattr(self, name), Path):
+                object.__setattr__(self, name, path.absolute())

@@ -1,0 +1,160 @@
+"""Worlds of generated meshes before one camera: how a scene code becomes an image, and the image sets.
+
+Spheres, Varied, Chairs, Multi and Light differ in their meshes, fields and draws, and in nothing else.
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from curio_train.data.meshes import Mesh
+from curio_train.geometry import Pose, direction_from_hemisphere, matrix_from_yaw
+from curio_train.rendering.renderer import Renderer
+from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, YAW, Layout, SceneCode
+from curio_train.worlds.base import Camera, ObjectKind, Split, World, jitter_seed
+from curio_train.worlds.stored import StoredImages, stored
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of object.
+
+    Attributes:
+        name: For people.
+        mesh: Its shape; white where the scene code has its colour.
+        num_slots: How many slots of the scene code it has; kinds take theirs one after the other.
+    """
+
+    name: str
+    mesh: Mesh
+    num_slots: int
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What is the same in all scenes of a world.
+
+    Attributes:
+        camera: With its matrix.
+        cam_from_world: Where it stands.
+        center_m: World frame: what the novel camera goes round.
+        up: World frame: the axis that it goes round.
+        ambient: Radiance from everywhere.
+        sun: World frame, towards the light; its length is the strength. Where the code has a light only that counts.
+    """
+
+    camera: Camera
+    cam_from_world: Pose
+    center_m: tuple[float, float, float]
+    up: tuple[float, float, float]
+    ambient: float
+    sun: tuple[float, float, float]
+
+    @property
+    def novel(self) -> Pose:
+        """cam_from_world of the same camera carried 90° round the scene's centre (design of the paper's Img metric)."""
+        turn = Rotation.from_rotvec(np.pi / 2 * np.array(self.up)).as_matrix()
+        center = np.array(self.center_m)
+        rotation = self.cam_from_world.rotation @ turn.T
+        return Pose(
+            rotation, self.cam_from_world.translation_m + self.cam_from_world.rotation @ center - rotation @ center
+        )
+
+
+class MeshWorld(World):
+    """Objects of known shape under one light, in the world frame of their stage.
+
+    Attributes:
+        stage: Camera, light, and where the novel view is taken from.
+        kinds: The objects.
+    """
+
+    def __init__(self, layout: Layout, kinds: Sequence[Kind], stage: Stage) -> None:
+        """Build the renderer.
+
+        Raises:
+            RendererError: No usable libLLVM.
+        """
+        self.layout, self.kinds, self.stage, self.camera = layout, tuple(kinds), stage, stage.camera
+        ends = np.cumsum([kind.num_slots for kind in kinds])
+        self.objects = tuple(
+            ObjectKind(
+                kind.name,
+                tuple(range(end - kind.num_slots, end)),
+                kind.mesh.diameter_m,
+                kind.mesh.box_corners_m,
+                kind.mesh.sha256,
+            )
+            for kind, end in zip(kinds, ends.tolist(), strict=True)
+        )
+        self._kind_of_slot = [number for number, kind in enumerate(kinds) for _ in range(kind.num_slots)]
+        self._renderer = Renderer(
+            [kind.mesh for kind in kinds],
+            self._kind_of_slot,
+            stage.camera.width,
+            stage.camera.height,
+            ambient=stage.ambient,
+        )
+
+    @property
+    @abstractmethod
+    def constants(self) -> Mapping[str, Any]:
+        """What the draws depend on beside layout, meshes and stage; changing one makes new image sets."""
+
+    def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
+        """The scenes from the world's own camera, over ``backgrounds`` or what the world has behind its objects."""
+        return self._view(code, self.stage.cam_from_world, backgrounds)
+
+    def novel_view(self, code: SceneCode) -> Tensor:
+        """The same scenes from 90° round their centre."""
+        return self._view(code, self.stage.novel, None)
+
+    def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> StoredImages:
+        """2,000, 500 and 500 images, the paper's numbers."""
+        return stored(self, self._recipe(), split, seed, with_code=with_code, cache=cache)
+
+    def light(self, code: SceneCode) -> Float[Tensor, "batch 3"]:
+        """Towards the sun, world frame; its length is the strength."""
+        sun = code[TRANSLATION].new_tensor(self.stage.sun, dtype=torch.float32)
+        if LIGHT in self.layout:
+            return direction_from_hemisphere(code[LIGHT].float()) * sun.norm()
+        return sun.expand(len(code[TRANSLATION]), 3)
+
+    def behind(self, light: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 height width"]:
+        """What is seen past the objects: black."""
+        return light.new_zeros(len(light), 3, self.camera.height, self.camera.width)
+
+    def _view(self, code: SceneCode, cam_from_world: Pose, backgrounds: Tensor | None) -> Tensor:
+        place = code[TRANSLATION].float()
+        turn, shift = (torch.as_tensor(part, dtype=torch.float32) for part in cam_from_world)
+        own = matrix_from_yaw(code[YAW].float()) if YAW in self.layout else torch.eye(3).expand(*place.shape[:2], 3, 3)
+        light = self.light(code)
+        assert self.camera.matrix is not None  # every stage has a pinhole camera
+        return self._renderer(
+            turn @ own,
+            place @ turn.T + shift,
+            camera_matrix=self.camera.matrix,
+            backgrounds=self.behind(light) if backgrounds is None else backgrounds,
+            light=light @ turn.T,
+            color=code[COLOR].float() if COLOR in self.layout else None,
+            confidence=code[CONFIDENCE][..., 0].float() if CONFIDENCE in self.layout else None,
+            seed=jitter_seed(code),
+        )
+
+    def _recipe(self) -> dict[str, Any]:
+        stage = {name: np.asarray(value).tolist() for name, value in asdict(self.stage).items() if name != "camera"}
+        return {
+            "constants": dict(self.constants),
+            "fields": [asdict(field) for field in self.layout.fields],
+            "kinds": [(kind.name, kind.mesh.sha256, kind.num_slots) for kind in self.kinds],
+            "camera": (self.camera.width, self.camera.height, np.asarray(self.camera.matrix).tolist()),
+            "stage": stage,
+        }
