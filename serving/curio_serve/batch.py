@@ -1,7 +1,7 @@
 """Many images through one function: in parallel, answered in order, with a bounded number in flight."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -12,7 +12,7 @@ Answer = TypeVar("Answer")
 _IN_FLIGHT_A_JOB = 8
 
 
-def in_order(function: Callable[[Item], Answer], items: Iterable[Item], num_jobs: int) -> Iterator[Answer]:
+def in_order(function: Callable[[Item], Answer], items: Iterable[Item], num_jobs: int) -> Generator[Answer, None, None]:
     """The function's answers in the order of the items.
 
     Args:

@@ -5,7 +5,9 @@ import re
 import shlex
 import signal
 import sys
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -56,6 +58,8 @@ class DetectArguments:
     """Turn images as EXIF says, and K with them. Otherwise pixels are taken as stored, to which K belongs."""
     jobs: int = len(os.sched_getaffinity(0))
     """Images worked on at the same time; by default the number of processors."""
+    ray: str | None = None
+    """Do it on a Ray cluster: HOST:PORT, auto for the one this machine is in, local for this machine's processors."""
     token_file: Path | None = None
     """File with the bearer token that the server asks for."""
     server_ca: Path | None = None
@@ -96,6 +100,7 @@ def run(arguments: DetectArguments) -> int:
     import cv2
 
     from curio_serve.batch import in_order
+    from curio_serve.cluster import over_cluster
     from curio_serve.detect_progress import Progress
     from curio_serve.result_file import ResultFile
     from curio_serve.sources import check_arguments, images
@@ -103,14 +108,24 @@ def run(arguments: DetectArguments) -> int:
     _check_numbers(arguments)
     check_arguments(arguments.images)
     cv2.setNumThreads(1)  # the images are what runs in parallel
-    estimator = _estimator(arguments, _settings(arguments))
+    settings = _settings(arguments)
+    estimator = _estimator(arguments, settings)
     form = _format(arguments, estimator.spec)
     _check_camera(arguments, estimator)
     model = (estimator.name, estimator.version)
     with ResultFile(arguments.out, form, model, overwrite=arguments.overwrite) as output:
         remaining = output.unanswered(images(arguments.images))
-        with Progress(output.num_images, output.num_errors, is_shown=arguments.out is not None) as progress:
-            for result in in_order(estimator, remaining, arguments.jobs):
+        if arguments.ray is None:
+            results = in_order(estimator, remaining, arguments.jobs)
+        else:  # other nodes have another working folder
+            is_path = os.path.exists(arguments.model)
+            there = replace(arguments, model=os.path.abspath(arguments.model)) if is_path else arguments
+            results = over_cluster(arguments.ray, partial(_estimator, there, settings), remaining)
+        with (
+            closing(results),
+            Progress(output.num_images, output.num_errors, is_shown=arguments.out is not None) as progress,
+        ):
+            for result in results:
                 output.write(result)
                 progress.count(result)
         if output.num_images == 0:
@@ -149,7 +164,7 @@ def _settings(arguments: DetectArguments) -> "Settings":
         arguments.min_confidence,
         arguments.max_detections,
         arguments.exif_rotation,
-        arguments.overlays,
+        arguments.overlays and arguments.overlays.absolute(),
         common_folder(arguments.images),
     )
 

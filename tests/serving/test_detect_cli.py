@@ -375,6 +375,7 @@ def test_errors_are_one_clear_line_and_the_right_status(models_dir: Path, frames
         (["none", str(frames)], 2),
         ([str(models_dir), str(frames)], 1),
         ([str(models_dir / "flat"), str(frames), "--out", "/proc/none/out.jsonl"], 1),
+        ([str(models_dir / "flat"), str(frames), "--out", "/dev/full"], 1),
     ):
         done = subprocess.run(command(*arguments), capture_output=True, text=True)
         assert done.returncode == status
