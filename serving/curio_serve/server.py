@@ -18,7 +18,7 @@ from prometheus_client import CollectorRegistry, start_http_server
 
 from curio_serve.admission import WorkQueue, num_cores
 from curio_serve.config import ServeConfig
-from curio_serve.errors import ModelError, Unavailable
+from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.inference_protocol import InferenceService
 from curio_serve.model_check import ChildCheck
 from curio_serve.repository import Change, Repository
@@ -102,7 +102,12 @@ class PoseServer:
         try:
             bound = server.add_secure_port(address, credentials) if credentials else server.add_insecure_port(address)
         except RuntimeError as exc:
-            raise Unavailable(f"cannot listen on {address}: {_why_not(host, port)}; choose another --port") from exc
+            if reason := _why_not(host, port):
+                raise Unavailable(f"cannot listen on {address}: {reason}; choose another --host or --port") from exc
+            raise UsageError(
+                f"--tls-certificate {self.config.tls_certificate} and --tls-key {self.config.tls_key} cannot be used; "
+                "expected PEM files of a certificate (chain) and its own key"
+            ) from exc
         return f"{address.rsplit(':', 1)[0]}:{bound}"
 
     def _open_metrics(self, port: int) -> str:
@@ -186,10 +191,10 @@ def channel_options(config: ServeConfig) -> list[tuple[str, int]]:
 
 
 def _why_not(host: str, port: int) -> str:
-    """GRPC keeps the operating system's reason to itself, so ask for it."""
+    """Why an address cannot be listened on, or nothing: gRPC keeps the operating system's reason to itself."""
     with contextlib.closing(socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)) as probe:
         try:
             probe.bind((host, port))
         except OSError as exc:
             return exc.strerror or str(exc)
-    return "the certificate and key may not belong together, or the port was taken for a moment"
+    return ""

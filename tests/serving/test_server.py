@@ -51,7 +51,7 @@ def test_a_taken_port_is_named(server: Any, models_dir: Path) -> None:
     port = server.address.rsplit(":", 1)[1]
     ended = _run(str(models_dir), "--port", port)
     assert ended.returncode == 1
-    assert f"cannot listen on 127.0.0.1:{port}: Address already in use; choose another --port" in ended.stderr
+    assert f"cannot listen on 127.0.0.1:{port}: Address already in use; choose another --host or --port" in ended.stderr
     assert "Traceback" not in ended.stderr
 
 
@@ -62,6 +62,8 @@ def test_a_taken_port_is_named(server: Any, models_dir: Path) -> None:
         (["{tmp}"], 1, "no model could be loaded from {tmp}"),
         (["{models}", "--token-file", "{tmp}/none"], 2, "--token-file {tmp}/none cannot be read"),
         (["{models}", "--tls-key", "{tmp}/k", "--tls-certificate", "{tmp}/c"], 2, "--tls-key {tmp}/k cannot be read"),
+        (["{models}", "--tls-key", "{readme}", "--tls-certificate", "{readme}"], 2, "expected PEM files"),
+        (["{models}", "--host", "203.0.113.7"], 1, "cannot listen on 203.0.113.7:0: Cannot assign requested address"),
         (["{models}", "--providers", "NoSuchProvider"], 1, "no model could be loaded"),
         (["{models}", "--queue", "-3"], 2, "--queue is -3"),
     ],
@@ -69,7 +71,7 @@ def test_a_taken_port_is_named(server: Any, models_dir: Path) -> None:
 def test_what_cannot_start_says_why(
     arguments: list[str], status: int, words: str, models_dir: Path, tmp_path: Path
 ) -> None:
-    names = {"tmp": str(tmp_path), "models": str(models_dir)}
+    names = {"tmp": str(tmp_path), "models": str(models_dir), "readme": __file__}
     ended = _run(*[argument.format(**names) for argument in arguments], "--port", "0")
     assert ended.returncode == status
     assert words.format(**names) in ended.stderr
