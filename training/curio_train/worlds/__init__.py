@@ -10,7 +10,15 @@ import importlib
 from typing import TYPE_CHECKING
 
 from curio_train.config import WorldOptions
-from curio_train.worlds.options import CirclesOptions, LinemodOptions, SpheresOptions, VariedOptions
+from curio_train.worlds.options import (
+    ChairsOptions,
+    CirclesOptions,
+    LightOptions,
+    LinemodOptions,
+    MultiOptions,
+    SpheresOptions,
+    VariedOptions,
+)
 
 if TYPE_CHECKING:
     from curio_train.worlds.base import World
@@ -18,7 +26,10 @@ if TYPE_CHECKING:
 WORLDS: dict[str, type[WorldOptions]] = {
     "circles": CirclesOptions,
     "spheres": SpheresOptions,
+    "chairs": ChairsOptions,
     "varied": VariedOptions,
+    "multi": MultiOptions,
+    "light": LightOptions,
     "linemod": LinemodOptions,
 }
 
