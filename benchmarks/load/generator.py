@@ -47,7 +47,8 @@ def bare_loop(model_folder: Path) -> Callable[[bytes], None]:
 
     def one(data: bytes) -> None:
         header = open_header(data)
-        frame = decode(data, max_reduction=detector.reduction(camera, header.width, header.height))
+        reduction = detector.reduction(camera, header.width, header.height)
+        frame = decode(data, header=header, max_reduction=reduction)
         view = PinholeFrame(frame.pixels, camera, model.camera, frame.reduction).look(region)
         model.run(view.image[None])
 

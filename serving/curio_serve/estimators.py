@@ -21,6 +21,7 @@ from curio_serve.camera_files import CameraFile
 from curio_serve.client import PoseClient
 from curio_serve.detector import Detector
 from curio_serve.errors import ArgumentError, CameraError, ImageError, InternalError, OutputError
+from curio_serve.image_header import Header
 from curio_serve.model import Model, canonical_camera
 from curio_serve.overlay import draw
 from curio_serve.sources import SourceImage
@@ -120,10 +121,12 @@ class Estimator(ABC):
             return None
         return self.settings.cameras.camera_for(str(image.relative_name))
 
-    def _frame(self, image: SourceImage, data: bytes, max_reduction: int = 1) -> images.Frame:
+    def _frame(
+        self, image: SourceImage, data: bytes, header: Header | None = None, max_reduction: int = 1
+    ) -> images.Frame:
         if image.pixels is None:
             turn = self.settings.apply_exif_rotation
-            return images.decode(data, max_reduction=max_reduction, apply_exif_rotation=turn)
+            return images.decode(data, header=header, max_reduction=max_reduction, apply_exif_rotation=turn)
         height, width = image.pixels.shape[:2]
         images.check_size(width, height)
         return images.Frame(image.pixels, width, height)
@@ -152,11 +155,11 @@ class LocalEstimator(Estimator):
 
     def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> _Seen:
         started = time.perf_counter()
-        reduction = 1
+        header, reduction = None, 1
         if image.pixels is None:
             header = images.open_header(data)
             reduction = self._detector.reduction(camera, header.width, header.height)
-        frame = self._frame(image, data, reduction)
+        frame = self._frame(image, data, header, reduction)
         camera = _turned(camera, frame) or self.canonical.for_frame(frame.width, frame.height)
         decoded = time.perf_counter()
         results = self._detector.detect(
