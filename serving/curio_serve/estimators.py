@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 from curio_proto.v1.detector_pb2 import RegionResult
@@ -18,7 +19,6 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve import image as images
 from curio_serve.camera import PinholeCamera
 from curio_serve.camera_files import CameraFile
-from curio_serve.client import PoseClient
 from curio_serve.detector import Detector
 from curio_serve.errors import ArgumentError, CameraError, ImageError, InternalError, OutputError
 from curio_serve.image_header import Header
@@ -26,6 +26,9 @@ from curio_serve.model import Model, canonical_camera
 from curio_serve.overlay import draw
 from curio_serve.sources import SourceImage
 from curio_serve.writers import ImageResult
+
+if TYPE_CHECKING:
+    from curio_serve.client import PoseClient
 
 _OF_ONE_IMAGE = (ImageError, CameraError, ArgumentError, InternalError)
 _DRAWN_SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -185,7 +188,7 @@ class RemoteEstimator(Estimator):
         timeout_s: For the question which model that is: a wrong address shall not take long to be told.
     """
 
-    def __init__(self, client: PoseClient, model: str, settings: Settings, *, timeout_s: float = 5.0) -> None:
+    def __init__(self, client: "PoseClient", model: str, settings: Settings, *, timeout_s: float = 5.0) -> None:
         found = client.get_model(model, timeout_s=timeout_s)
         super().__init__(model.partition("/")[0], found.version, found.spec, settings)
         self._client = client
