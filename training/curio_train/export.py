@@ -18,7 +18,7 @@ from curio_train.learning.checkpoint import RunFolder
 from curio_train.learning.configuration import to_portable
 from curio_train.learning.provenance import sittings
 from curio_train.model_card import Making, card
-from curio_train.model_folder import ModelFolder
+from curio_train.model_folder import ModelFolder, triton_config
 from curio_train.onnx_file import SCHEMA_VERSION, OnnxModel, put_spec, store_half, to_onnx
 from curio_train.scene_code import Field
 from curio_train.worlds import build
@@ -80,7 +80,7 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     """
     folder = RunFolder.open(run)
     world = build(folder.config.world)
-    target = ModelFolder.named(out, name or world.model_name)
+    target = ModelFolder.named(out, world.model_name if name is None else name)
     state = folder.trained(world)
     trained = _Graph(state.pose.network, world)
     deployed = _Graph(_deployable(state.pose.network, half), world)
@@ -88,6 +88,10 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     with torch.no_grad():
         learned, expected = trained.outputs(images), deployed.outputs(images)
     rounding_error = largest_difference(learned, expected) if half else 0.0
+
+    shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
+    config = triton_config(target.path.name, tuple(images.shape[1:]), shapes)
+    target.refuse_other_tensors(config)
 
     model = to_onnx(deployed, world.camera.width, world.camera.height, list(expected))
     if half:
@@ -103,8 +107,8 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     put_spec(model, spec)
     version = target.next_version()
     made = Making(run, folder.config, first, state.course, _weights(half, rounding_error))
-    shapes = {name: values.shape[1:] for name, values in expected.items()}
-    path = target.add(version, model, card(version, spec, shapes, world.objects, made))
+    text = card(version, spec, shapes, world.objects, made)
+    path = target.add(version, model.SerializeToString(), config, text)
     return Exported(path, spec.parity_max_abs_error, rounding_error, model.ByteSize())
 
 

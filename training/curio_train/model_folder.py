@@ -12,13 +12,10 @@ import hashlib
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-
-import onnx
-from onnx import TensorProto
 
 from curio_train.errors import ExportError, UsageError
 
@@ -26,7 +23,6 @@ MODEL_FILE = "model.onnx"
 _CONFIG, _CARD, _SUMS = "config.pbtxt", "CARD.md", "SHA256SUMS"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # what a server takes for a model's name
 _MAX_BATCH_SIZE = 64
-_TRITON_TYPES: Mapping[int, str] = {TensorProto.UINT8: "TYPE_UINT8", TensorProto.FLOAT: "TYPE_FP32"}
 
 
 @dataclass(frozen=True)
@@ -65,24 +61,37 @@ class ModelFolder:
         """The number after the largest."""
         return max(self.versions(), default=0) + 1
 
-    def add(self, version: int, model: onnx.ModelProto, card: str) -> Path:
+    def refuse_other_tensors(self, config: str) -> None:
+        """Make sure that a version with these tensors may stand beside those that are there.
+
+        Args:
+            config: From :func:`triton_config`.
+
+        Raises:
+            ExportError: It may not.
+        """
+        path = self.path / _CONFIG
+        if path.exists() and path.read_text(encoding="utf-8") != config:
+            raise ExportError(
+                f"{self.path} holds a model with other inputs or outputs (see {path}); versions of one model must "
+                "agree in them: choose another --name"
+            )
+
+    def add(self, version: int, content: bytes, config: str, card: str) -> Path:
         """Write a version.
 
         Args:
             version: From :meth:`next_version`.
-            model: The graph with its specification.
+            content: Of model.onnx.
+            config: From :func:`triton_config`.
             card: Markdown, a section about this version.
 
         Returns:
             The version's folder.
 
         Raises:
-            ExportError: It could not be written, or differs in its tensors from the versions that are there. Nothing
-                of it is left behind, and what was there is as before.
+            ExportError: It could not be written. Nothing of it is left behind, and what was there is as before.
         """
-        config = triton_config(self.path.name, model)
-        self._refuse_other_tensors(config)
-        content = model.SerializeToString()
         target = self.path / str(version)
         try:
             with _draft(self.path) as draft:
@@ -94,14 +103,6 @@ class ModelFolder:
         except OSError as exc:
             raise ExportError(f"cannot write {target}: {exc.strerror}; name another folder: --out") from exc
         return target
-
-    def _refuse_other_tensors(self, config: str) -> None:
-        path = self.path / _CONFIG
-        if path.exists() and path.read_text(encoding="utf-8") != config:
-            raise ExportError(
-                f"{self.path} holds a model with other inputs or outputs (see {path}); versions of one model must "
-                "agree in them: choose another --name"
-            )
 
     def _add_version(self, draft: Path, target: Path, content: bytes, card: str) -> None:
         """Beside earlier versions: first what speaks of it, at last the version itself, by one rename."""
@@ -133,18 +134,21 @@ def find_model(path: Path) -> Path:
     return path / str(versions[-1]) / MODEL_FILE
 
 
-def triton_config(name: str, model: onnx.ModelProto) -> str:
-    """Triton's description of the tensors, batch left out."""
+def triton_config(name: str, image: Sequence[int], outputs: Mapping[str, Sequence[int]]) -> str:
+    """Triton's description of a model.
 
-    def tensor(value: onnx.ValueInfoProto) -> str:
-        kind = value.type.tensor_type
-        dims = ", ".join(str(dim.dim_value) for dim in kind.shape.dim[1:])
-        return f'  {{ name: "{value.name}" data_type: {_TRITON_TYPES[kind.elem_type]} dims: [ {dims} ] }}'
+    Args:
+        name: Of its folder.
+        image: Shape of the uint8 input, the batch left out.
+        outputs: Shape of each float32 output, the batch left out, in order.
+    """
 
-    inputs = ",\n".join(map(tensor, model.graph.input))
-    outputs = ",\n".join(map(tensor, model.graph.output))
+    def tensor(name: str, kind: str, shape: Sequence[int]) -> str:
+        return f'  {{ name: "{name}" data_type: {kind} dims: [ {", ".join(map(str, shape))} ] }}'
+
+    found = ",\n".join(tensor(output, "TYPE_FP32", shape) for output, shape in outputs.items())
     head = f'name: "{name}"\nbackend: "onnxruntime"\nmax_batch_size: {_MAX_BATCH_SIZE}\n'
-    return f"{head}input [\n{inputs}\n]\noutput [\n{outputs}\n]\n"
+    return f"{head}input [\n{tensor('image', 'TYPE_UINT8', image)}\n]\noutput [\n{found}\n]\n"
 
 
 @contextmanager

@@ -67,9 +67,12 @@ def sittings(run: Path) -> list[Sitting]:
     """
     try:
         lines = (run / _FILE).read_text(encoding="utf-8").splitlines()
-        return [Sitting(**json.loads(line)) for line in lines if line.endswith("}")]  # the rest was cut off by a kill
+        found = [Sitting(**json.loads(line)) for line in lines if line.endswith("}")]  # the rest was cut off by a kill
     except (OSError, ValueError, TypeError) as exc:
         raise CheckpointError(f"{run / _FILE} cannot be read ({exc}); is {run} a whole run folder?") from exc
+    if not found:
+        raise CheckpointError(f"{run / _FILE} has no whole line, expected one a sitting; is {run} a whole run folder?")
+    return found
 
 
 def commit() -> str:
