@@ -76,7 +76,10 @@ def _parse(arguments: list[str]) -> TrainCommand:
     seen, _ = first.parse_known_args(arguments)
 
     recipe = PRESETS.get(seen.preset, PRESETS["laptop"])  # an unknown preset is tyro's to refuse
-    defaults = {name: RunConfig(_unset(kind), recipe=recipe) for name, kind in WORLDS.items()}
+    defaults = {
+        name: RunConfig(_unset(kind), method=kind.default_method, recipe=recipe, network=kind.default_network)
+        for name, kind in WORLDS.items()
+    }
     stored = load_config(seen.resume) if seen.resume else None
     if stored is not None:
         defaults[world_name(stored)] = stored

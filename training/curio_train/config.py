@@ -5,7 +5,7 @@ The command line, ``config.json`` of a run folder and the loop read these same c
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Suppress
 
@@ -51,6 +51,9 @@ class NetworkConfig:
     """Sizes of the networks; the defaults are the paper's appendix as its parameter counts decide it.
 
     Attributes:
+        reading: How an image becomes a latent code. "whole": the paper's encoder. "attention": features on a grid of a
+            quarter of the image's size, averaged with learned weights, and the place they were found at; for one
+            object that is small in a large image, where "whole" needs far longer to learn where it is.
         encoder: 2,029,056 parameters, 128 → 30 → 14 → 7 → 4 → 1 pixels.
         critic: 1,883,713 parameters, 128 → 30 → 7 → 4 → 2 → 1 pixels.
         critic_normalisation: Both worked for the paper; its results use "batch".
@@ -58,6 +61,7 @@ class NetworkConfig:
         hidden: Width of each branch's hidden layer.
     """
 
+    reading: Literal["whole", "attention"] = "whole"
     encoder: Suppress[ConvStack] = ConvStack(
         (64, 192, 384, 256, 64), (11, 5, 3, 3, 3), (4, 2, 2, 2, 2), (0, 1, 1, 1, 0)
     )
@@ -69,7 +73,15 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """What a user may choose about a world; each world has its own subclass in ``worlds/options.py``."""
+    """What a user may choose about a world; each world has its own subclass in ``worlds/options.py``.
+
+    Attributes:
+        default_method: What --method is unless given.
+        default_network: What the networks' flags are unless given.
+    """
+
+    default_method: ClassVar[Method] = "our"
+    default_network: ClassVar[NetworkConfig] = NetworkConfig()
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,13 @@ class Field:
         depth = ((log_near + log_far) / 2 + torch.tanh(raw[..., 2:]) * (log_far - log_near) / 2).exp()
         return torch.cat([slope * depth, depth], dim=-1)
 
+    def raw_from_share(self, share: Tensor) -> Tensor:
+        """The raw output that :meth:`activate` brings to a share of the half range: −1 the lower bound, 1 the upper."""
+        if self.activation == "linear":
+            return share
+        bounded = share.clamp(-0.99, 0.99)
+        return torch.atanh(bounded) if self.activation != "sigmoid" else 2 * torch.atanh(bounded)
+
     def relative(self, value: Tensor) -> Tensor:
         """Physical values in units of the range, so that differences are Eq. 1's with w = 1.
 

@@ -43,14 +43,15 @@ def learn(
         CurioError: Any of this package's errors; checkpoints that were written stay.
     """
     with ranks(device) as here:
-        run = RunFolder(path, config)
-        if here.leads:
-            run.write_config(new=not resume)
-            note_sitting(path)
+        # The world comes first: what is wrong with its data shows before a run folder is there.
         world = build(config.world)
         source = world.source("train", config.seed, with_code="label" in config.terms, cache=cache)
         if config.labels < 1:
             source = source.subset(config.labels)
+        run = RunFolder(path, config)
+        if here.leads:
+            run.write_config(new=not resume)
+            note_sitting(path)
         trainer = Trainer(config, world, source, here)
         if resume:
             run.restore(trainer.state)

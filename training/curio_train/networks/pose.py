@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from curio_train.config import NetworkConfig
 from curio_train.errors import UsageError
+from curio_train.networks.attention import LATENT, AttentionEncoder
 from curio_train.networks.encoder import Encoder
 from curio_train.networks.heads import Heads
 from curio_train.scene_code import Layout
@@ -21,6 +22,10 @@ class PoseNetwork(nn.Module):
         """
         super().__init__()
         config = config or NetworkConfig()
+        if config.reading == "attention":
+            self.encoder: nn.Module = AttentionEncoder()
+            self.heads = Heads(layout, LATENT, config.row, config.hidden, placed=True)
+            return
         left = config.encoder.output_side(image_side)
         if left != 1:
             raise UsageError(

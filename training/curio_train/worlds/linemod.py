@@ -88,7 +88,7 @@ class Linemod(World):
                     lower=(*first.tolist(), NEAR_M),
                     upper=(*last.tolist(), FAR_M),
                 ),
-                Field(ROTATION_6D, 6, frame="camera"),
+                Field(ROTATION_6D, 6, frame="camera", lower=(-1.0,) * 6, upper=(1.0,) * 6),
                 Field(
                     LIGHT,
                     3,

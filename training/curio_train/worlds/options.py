@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import tyro
 
-from curio_train.config import WorldOptions
+from curio_train.config import Method, NetworkConfig, WorldOptions
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,9 @@ class LinemodOptions(WorldOptions):
         data: Folder in BOP's layout (lm or lmo) with models, models_info.json and camera.json.
         backgrounds: Folder of photographs to see the object in front of; clutter is rendered where none is given.
     """
+
+    default_method: ClassVar[Method] = "wake_sleep"
+    default_network: ClassVar[NetworkConfig] = NetworkConfig(reading="attention")
 
     class_name: Annotated[str, tyro.conf.arg(name="class")]
     data: Path
