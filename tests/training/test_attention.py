@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 
@@ -28,7 +29,7 @@ def test_place_is_where_attention_falls():
         encoder.attention.weight.zero_()
         encoder.attention.weight[0, 0] = 50.0
         found = encoder(images)[:, LATENT:]
-    assert found == pytest.approx(torch.tensor(places), abs=0.05)
+    assert found.numpy() == pytest.approx(np.array(places), abs=0.05)
 
 
 def test_latent_and_place_have_the_promised_size():
@@ -47,7 +48,7 @@ def test_an_untrained_network_starts_from_the_place_it_sees(activation):
     latent[0, -2:] = torch.tensor([0.5, -0.25])
     position = heads(latent)[TRANSLATION][0, 0]
     lateral = position[:2] / position[2] if activation == "perspective" else position[:2]
-    assert lateral == pytest.approx(torch.tensor([0.2, -0.05]), abs=1e-5)
+    assert lateral.tolist() == pytest.approx([0.2, -0.05], abs=1e-5)
 
 
 def test_gradient_reaches_every_weight():
