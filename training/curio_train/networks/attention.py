@@ -5,6 +5,8 @@ place is read off the attention itself (spatial soft-argmax, Levine et al. 2016,
 Policies"), so that what is learned at one place holds at all.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
