@@ -38,11 +38,12 @@ class AttentionEncoder(nn.Module):
         # Sums over a thousand cells need more digits than bfloat16 has.
         weights = self.attention(features).float().flatten(2).softmax(-1).unflatten(-1, features.shape[-2:])
         latent = (self.values(features).float() * weights).sum((-2, -1))
-        places = [
-            (weights.sum(d)[:, 0] * _centres(features.shape[k], weights)).sum(-1) for d, k in ((-2, -1), (-1, -2))
-        ]
-        return torch.cat([latent, torch.stack(places, dim=-1)], dim=-1)
+        place = torch.stack([_mean_place(weights.sum(across)[:, 0]) for across in (-2, -1)], dim=-1)
+        return torch.cat([latent, place], dim=-1)
 
 
-def _centres(count: int, like: Tensor) -> Float[Tensor, " count"]:
-    return (torch.arange(count, device=like.device, dtype=like.dtype) + 0.5) * (2 / count) - 1
+def _mean_place(weights: Float[Tensor, "batch cells"]) -> Float[Tensor, " batch"]:
+    # With odd kernels padded by half their size, cell i looks at pixel i * stride and not at the middle of its square.
+    stride, count = math.prod(_STRIDES), weights.shape[1]
+    pixels = torch.arange(count, device=weights.device, dtype=weights.dtype) * stride
+    return weights @ ((pixels + 0.5) * 2 / (count * stride) - 1)
