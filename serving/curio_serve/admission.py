@@ -1,22 +1,31 @@
 """Who may work, who waits, who is sent away.
 
-Decoding and inference leave the interpreter's lock, so a few threads use all cores; the event loop only moves messages.
-A request beyond the queue is refused at once: an answer that would come too late costs everyone.
+Every call has a thread of its own, and a waiting thread costs almost nothing; what is scarce is cores. So a call takes
+one of a few slots before it decodes or infers (work that leaves the interpreter's lock), and gives it back after. A
+call beyond the queue is refused at once: an answer that would come too late costs everyone.
 """
 
-import asyncio
 import os
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol
 
-from curio_serve.errors import DeadlineError, Overloaded
+from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
 from curio_serve.telemetry import Metrics
 
-T = TypeVar("T")
+
+class Call(Protocol):
+    """What admission needs to know of a call; gRPC's servicer context knows it."""
+
+    def time_remaining(self) -> float | None:
+        """Seconds until the caller's deadline; None without one."""
+
+    def add_callback(self, callback: Callable[[], None]) -> bool:
+        """Have a function called when the call ends; False if it has ended already."""
 
 
 def num_cores() -> int:
@@ -29,61 +38,90 @@ def num_cores() -> int:
     return cores if quota == "max" else max(1, min(cores, round(int(quota) / int(period))))
 
 
+class _Waiter:
+    """A call in the queue: waiting, until it is granted a slot or leaves."""
+
+    def __init__(self) -> None:
+        self.told = threading.Event()
+        self.is_granted = False
+
+
 class WorkQueue:
-    """A fixed number of worker threads behind a bounded queue."""
+    """A fixed number of slots behind a bounded queue, first come, first served."""
 
-    def __init__(self, num_workers: int, max_waiting: int, metrics: Metrics) -> None:
-        self._threads = ThreadPoolExecutor(num_workers, thread_name_prefix="curio-worker")
-        self._num_workers, self._max_waiting = num_workers, max_waiting
-        self._num_admitted, self._lock = 0, threading.Lock()
+    def __init__(self, num_slots: int, max_waiting: int, metrics: Metrics) -> None:
+        self._num_slots, self._max_waiting = num_slots, max_waiting
+        self._lock = threading.Lock()
+        self._num_free = num_slots
+        self._waiting: deque[_Waiter] = deque()
         self._mean_work_s = 0.005
-        self._metrics = metrics
-        metrics.waiting.set_function(lambda: max(0, self._num_admitted - num_workers))
-        metrics.working.set_function(lambda: min(self._num_admitted, num_workers))
+        metrics.waiting.set_function(lambda: len(self._waiting))
+        metrics.working.set_function(lambda: num_slots - self._num_free)
 
-    async def run(self, work: Callable[[float], T], remaining_s: float | None, *, always: bool = False) -> T:
-        """Do the work on a worker thread. Call from the event loop.
+    @contextmanager
+    def slot(self, call: Call, *, always: bool = False) -> Iterator[float]:
+        """Hold a slot while working. Gives the seconds it took to get it.
 
         Args:
-            work: Gets the seconds it had to wait.
-            remaining_s: Time until the caller's deadline; None: no deadline.
+            call: Its deadline bounds the wait, its end takes it out of the queue.
             always: Wait even behind a full queue, for callers that are bounded otherwise.
 
         Raises:
             Overloaded: The queue is full.
-            DeadlineError: The deadline passed while the work waited.
-            asyncio.CancelledError: The caller hung up; work that had not begun is dropped.
+            DeadlineError: The deadline passed before there was a slot.
+            CallCancelled: The client hung up before there was a slot.
         """
-        if self._num_admitted >= self._num_workers + self._max_waiting and not always:
-            retry_s = self._mean_work_s * self._max_waiting / self._num_workers
-            raise Overloaded(
-                f"{self._num_admitted} requests are being worked on or waiting, which is the limit (--workers, "
-                f"--queue); try again in {retry_s:.2g} s",
-                retry_s,
-            )
-        admitted = time.monotonic()
-        with self._lock:
-            self._num_admitted += 1
-        future = self._threads.submit(self._work, work, admitted, remaining_s)
-        # Runs when the work ends, or at once where a cancelled call leaves the queue before it began.
-        future.add_done_callback(self._leave)
-        return await asyncio.wrap_future(future)
-
-    def _work(self, work: Callable[[float], T], admitted: float, remaining_s: float | None) -> T:
+        remaining_s = call.time_remaining()
         begun = time.monotonic()
-        waited_s = begun - admitted
-        if remaining_s is not None and waited_s >= remaining_s:
-            raise DeadlineError(f"the deadline passed after {waited_s:.3g} s in the queue; nothing was done")
+        waiter = self._enter(always)
+        if waiter is not None:
+            self._wait(waiter, call, remaining_s)
+        granted = time.monotonic()
         try:
-            return work(waited_s)
+            if remaining_s is not None and granted - begun >= remaining_s:
+                raise DeadlineError(f"the deadline passed after {granted - begun:.3g} s in the queue; nothing was done")
+            yield granted - begun
         finally:
-            # A smoothed guess is enough to tell clients when to come back.
-            self._mean_work_s += 0.05 * (time.monotonic() - begun - self._mean_work_s)
+            self._leave(time.monotonic() - granted)
 
-    def _leave(self, _done: "Future[T]") -> None:
+    def _enter(self, always: bool) -> _Waiter | None:
+        """Take a free slot (None) or a place in the queue."""
         with self._lock:
-            self._num_admitted -= 1
+            if self._num_free:
+                self._num_free -= 1
+                return None
+            if len(self._waiting) >= self._max_waiting and not always:
+                retry_s = self._mean_work_s * (len(self._waiting) + 1) / self._num_slots
+                raise Overloaded(
+                    f"{self._num_slots} requests are being worked on and {len(self._waiting)} are waiting, which is "
+                    f"the limit (--workers, --queue); try again in {retry_s:.2g} s",
+                    retry_s,
+                )
+            waiter = _Waiter()
+            self._waiting.append(waiter)
+            return waiter
 
-    def close(self) -> None:
-        """Drop what waits and let the threads end."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
+    def _wait(self, waiter: _Waiter, call: Call, remaining_s: float | None) -> None:
+        """Return with a slot, or raise without one."""
+        if not call.add_callback(waiter.told.set):
+            waiter.told.set()
+        waiter.told.wait(remaining_s)
+        with self._lock:
+            if waiter.is_granted:
+                return
+            self._waiting.remove(waiter)
+        if waiter.told.is_set():
+            raise CallCancelled("the client hung up while the call was in the queue; nothing was done")
+        raise DeadlineError(f"the deadline passed after {remaining_s:.3g} s in the queue; nothing was done")
+
+    def _leave(self, worked_s: float) -> None:
+        """Hand the slot to the first in the queue, or free it."""
+        with self._lock:
+            # A smoothed guess is enough to tell clients when to come back.
+            self._mean_work_s += 0.05 * (worked_s - self._mean_work_s)
+            if self._waiting:
+                waiter = self._waiting.popleft()
+                waiter.is_granted = True
+                waiter.told.set()
+            else:
+                self._num_free += 1

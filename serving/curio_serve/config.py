@@ -36,6 +36,8 @@ class ServeConfig:
     """Requests that may wait for a worker; more are answered RESOURCE_EXHAUSTED."""
     max_streams: int = 256
     """Open DetectStream calls."""
+    max_calls: int = 4096
+    """Open calls of any kind, also those whose message has not come yet."""
     max_message_mb: int = 32
     """Largest request, in MiB."""
     max_pixels: int = 1 << 25
@@ -78,8 +80,8 @@ class ServeConfig:
             UsageError: Names the flag.
         """
         least = {
-            "port": 0, "workers": 0, "queue": 0, "max_streams": 0, "max_message_mb": 1, "max_pixels": 256,
-            "max_regions": 1, "max_models": 1, "versions": 1, "refresh_s": 0, "grace_s": 0,
+            "port": 0, "workers": 0, "queue": 0, "max_streams": 0, "max_calls": 1, "max_message_mb": 1,
+            "max_pixels": 256, "max_regions": 1, "max_models": 1, "versions": 1, "refresh_s": 0, "grace_s": 0,
         }  # fmt: skip
         for name, smallest in least.items():
             if not getattr(self, name) >= smallest:

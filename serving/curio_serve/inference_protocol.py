@@ -4,6 +4,7 @@ For clients that bring their own preprocessing, ``tritonclient`` for one. The im
 and camera already; :mod:`curio_serve.service` is the way for frames as cameras give them.
 """
 
+from functools import partial
 from importlib.metadata import version as installed_version
 
 import numpy as np
@@ -33,36 +34,34 @@ class InferenceService(GRPCInferenceServiceServicer):
         """Say from now on that no new work is wanted."""
         self._is_ready = False
 
-    async def ServerLive(self, request: messages.ServerLiveRequest, context: Context) -> messages.ServerLiveResponse:
+    def ServerLive(self, request: messages.ServerLiveRequest, context: Context) -> messages.ServerLiveResponse:
         return messages.ServerLiveResponse(live=True)
 
-    async def ServerReady(self, request: messages.ServerReadyRequest, context: Context) -> messages.ServerReadyResponse:
+    def ServerReady(self, request: messages.ServerReadyRequest, context: Context) -> messages.ServerReadyResponse:
         return messages.ServerReadyResponse(ready=self._is_ready)
 
-    async def ModelReady(self, request: messages.ModelReadyRequest, context: Context) -> messages.ModelReadyResponse:
-        return await self._guard.run("ModelReady", "", context, self._model_ready(request))
+    def ModelReady(self, request: messages.ModelReadyRequest, context: Context) -> messages.ModelReadyResponse:
+        return self._guard.run("ModelReady", "", context, partial(self._model_ready, request))
 
-    async def ServerMetadata(
+    def ServerMetadata(
         self, request: messages.ServerMetadataRequest, context: Context
     ) -> messages.ServerMetadataResponse:
         return messages.ServerMetadataResponse(name="curio-serve", version=installed_version("curio-pose"))
 
-    async def ModelMetadata(
-        self, request: messages.ModelMetadataRequest, context: Context
-    ) -> messages.ModelMetadataResponse:
-        return await self._guard.run("ModelMetadata", "", context, self._metadata(request))
+    def ModelMetadata(self, request: messages.ModelMetadataRequest, context: Context) -> messages.ModelMetadataResponse:
+        return self._guard.run("ModelMetadata", "", context, partial(self._metadata, request))
 
-    async def ModelInfer(self, request: messages.ModelInferRequest, context: Context) -> messages.ModelInferResponse:
-        return await self._guard.run("ModelInfer", request.id[:128], context, self._infer(request, context))
+    def ModelInfer(self, request: messages.ModelInferRequest, context: Context) -> messages.ModelInferResponse:
+        return self._guard.run("ModelInfer", request.id[:128], context, partial(self._infer, request, context))
 
-    async def _model_ready(self, request: messages.ModelReadyRequest) -> messages.ModelReadyResponse:
+    def _model_ready(self, request: messages.ModelReadyRequest) -> messages.ModelReadyResponse:
         try:
             self._repository.get(request.name, _version(request.version))
         except ModelNotFound:
             return messages.ModelReadyResponse(ready=False)
         return messages.ModelReadyResponse(ready=self._is_ready)
 
-    async def _metadata(self, request: messages.ModelMetadataRequest) -> messages.ModelMetadataResponse:
+    def _metadata(self, request: messages.ModelMetadataRequest) -> messages.ModelMetadataResponse:
         model = self._repository.get(request.name, _version(request.version))
         loaded = next(loaded for name, loaded in self._repository if name == model.name)
         answer = messages.ModelMetadataResponse(
@@ -73,14 +72,15 @@ class InferenceService(GRPCInferenceServiceServicer):
             answer.outputs.add(name=name, datatype="FP32", shape=[-1, *shape])
         return answer
 
-    async def _infer(self, request: messages.ModelInferRequest, context: Context) -> messages.ModelInferResponse:
+    def _infer(self, request: messages.ModelInferRequest, context: Context) -> messages.ModelInferResponse:
         model = self._repository.get(request.model_name, _version(request.model_version))
         images = _images(request, model)
         names = [output.name for output in request.outputs] or list(model.output_names)
         if (unknown := set(names) - set(model.output_names)) or len(names) > len(model.output_names):
             found = sorted(unknown)[:4] or f"{len(names)} names"
             raise ArgumentError(f"outputs has {found}; model {model.label} has each of {model.output_names} once")
-        outputs = await self._work.run(lambda waited_s: model.run(images), context.time_remaining())
+        with self._work.slot(context):
+            outputs = model.run(images)
         return _answer(request.id, model, names, outputs)
 
 

@@ -1,9 +1,9 @@
 """Who may call: TLS, client certificates, bearer tokens."""
 
 import hmac
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import grpc
 from grpc_health.v1 import health
@@ -15,20 +15,20 @@ from curio_serve.wire import status_from_error
 _HEALTH_PREFIX = f"/{health.SERVICE_NAME}/"
 
 
-class TokenInterceptor(grpc.aio.ServerInterceptor):
+class TokenInterceptor(grpc.ServerInterceptor):
     """Lets calls pass that show a known bearer token, and health checks."""
 
     def __init__(self, tokens: list[bytes]) -> None:
         self._tokens = tokens
 
-    async def intercept_service(
+    def intercept_service(
         self,
-        continuation: Callable[[grpc.HandlerCallDetails], "Awaitable[grpc.RpcMethodHandler[Any, Any] | None]"],
+        continuation: Callable[[grpc.HandlerCallDetails], "grpc.RpcMethodHandler[Any, Any] | None"],
         handler_call_details: grpc.HandlerCallDetails,
     ) -> "grpc.RpcMethodHandler[Any, Any] | None":
         shown = dict(handler_call_details.invocation_metadata).get("authorization", "")
         if handler_call_details.method.startswith(_HEALTH_PREFIX) or self._knows(shown):
-            return await continuation(handler_call_details)
+            return continuation(handler_call_details)
         return grpc.stream_stream_rpc_method_handler(_refuse_token)
 
     def _knows(self, shown: str | bytes) -> bool:
@@ -39,10 +39,9 @@ class TokenInterceptor(grpc.aio.ServerInterceptor):
         return token != text and any(matches)
 
 
-async def _refuse_token(_requests: AsyncIterator[bytes], context: grpc.aio.ServicerContext) -> None:
+def _refuse_token(_requests: Iterator[bytes], context: grpc.ServicerContext) -> NoReturn:
     error = TokenError("bearer token missing or unknown; send the metadata `authorization: Bearer <token>`")
-    status = status_from_error(error)
-    await context.abort(status.code, status.details, status.trailing_metadata)
+    context.abort_with_status(status_from_error(error))
 
 
 def server_credentials(config: ServeConfig) -> grpc.ServerCredentials | None:

@@ -1,7 +1,7 @@
 """The command ``curio-serve``."""
 
-import asyncio
 import os
+import signal
 import sys
 
 from curio_serve.config import ServeConfig, read_config, to_toml
@@ -15,17 +15,16 @@ def main() -> None:
         if config.dump_config:
             print(to_toml(config), end="")
             return
-        status = asyncio.run(_serve(config))
+        _serve(config)
     except CurioError as exc:
         print(f"curio-serve: {exc}", file=sys.stderr)
         sys.exit(exc.exit_status)
     except KeyboardInterrupt:
         # Before the server has taken the signal over there is nothing to drain.
         sys.exit(130)
-    sys.exit(status)
 
 
-async def _serve(config: ServeConfig) -> int:
+def _serve(config: ServeConfig) -> None:
     # gRPC's own stderr lines say again, and less clearly, what our messages say.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     # Imported here, so that --help need not wait for gRPC and OpenCV.
@@ -35,11 +34,12 @@ async def _serve(config: ServeConfig) -> int:
     lines = start_logging(config.log_level)
     try:
         server = PoseServer(config)
-        address, *metrics = await server.start()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda _number, _frame: server.stop())
+        address, *metrics = server.start()
         print(f"listening on {address}", flush=True)
         for url in metrics:
             print(f"metrics on {url}", flush=True)
-        await server.serve_until_stopped()
+        server.serve_until_stopped()
     finally:
         lines.stop()
-    return 0

@@ -1,10 +1,10 @@
 """The server's life: open the port, load the models, watch for new ones, drain, leave."""
 
-import asyncio
 import contextlib
 import logging
-import signal
 import socket
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import grpc
@@ -32,7 +32,7 @@ _SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.Heal
 
 
 class PoseServer:
-    """One server process. Use from within one event loop: :meth:`start`, then :meth:`serve_until_stopped`."""
+    """One server: :meth:`start`, then :meth:`serve_until_stopped`, which :meth:`stop` ends from anywhere."""
 
     def __init__(self, config: ServeConfig) -> None:
         self.config = config
@@ -41,14 +41,16 @@ class PoseServer:
         self._metrics = Metrics(registry)
         self._repository = Repository(config.models, config.versions, config.providers)
         self._work = WorkQueue(config.workers or num_cores(), config.queue, self._metrics)
-        self._health = health.aio.HealthServicer()
+        self._health = health.HealthServicer(
+            experimental_non_blocking=True, experimental_thread_pool=ThreadPoolExecutor(1)
+        )
         self._inference = InferenceService(self._repository, self._work, self._metrics)
         self._check = ChildCheck()
-        self._server: grpc.aio.Server | None = None
-        self._stopped = asyncio.Event()
+        self._server: grpc.Server | None = None
+        self._stopped = threading.Event()
 
-    async def start(self) -> list[str]:
-        """Load the models and open the ports. From here on SIGTERM and SIGINT end the server in good order.
+    def start(self) -> list[str]:
+        """Load the models and open the ports.
 
         Returns:
             The addresses that answer: gRPC's, and the metrics' URL where they are on.
@@ -58,12 +60,9 @@ class PoseServer:
             Unavailable: A port is taken.
             UsageError: A certificate, key or token file cannot be used.
         """
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self.stop)
         # Frames run in parallel already, one a core; OpenCV's own threads would only get in their way.
         cv2.setNumThreads(1)
-        self._report(await asyncio.to_thread(self._repository.refresh))
+        self._report(self._repository.refresh())
         if not list(self._repository):
             raise ModelError(
                 f"no model could be loaded from {self.config.models}; the log says why each was refused. "
@@ -73,14 +72,20 @@ class PoseServer:
         addresses = [self._open_port(self._server)]
         if self.config.metrics_port is not None:
             addresses.append(self._open_metrics(self.config.metrics_port))
-        await self._server.start()
-        await self._announce()
+        self._server.start()
+        self._announce()
         return addresses
 
-    def _build(self) -> grpc.aio.Server:
+    def _build(self) -> grpc.Server:
         interceptors = [TokenInterceptor(read_tokens(self.config.token_file))] if self.config.token_file else []
-        server = grpc.aio.server(interceptors=interceptors, options=channel_options(self.config))
         config = self.config
+        server = grpc.server(
+            # Threads are made as calls need them, so their number follows the load; one that waits takes 16 kB.
+            ThreadPoolExecutor(config.max_calls, thread_name_prefix="curio-call"),
+            interceptors=interceptors,
+            options=channel_options(config),
+            maximum_concurrent_rpcs=config.max_calls,
+        )
         limits = Limits(
             config.max_pixels,
             config.max_regions,
@@ -95,7 +100,7 @@ class PoseServer:
         reflection.enable_server_reflection([_POSE, _INFERENCE, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
         return server
 
-    def _open_port(self, server: grpc.aio.Server) -> str:
+    def _open_port(self, server: grpc.Server) -> str:
         host, port = self.config.host, self.config.port
         address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         credentials = server_credentials(self.config)
@@ -119,49 +124,50 @@ class PoseServer:
             ) from exc
         return f"http://{self.config.host}:{http.server_port}/metrics"
 
-    async def _announce(self) -> None:
+    def _announce(self) -> None:
         """Health of the whole and of each service and model."""
         names = [name for name, _ in self._repository]
         for name in ("", _POSE, _INFERENCE, *names):
-            await self._health.set(name, _SERVING)
+            self._health.set(name, _SERVING)
 
-    async def serve_until_stopped(self) -> None:
-        """Answer calls until a signal or :meth:`stop`, which may have come during :meth:`start`; then drain."""
-        watcher = asyncio.create_task(self._watch())
+    def serve_until_stopped(self) -> None:
+        """Answer calls until :meth:`stop`, which may have come during :meth:`start`; then drain."""
+        watcher = threading.Thread(target=self._watch, name="curio-watch")
+        watcher.start()
         try:
-            await self._stopped.wait()
+            self._stopped.wait()
         finally:
-            watcher.cancel()
+            self._stopped.set()
+            self._drain()
             self._check.stop()
-            await self._drain()
+            watcher.join()
+            log(logging.INFO, "stopped")
 
     def stop(self) -> None:
         """Begin to drain."""
         self._stopped.set()
 
-    async def _drain(self) -> None:
+    def _drain(self) -> None:
+        """Refuse new calls and let accepted ones finish."""
         if self._server is None:
             return
         log(logging.INFO, "draining", grace_s=self.config.grace_s)
         self._inference.drain()
-        await self._health.enter_graceful_shutdown()
-        await self._server.stop(self.config.grace_s)
-        self._work.close()
-        log(logging.INFO, "stopped")
+        self._health.enter_graceful_shutdown()
+        self._server.stop(self.config.grace_s).wait()
 
-    async def _watch(self) -> None:
+    def _watch(self) -> None:
         """Pick up new model versions for as long as the server lives."""
-        while self.config.refresh_s:
-            await asyncio.sleep(self.config.refresh_s)
+        while self.config.refresh_s and not self._stopped.wait(self.config.refresh_s):
             before = {name for name, _ in self._repository}
             try:
-                self._report(await asyncio.to_thread(self._repository.refresh, self._check))
+                self._report(self._repository.refresh(self._check))
             except ModelError as exc:
                 log(logging.ERROR, "models folder unreadable; serving what is loaded", reason=str(exc))
                 continue
-            await self._announce()
+            self._announce()
             for gone in before - {name for name, _ in self._repository}:
-                await self._health.set(gone, _NOT_SERVING)
+                self._health.set(gone, _NOT_SERVING)
 
     def _report(self, changes: list[Change]) -> None:
         for change in changes:

@@ -1,9 +1,10 @@
 """The typed API ``curio.v1.PoseDetector``: translates between messages and the detector, and nothing else."""
 
 import logging
+import threading
 import time
 import uuid
-from collections.abc import AsyncIterator, Awaitable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
@@ -16,11 +17,11 @@ from curio_serve import image, wire
 from curio_serve.admission import WorkQueue
 from curio_serve.camera import PinholeCamera
 from curio_serve.detector import Detector
-from curio_serve.errors import ArgumentError, CurioError, ImageError, InternalError, Overloaded
+from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, InternalError, Overloaded
 from curio_serve.repository import Repository
 from curio_serve.telemetry import Metrics, log
 
-Context = grpc.aio.ServicerContext
+Context = grpc.ServicerContext
 Answer = TypeVar("Answer")
 _MAX_ID_LENGTH = 128
 
@@ -43,62 +44,72 @@ class CallGuard:
     def __init__(self, metrics: Metrics) -> None:
         self._metrics = metrics
 
-    async def run(self, method: str, request_id: str, context: Context, body: Awaitable[Answer]) -> Answer:
-        """Await the body; abort the call with the status of what it raises."""
+    def run(self, method: str, request_id: str, context: Context, body: Callable[[], Answer]) -> Answer:
+        """Call the body; abort the call with the status of what it raises."""
         code = "UNKNOWN"
         try:
-            answer = await body
+            answer = body()
             code = "OK"
         except CurioError as exc:
             status = wire.status_from_error(exc)
             code = status.code.name
-            level = logging.ERROR if isinstance(exc, InternalError) else logging.INFO
-            reason = str(exc)[: wire.MAX_TEXT]
-            log(level, "refused", method=method, request_id=request_id, code=code, reason=reason, peer=context.peer())
-            await context.abort(status.code, status.details, status.trailing_metadata)
+            self._log(exc, method=method, request_id=request_id, code=code, peer=context.peer())
+            context.abort_with_status(status)
         finally:
             self._metrics.requests.labels(method, code).inc()
         log(logging.DEBUG, "answered", method=method, request_id=request_id)
         return answer
 
+    def _log(self, error: CurioError, **values: str) -> None:
+        level = logging.INFO
+        if isinstance(error, InternalError):
+            level = logging.ERROR
+        elif isinstance(error, Overloaded | CallEnded):
+            level = logging.DEBUG  # they come by the thousand, when time is shortest; the metrics count them
+        log(level, "refused", reason=str(error)[: wire.MAX_TEXT], **values)
+
 
 class PoseService(PoseDetectorServicer):
-    """Answers ``PoseDetector``'s calls on the event loop; frames are worked on by the queue's threads."""
+    """Answers ``PoseDetector``'s calls, each on a thread of its own."""
 
     def __init__(self, repository: Repository, work: WorkQueue, limits: Limits, metrics: Metrics) -> None:
         self._repository, self._work, self._limits, self._metrics = repository, work, limits, metrics
         self._guard = CallGuard(metrics)
-        self._num_streams = 0
+        self._num_streams, self._lock = 0, threading.Lock()
         metrics.streams.set_function(lambda: self._num_streams)
 
-    async def Detect(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
-        body = self._detect(request, context, always=False)
-        return await self._guard.run("Detect", request.request_id[:_MAX_ID_LENGTH], context, body)
+    def Detect(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
+        body = partial(self._detect, request, context, always=False)
+        return self._guard.run("Detect", request.request_id[:_MAX_ID_LENGTH], context, body)
 
-    async def DetectStream(
-        self, request_iterator: AsyncIterator[messages.DetectRequest], context: Context
-    ) -> AsyncIterator[messages.DetectResponse]:
-        await self._guard.run("DetectStream", "", context, self._open_stream())
-        self._num_streams += 1
-        try:
-            # One frame of a stream at a time: the next is read when this one is answered, so the client feels the load.
-            async for request in request_iterator:
-                body = self._detect(request, context, always=True)
-                yield await self._guard.run("DetectStream.frame", request.request_id[:_MAX_ID_LENGTH], context, body)
-        finally:
+    def DetectStream(
+        self, request_iterator: Iterator[messages.DetectRequest], context: Context
+    ) -> Iterator[messages.DetectResponse]:
+        self._guard.run("DetectStream", "", context, partial(self._open_stream, context))
+        # One frame of a stream at a time: the next is read when this one is answered, so the client feels the load.
+        for request in request_iterator:
+            body = partial(self._detect, request, context, always=True)
+            yield self._guard.run("DetectStream.frame", request.request_id[:_MAX_ID_LENGTH], context, body)
+
+    def ListModels(self, request: messages.ListModelsRequest, context: Context) -> messages.ListModelsResponse:
+        return self._guard.run("ListModels", "", context, self._list)
+
+    def GetModel(self, request: messages.GetModelRequest, context: Context) -> messages.GetModelResponse:
+        return self._guard.run("GetModel", "", context, partial(self._get, request))
+
+    def _open_stream(self, context: Context) -> None:
+        with self._lock:
+            if self._num_streams >= self._limits.max_streams:
+                raise Overloaded(f"{self._num_streams} streams are open, which is the limit (--max-streams)", 1.0)
+            self._num_streams += 1
+        if not context.add_callback(self._close_stream):
+            self._close_stream()
+
+    def _close_stream(self) -> None:
+        with self._lock:
             self._num_streams -= 1
 
-    async def ListModels(self, request: messages.ListModelsRequest, context: Context) -> messages.ListModelsResponse:
-        return await self._guard.run("ListModels", "", context, self._list())
-
-    async def GetModel(self, request: messages.GetModelRequest, context: Context) -> messages.GetModelResponse:
-        return await self._guard.run("GetModel", "", context, self._get(request))
-
-    async def _open_stream(self) -> None:
-        if self._num_streams >= self._limits.max_streams:
-            raise Overloaded(f"{self._num_streams} streams are open, which is the limit (--max-streams)", 1.0)
-
-    async def _list(self) -> messages.ListModelsResponse:
+    def _list(self) -> messages.ListModelsResponse:
         answer = messages.ListModelsResponse()
         for name, loaded in self._repository:
             spec = loaded[max(loaded)].spec
@@ -106,17 +117,15 @@ class PoseService(PoseDetectorServicer):
             answer.models.add(name=name, versions=sorted(loaded), world=spec.world, objects=objects)
         return answer
 
-    async def _get(self, request: messages.GetModelRequest) -> messages.GetModelResponse:
+    def _get(self, request: messages.GetModelRequest) -> messages.GetModelResponse:
         model = self._repository.get(request.model.name, request.model.version)
         return messages.GetModelResponse(spec=model.spec, version=model.version)
 
-    async def _detect(
-        self, request: messages.DetectRequest, context: Context, *, always: bool
-    ) -> messages.DetectResponse:
+    def _detect(self, request: messages.DetectRequest, context: Context, *, always: bool) -> messages.DetectResponse:
         self._check(request)
         detectors = [Detector(self._repository.get(m.name, m.version)) for m in request.models]
-        work = partial(detect_frame, request, detectors, self._limits)
-        answer = await self._work.run(work, context.time_remaining(), always=always)
+        with self._work.slot(context, always=always) as waited_s:
+            answer = detect_frame(request, detectors, self._limits, waited_s)
         spent = answer.milliseconds
         self._metrics.queue_s.observe(spent.queue / 1e3)
         self._metrics.decode_s.observe(spent.decode / 1e3)
@@ -143,7 +152,7 @@ class PoseService(PoseDetectorServicer):
 def detect_frame(
     request: messages.DetectRequest, detectors: list[Detector], limits: Limits, waited_s: float
 ) -> messages.DetectResponse:
-    """Decode a request's frame and run the models on it. On a worker thread.
+    """Decode a request's frame and run the models on it.
 
     Raises:
         RequestError: The image, the camera or a region is not acceptable.

@@ -1,118 +1,165 @@
-"""The bounded queue: refusals, deadlines, calls that hang up."""
+"""The bounded queue: refusals, deadlines, calls that hang up, order."""
 
-import asyncio
 import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 import pytest
 from curio_serve.admission import WorkQueue
-from curio_serve.errors import DeadlineError, Overloaded
+from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
 from curio_serve.telemetry import Metrics
 from prometheus_client import CollectorRegistry
 
 
-class Gate:
-    """Work that tells when it has begun and ends when it is let go."""
+class Caller:
+    """A call without gRPC: its deadline, and a way to hang up."""
 
-    def __init__(self) -> None:
-        self.begun, self.open = threading.Event(), threading.Event()
+    def __init__(self, remaining_s: float | None = None) -> None:
+        self._remaining_s = remaining_s
+        self._callbacks: list[Callable[[], None]] = []
+        self._has_ended = False
+        self.is_waiting = threading.Event()
 
-    def __call__(self, waited_s: float) -> str:
-        self.begun.set()
-        assert self.open.wait(30)
-        return "done"
+    def time_remaining(self) -> float | None:
+        return self._remaining_s
 
+    def add_callback(self, callback: Callable[[], None]) -> bool:
+        self._callbacks.append(callback)
+        self.is_waiting.set()
+        return not self._has_ended
 
-def _queue(num_workers: int, max_waiting: int) -> WorkQueue:
-    return WorkQueue(num_workers, max_waiting, Metrics(CollectorRegistry()))
-
-
-def test_beyond_the_queue_is_refused_at_once() -> None:
-    async def scenario() -> None:
-        work, gate = _queue(1, 2), Gate()
-        accepted = [asyncio.create_task(work.run(gate, None)) for _ in range(3)]
-        await asyncio.to_thread(gate.begun.wait)
-        with pytest.raises(Overloaded, match="3 requests are being worked on or waiting") as caught:
-            await work.run(gate, None)
-        assert caught.value.retry_after_s > 0
-        # Callers that are bounded otherwise may wait all the same.
-        extra = asyncio.create_task(work.run(gate, None, always=True))
-        gate.open.set()
-        assert await asyncio.gather(*accepted, extra) == ["done"] * 4
-        assert await work.run(gate, None) == "done"
-        work.close()
-
-    asyncio.run(scenario())
+    def hang_up(self) -> None:
+        self._has_ended = True
+        for callback in self._callbacks:
+            callback()
 
 
-def test_a_deadline_that_passed_in_the_queue_costs_no_work() -> None:
-    async def scenario() -> None:
-        work, gate, late = _queue(1, 5), Gate(), Gate()
-        first = asyncio.create_task(work.run(gate, None))
-        await asyncio.to_thread(gate.begun.wait)
-        second = asyncio.create_task(work.run(late, 0.0))
-        await asyncio.sleep(0)
-        gate.open.set()
-        assert await first == "done"
-        with pytest.raises(DeadlineError, match="nothing was done"):
-            await second
-        assert not late.begun.is_set()
-        work.close()
+class Bench:
+    """A queue, and threads that ask it for slots."""
 
-    asyncio.run(scenario())
+    def __init__(self, num_slots: int, max_waiting: int) -> None:
+        self.queue = WorkQueue(num_slots, max_waiting, Metrics(CollectorRegistry()))
+        self.threads = ThreadPoolExecutor(16)
+        self.order: list[str] = []
 
+    def hold(
+        self, gate: threading.Event, caller: Caller | None = None, *, name: str = "", **options: Any
+    ) -> "Future[str]":
+        """Take a slot and keep it until the gate opens; returns once the slot is held or the call waits in the queue."""
+        caller, held = caller or Caller(), threading.Event()
 
-def test_a_cancelled_call_leaves_the_queue() -> None:
-    async def scenario() -> None:
-        work, gate, gone = _queue(1, 1), Gate(), Gate()
-        first = asyncio.create_task(work.run(gate, None))
-        await asyncio.to_thread(gate.begun.wait)
-        waiting = asyncio.create_task(work.run(gone, None))
-        await asyncio.sleep(0)
-        waiting.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await waiting
-        # Its place is free again.
-        third = asyncio.create_task(work.run(gate, None))
-        await asyncio.sleep(0)
-        gate.open.set()
-        assert await asyncio.gather(first, third) == ["done", "done"]
-        assert not gone.begun.is_set()
-        work.close()
+        def work() -> str:
+            with self.queue.slot(caller, **options):
+                self.order.append(name)
+                held.set()
+                assert gate.wait(30)
+            return "done"
 
-    asyncio.run(scenario())
+        future = self.threads.submit(work)
+        future.add_done_callback(lambda _: held.set())
+        while not held.is_set() and not caller.is_waiting.is_set():
+            held.wait(0.001)
+        return future
 
 
-def test_a_call_cancelled_while_worked_on_keeps_its_worker_until_it_ends() -> None:
-    async def scenario() -> None:
-        work, gate = _queue(1, 0), Gate()
-        running = asyncio.create_task(work.run(gate, None))
-        await asyncio.to_thread(gate.begun.wait)
-        running.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await running
-        with pytest.raises(Overloaded):
-            await work.run(gate, None)
-        gate.open.set()
-        while True:
-            try:
-                assert await work.run(gate, None) == "done"
-                break
-            except Overloaded:
-                await asyncio.sleep(0.001)
-        work.close()
-
-    asyncio.run(scenario())
+@pytest.fixture
+def gate() -> threading.Event:
+    return threading.Event()
 
 
-def test_errors_of_the_work_come_through() -> None:
-    def broken(waited_s: float) -> None:
-        raise ValueError("mine")
+def test_beyond_the_queue_is_refused_at_once(gate: threading.Event) -> None:
+    bench = Bench(1, 2)
+    accepted = [bench.hold(gate) for _ in range(3)]
+    with pytest.raises(Overloaded, match="1 requests are being worked on and 2 are waiting") as caught:
+        bench.hold(gate).result(30)
+    assert caught.value.retry_after_s > 0
+    # Callers that are bounded otherwise may wait all the same.
+    accepted.append(bench.hold(gate, always=True))
+    gate.set()
+    assert [future.result(30) for future in accepted] == ["done"] * 4
+    assert bench.hold(gate).result(30) == "done"
 
-    async def scenario() -> None:
-        work = _queue(2, 2)
-        for _ in range(5):
-            with pytest.raises(ValueError, match="mine"):
-                await work.run(broken, None)
-        work.close()
 
-    asyncio.run(scenario())
+def test_first_come_first_served(gate: threading.Event) -> None:
+    bench = Bench(1, 9)
+    futures = [bench.hold(gate, name=name) for name in "abcdefg"]
+    gate.set()
+    assert [future.result(30) for future in futures] == ["done"] * 7
+    assert bench.order == list("abcdefg")
+
+
+def test_all_slots_are_used(gate: threading.Event) -> None:
+    bench = Bench(3, 0)
+    futures = [bench.hold(gate) for _ in range(3)]
+    assert len(bench.order) == 3
+    with pytest.raises(Overloaded):
+        bench.hold(gate).result(30)
+    gate.set()
+    assert [future.result(30) for future in futures] == ["done"] * 3
+
+
+def test_a_deadline_that_passes_in_the_queue_costs_no_work(gate: threading.Event) -> None:
+    bench = Bench(1, 5)
+    first = bench.hold(gate, name="first")
+    with pytest.raises(DeadlineError, match="nothing was done"):
+        bench.hold(gate, Caller(0.02), name="late").result(30)
+    gate.set()
+    assert first.result(30) == "done"
+    assert bench.order == ["first"]
+    with pytest.raises(DeadlineError):
+        bench.hold(gate, Caller(0.0), name="too late at once").result(30)
+    assert bench.hold(gate).result(30) == "done"
+
+
+def test_a_cancelled_call_leaves_the_queue(gate: threading.Event) -> None:
+    bench, caller = Bench(1, 1), Caller()
+    first = bench.hold(gate, name="first")
+    waiting = bench.hold(gate, caller, name="gone")
+    caller.hang_up()
+    with pytest.raises(CallCancelled):
+        waiting.result(30)
+    # Its place is free again.
+    third = bench.hold(gate, name="third")
+    gate.set()
+    assert [first.result(30), third.result(30)] == ["done", "done"]
+    assert bench.order == ["first", "third"]
+
+
+def test_a_call_that_ended_before_it_waits_never_works(gate: threading.Event) -> None:
+    bench, caller = Bench(1, 1), Caller()
+    first = bench.hold(gate)
+    caller.hang_up()
+    with pytest.raises(CallCancelled):
+        bench.hold(gate, caller).result(30)
+    gate.set()
+    assert first.result(30) == "done"
+
+
+def test_errors_of_the_work_give_the_slot_back() -> None:
+    queue = WorkQueue(1, 0, Metrics(CollectorRegistry()))
+    for _ in range(5):
+        with pytest.raises(ValueError, match="mine"), queue.slot(Caller()):
+            raise ValueError("mine")
+
+
+def test_many_threads_leave_nothing_behind() -> None:
+    queue, busy, most = WorkQueue(2, 1000, Metrics(CollectorRegistry())), [], []
+
+    def work(number: int) -> None:
+        caller = Caller(None if number % 3 else 0.005)
+        if number % 5 == 0:
+            threading.Timer(0.002, caller.hang_up).start()
+        try:
+            with queue.slot(caller):
+                busy.append(number)
+                most.append(len(busy))
+                busy.remove(number)
+        except (DeadlineError, CallCancelled):
+            return
+
+    with ThreadPoolExecutor(32) as threads:
+        list(threads.map(work, range(600)))
+    assert max(most) <= 2
+    with queue.slot(Caller()), queue.slot(Caller()):
+        assert busy == []

@@ -246,18 +246,14 @@ def test_it_serves_where_the_training_stack_cannot_be_imported(models_dir: Path)
 import sys
 for name in ("torch", "mitsuba", "drjit", "onnx", "trimesh", "curio_train"):
     sys.modules[name] = None
-import asyncio
 from curio_serve.config import ServeConfig
 from curio_serve.server import PoseServer
 from pathlib import Path
 
-async def main():
-    server = PoseServer(ServeConfig(models=Path(sys.argv[1]), port=0))
-    print(await server.start())
-    asyncio.get_running_loop().call_later(0.1, server.stop)
-    await server.serve_until_stopped()
-
-asyncio.run(main())
+server = PoseServer(ServeConfig(models=Path(sys.argv[1]), port=0))
+print(server.start())
+server.stop()
+server.serve_until_stopped()
 """
     ended = subprocess.run(
         [sys.executable, "-c", code, str(models_dir)], capture_output=True, text=True, timeout=60, check=False
