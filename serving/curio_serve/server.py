@@ -41,9 +41,9 @@ class PoseServer:
         self._metrics = Metrics(registry)
         self._repository = Repository(config.models, config.versions, config.providers)
         self._work = WorkQueue(config.workers or num_cores(), config.queue, self._metrics)
-        self._health = health.HealthServicer(
-            experimental_non_blocking=True, experimental_thread_pool=ThreadPoolExecutor(1)
-        )
+        # Watchers of health wait without a thread each.
+        watchers = ThreadPoolExecutor(1)
+        self._health = health.HealthServicer(experimental_non_blocking=True, experimental_thread_pool=watchers)
         self._inference = InferenceService(self._repository, self._work, self._metrics)
         self._check = ChildCheck()
         self._server: grpc.Server | None = None
@@ -77,8 +77,10 @@ class PoseServer:
         return addresses
 
     def _build(self) -> grpc.Server:
-        interceptors = [TokenInterceptor(read_tokens(self.config.token_file))] if self.config.token_file else []
         config = self.config
+        interceptors: list[grpc.ServerInterceptor] = []
+        if config.token_file:
+            interceptors.append(TokenInterceptor(read_tokens(config.token_file)))
         server = grpc.server(
             # Threads are made as calls need them, so their number follows the load; one that waits takes 16 kB.
             ThreadPoolExecutor(config.max_calls, thread_name_prefix="curio-call"),

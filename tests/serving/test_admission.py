@@ -46,7 +46,7 @@ class Bench:
     def hold(
         self, gate: threading.Event, caller: Caller | None = None, *, name: str = "", **options: Any
     ) -> "Future[str]":
-        """Take a slot and keep it until the gate opens; returns once the slot is held or the call waits in the queue."""
+        """Take a slot and keep it until the gate opens; returns once it is held or the call waits in the queue."""
         caller, held = caller or Caller(), threading.Event()
 
         def work() -> str:
