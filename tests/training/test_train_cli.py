@@ -106,6 +106,13 @@ def test_help_names_worlds_flags_and_defaults_without_torch() -> None:
         assert [text for text in expected if text not in shown] == []
 
 
+def test_a_reader_that_leaves_early_is_no_crash() -> None:
+    process = start("circles", "--help")
+    process.stdout.close()
+    assert "Traceback" not in process.stderr.read()
+    assert process.wait(PATIENCE_S) == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "status", "message"),
     [

@@ -66,6 +66,9 @@ def answer(work: Callable[[Interruption], int]) -> int:
         except Interrupted as exc:
             console.print(f"stopped by {exc}; whatever was saved before is intact", markup=False)
             return exc.exit_status
+        except BrokenPipeError:  # the reader of our output (head, less) has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
 
 
 def _parse(arguments: list[str]) -> TrainCommand:
@@ -122,8 +125,9 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     if int(os.environ.get("RANK", "0")) == 0:
         loss = "" if course.image_loss is None else f", image loss {course.image_loss:.4g}"
         print(f"{path}: {outcome.value} after {course.images:,} images in {course.seconds / 60:.1f} minutes{loss}")
+        if outcome is Outcome.INTERRUPTED:
+            print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
     if outcome is Outcome.INTERRUPTED and interruption.signum is not None:
-        print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
         return 128 + interruption.signum
     return 0
 
