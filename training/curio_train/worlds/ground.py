@@ -17,6 +17,7 @@ Codes are in the world frame. An exported model answers in the camera frame, whi
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -81,6 +82,11 @@ class GroundWorld(MeshWorld):
         linear = linear_from_srgb(light.new_tensor(GROUND_SRGB)) * (AMBIENT + light[:, 1].clamp(min=0))
         srgb = 1.055 * linear.clamp(0.0031308, 1) ** (1 / 2.4) - 0.055
         return srgb.view(-1, 1, 1, 1).expand(-1, 3, self.camera.height, self.camera.width)
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """All that the images depend on."""
+        return super().recipe | {"ground": GROUND_SRGB}
 
     @property
     def exported_fields(self) -> tuple[Field, ...]:

@@ -37,9 +37,9 @@ class Light(GroundWorld):
 
     def __init__(self) -> None:
         kinds = [
-            Kind("capsule", painted(standing(capsule(0.13, 0.48)), DARKEST), 4),
+            Kind("capsule", painted(standing(capsule(0.13, 0.48, sections=16)), DARKEST), 4),
             Kind("box", painted(standing(box((0.3, 0.32, 0.22))), DARKEST), 3),
-            Kind("cone", painted(standing(cone(0.18, 0.48)), DARKEST), 3),
+            Kind("cone", painted(standing(cone(0.18, 0.48, sections=24)), DARKEST), 3),
         ]
         super().__init__([COLOR_FIELD, CONFIDENCE_FIELD, SUN_FIELD], kinds)
 

@@ -95,10 +95,10 @@ class MeshWorld(World):
             )
             for kind, end in zip(kinds, ends.tolist(), strict=True)
         )
-        self._kind_of_slot = [number for number, kind in enumerate(kinds) for _ in range(kind.num_slots)]
+        kind_of_slot = [number for number, kind in enumerate(kinds) for _ in range(kind.num_slots)]
         self._renderer = Renderer(
             [kind.mesh for kind in kinds],
-            self._kind_of_slot,
+            kind_of_slot,
             stage.camera.width,
             stage.camera.height,
             ambient=stage.ambient,
@@ -108,6 +108,19 @@ class MeshWorld(World):
     @abstractmethod
     def constants(self) -> Mapping[str, Any]:
         """What the draws depend on beside layout, meshes and stage; changing one makes new image sets."""
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """All that the images depend on."""
+        stage = self.stage
+        return {
+            "constants": dict(self.constants),
+            "fields": [asdict(field) for field in self.layout.fields],
+            "kinds": [(kind.name, kind.mesh.sha256, kind.num_slots) for kind in self.kinds],
+            "camera": (self.camera.width, self.camera.height, np.asarray(self.camera.matrix).tolist()),
+            "cam_from_world": [np.asarray(part).tolist() for part in stage.cam_from_world],
+            "light": (stage.ambient, stage.sun),
+        }
 
     def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
         """The scenes from the world's own camera, over ``backgrounds`` or what the world has behind its objects."""
@@ -119,7 +132,7 @@ class MeshWorld(World):
 
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> StoredImages:
         """2,000, 500 and 500 images, the paper's numbers."""
-        return stored(self, self._recipe(), split, seed, with_code=with_code, cache=cache)
+        return stored(self, self.recipe, split, seed, with_code=with_code, cache=cache)
 
     def light(self, code: SceneCode) -> Float[Tensor, "batch 3"]:
         """Towards the sun, world frame; its length is the strength."""
@@ -148,13 +161,3 @@ class MeshWorld(World):
             confidence=code[CONFIDENCE][..., 0].float() if CONFIDENCE in self.layout else None,
             seed=jitter_seed(code),
         )
-
-    def _recipe(self) -> dict[str, Any]:
-        stage = {name: np.asarray(value).tolist() for name, value in asdict(self.stage).items() if name != "camera"}
-        return {
-            "constants": dict(self.constants),
-            "fields": [asdict(field) for field in self.layout.fields],
-            "kinds": [(kind.name, kind.mesh.sha256, kind.num_slots) for kind in self.kinds],
-            "camera": (self.camera.width, self.camera.height, np.asarray(self.camera.matrix).tolist()),
-            "stage": stage,
-        }

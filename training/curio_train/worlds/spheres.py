@@ -64,7 +64,9 @@ class Spheres(MeshWorld):
     name = "spheres"
 
     def __init__(self) -> None:
-        super().__init__(Layout(FIELDS, NUM_SPHERES), [Kind("sphere", sphere(RADIUS_M), NUM_SPHERES)], stage())
+        super().__init__(
+            Layout(FIELDS, NUM_SPHERES), [Kind("sphere", sphere(RADIUS_M, subdivisions=2), NUM_SPHERES)], stage()
+        )
 
     @property
     def constants(self) -> Mapping[str, Any]:

@@ -29,7 +29,7 @@ class Varied(MeshWorld):
 
     def __init__(self) -> None:
         layout = Layout((*FIELDS, CONFIDENCE_FIELD), NUM_SLOTS)
-        super().__init__(layout, [Kind("sphere", sphere(RADIUS_M), NUM_SLOTS)], stage())
+        super().__init__(layout, [Kind("sphere", sphere(RADIUS_M, subdivisions=2), NUM_SLOTS)], stage())
 
     @property
     def constants(self) -> Mapping[str, Any]:
