@@ -9,11 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import grpc
 from curio_proto.inference import inference_pb2
-from curio_proto.inference.inference_pb2_grpc import add_GRPCInferenceServiceServicer_to_server
 from curio_proto.v1 import detector_pb2
-from curio_proto.v1.detector_pb2_grpc import add_PoseDetectorServicer_to_server
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from grpc_reflection.v1alpha import reflection
+from grpc_health.v1 import health, health_pb2
+from grpc_reflection.v1alpha import reflection, reflection_pb2
 from prometheus_client import CollectorRegistry, start_http_server
 
 from curio_serve.admission import WorkQueue, num_cores
@@ -21,13 +19,16 @@ from curio_serve.config import ServeConfig
 from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.inference_protocol import InferenceService
 from curio_serve.model_check import ChildCheck
+from curio_serve.registration import register
 from curio_serve.repository import Change, Repository
 from curio_serve.security import TokenInterceptor, read_tokens, server_credentials
 from curio_serve.service import Limits, PoseService
 from curio_serve.telemetry import Metrics, log
 
-_POSE = detector_pb2.DESCRIPTOR.services_by_name["PoseDetector"].full_name
-_INFERENCE = inference_pb2.DESCRIPTOR.services_by_name["GRPCInferenceService"].full_name
+_POSE = detector_pb2.DESCRIPTOR.services_by_name["PoseDetector"]
+_INFERENCE = inference_pb2.DESCRIPTOR.services_by_name["GRPCInferenceService"]
+_HEALTH = health_pb2.DESCRIPTOR.services_by_name["Health"]
+_REFLECTION = reflection_pb2.DESCRIPTOR.services_by_name["ServerReflection"]
 _SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
 
 
@@ -96,10 +97,11 @@ class PoseServer:
             config.min_confidence,
             config.full_decode,
         )
-        add_PoseDetectorServicer_to_server(PoseService(self._repository, self._work, limits, self._metrics), server)
-        add_GRPCInferenceServiceServicer_to_server(self._inference, server)
-        health_pb2_grpc.add_HealthServicer_to_server(self._health, server)
-        reflection.enable_server_reflection([_POSE, _INFERENCE, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
+        register(server, _POSE, PoseService(self._repository, self._work, limits, self._metrics))
+        register(server, _INFERENCE, self._inference)
+        register(server, _HEALTH, self._health)
+        names = [service.full_name for service in (_POSE, _INFERENCE, _HEALTH, _REFLECTION)]
+        register(server, _REFLECTION, reflection.ReflectionServicer(names))
         return server
 
     def _open_port(self, server: grpc.Server) -> str:
@@ -129,7 +131,7 @@ class PoseServer:
     def _announce(self) -> None:
         """Health of the whole and of each service and model."""
         names = [name for name, _ in self._repository]
-        for name in ("", _POSE, _INFERENCE, *names):
+        for name in ("", _POSE.full_name, _INFERENCE.full_name, *names):
             self._health.set(name, _SERVING)
 
     def serve_until_stopped(self) -> None:

@@ -94,6 +94,20 @@ def test_a_reader_that_does_not_read(server: Any) -> None:
     _answers(server.address)
 
 
+@pytest.mark.parametrize(
+    "method", ["curio.v1.PoseDetector/Detect", "curio.v1.PoseDetector/DetectStream", "grpc.health.v1.Health/Check",
+               "inference.GRPCInferenceService/ModelInfer"],
+)  # fmt: skip
+def test_messages_nobody_can_read_keep_no_call_open(server: Any, method: str) -> None:
+    """More of them than a connection may have streams; the same connection still works after."""
+    with grpc.insecure_channel(server.address) as channel:
+        for _ in range(200):
+            with pytest.raises(grpc.RpcError, match="cannot be read as") as caught:
+                next(channel.stream_stream(f"/{method}")(iter([b"\xff" * 50]), timeout=30))
+            assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+        assert PoseDetectorStub(channel).Detect(REQUEST, timeout=30).results
+
+
 def test_a_log_that_cannot_be_written(models_dir: Path) -> None:
     code = "from curio_serve.serve_cli import main; main()"
     command = [sys.executable, "-c", code, str(models_dir), "--port", "0", "--log-level", "debug"]

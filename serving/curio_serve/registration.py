@@ -1,0 +1,59 @@
+"""Puts services on a gRPC server so that a message nobody can read is answered like any other bad request.
+
+Left to itself, grpcio answers such a message but never lets go of its call: after as many of them as a connection may
+have streams, that connection is dead, and a server with any of them waits out its whole grace time at the end. Here the
+bytes come to the handler's thread unread, and are parsed there.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import partial, update_wrapper
+from typing import Any
+
+import grpc
+from google.protobuf.descriptor import MethodDescriptor, ServiceDescriptor
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.message_factory import GetMessageClass
+
+from curio_serve.errors import ArgumentError
+from curio_serve.wire import status_from_error
+
+Behavior = Callable[..., Any]
+
+
+def register(server: grpc.Server, service: ServiceDescriptor, servicer: object) -> None:
+    """Answer a service's calls (one message or streams both ways) with the servicer's methods of the same names."""
+    handlers = {method.name: _handler(method, getattr(servicer, method.name)) for method in service.methods}
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(service.full_name, handlers),))
+
+
+def _handler(method: MethodDescriptor, behavior: Behavior) -> grpc.RpcMethodHandler:
+    wrap = _with_messages if method.client_streaming else _with_message
+    wrapped: Behavior = partial(wrap, behavior, GetMessageClass(method.input_type))
+    # grpcio reads from the behaviour's attributes on which threads it wants to run.
+    update_wrapper(wrapped, behavior)
+    serializer = GetMessageClass(method.output_type).SerializeToString
+    if method.client_streaming:
+        return grpc.stream_stream_rpc_method_handler(wrapped, response_serializer=serializer)
+    if method.server_streaming:
+        return grpc.unary_stream_rpc_method_handler(wrapped, response_serializer=serializer)
+    return grpc.unary_unary_rpc_method_handler(wrapped, response_serializer=serializer)
+
+
+def _with_message(behavior: Behavior, kind: type[Message], data: bytes, context: Any, *more: Any) -> Any:
+    return behavior(_parse(kind, data, context), context, *more)
+
+
+def _with_messages(behavior: Behavior, kind: type[Message], data: Iterator[bytes], context: Any) -> Any:
+    return behavior((_parse(kind, one, context) for one in data), context)
+
+
+def _parse(kind: type[Message], data: bytes, context: grpc.ServicerContext) -> Message:
+    try:
+        return kind.FromString(data)
+    except DecodeError:
+        name = kind.DESCRIPTOR.full_name
+        error = ArgumentError(
+            f"the message of {len(data)} bytes cannot be read as {name}; was the client made for this API?"
+        )
+        context.abort_with_status(status_from_error(error))
+        raise
