@@ -8,6 +8,8 @@ from rich.table import Table
 
 _LABELS: Mapping[str, str] = {
     "scene_error": "scene error, Eq. 1",
+    "scene_error_any_shape": "   by position alone, shapes aside",
+    "novel_view_dssim": "novel view, DSSIM",
     "position_image_widths": "position, image widths",
     "position_px": "position, pixels",
     "position_px_median": "position, pixels, median",
