@@ -200,6 +200,8 @@ class RunConfig:
             raise UsageError(
                 f"--labels {self.labels} with --method {self.method}, which uses none; expected --method super"
             )
+        if self.stop_below and "image" not in self.terms:
+            raise UsageError(f"--stop-below watches the image loss, which --method {self.method} does not have")
         for name in ("minutes", "images"):
             if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected more than 0")
