@@ -1,7 +1,7 @@
 """The bounded queue: refusals, deadlines, calls that hang up, order."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -63,13 +63,29 @@ class Bench:
         return future
 
 
+MakeBench = Callable[[int, int], Bench]
+
+
 @pytest.fixture
 def gate() -> threading.Event:
     return threading.Event()
 
 
-def test_beyond_the_queue_is_refused_at_once(gate: threading.Event) -> None:
-    bench = Bench(1, 2)
+@pytest.fixture
+def make_bench() -> Iterator[MakeBench]:
+    made: list[Bench] = []
+
+    def make(num_slots: int, max_waiting: int) -> Bench:
+        made.append(Bench(num_slots, max_waiting))
+        return made[-1]
+
+    yield make
+    for bench in made:
+        bench.threads.shutdown()
+
+
+def test_beyond_the_queue_is_refused_at_once(gate: threading.Event, make_bench: MakeBench) -> None:
+    bench = make_bench(1, 2)
     accepted = [bench.hold(gate) for _ in range(3)]
     with pytest.raises(Overloaded, match="1 requests are being worked on and 2 are waiting") as caught:
         bench.hold(gate).result(30)
@@ -81,16 +97,16 @@ def test_beyond_the_queue_is_refused_at_once(gate: threading.Event) -> None:
     assert bench.hold(gate).result(30) == "done"
 
 
-def test_first_come_first_served(gate: threading.Event) -> None:
-    bench = Bench(1, 9)
+def test_first_come_first_served(gate: threading.Event, make_bench: MakeBench) -> None:
+    bench = make_bench(1, 9)
     futures = [bench.hold(gate, name=name) for name in "abcdefg"]
     gate.set()
     assert [future.result(30) for future in futures] == ["done"] * 7
     assert bench.order == list("abcdefg")
 
 
-def test_all_slots_are_used(gate: threading.Event) -> None:
-    bench = Bench(3, 0)
+def test_all_slots_are_used(gate: threading.Event, make_bench: MakeBench) -> None:
+    bench = make_bench(3, 0)
     futures = [bench.hold(gate) for _ in range(3)]
     assert len(bench.order) == 3
     with pytest.raises(Overloaded):
@@ -99,8 +115,8 @@ def test_all_slots_are_used(gate: threading.Event) -> None:
     assert [future.result(30) for future in futures] == ["done"] * 3
 
 
-def test_a_deadline_that_passes_in_the_queue_costs_no_work(gate: threading.Event) -> None:
-    bench = Bench(1, 5)
+def test_a_deadline_that_passes_in_the_queue_costs_no_work(gate: threading.Event, make_bench: MakeBench) -> None:
+    bench = make_bench(1, 5)
     first = bench.hold(gate, name="first")
     with pytest.raises(DeadlineError, match="nothing was done"):
         bench.hold(gate, Caller(0.02), name="late").result(30)
@@ -112,8 +128,8 @@ def test_a_deadline_that_passes_in_the_queue_costs_no_work(gate: threading.Event
     assert bench.hold(gate).result(30) == "done"
 
 
-def test_a_cancelled_call_leaves_the_queue(gate: threading.Event) -> None:
-    bench, caller = Bench(1, 1), Caller()
+def test_a_cancelled_call_leaves_the_queue(gate: threading.Event, make_bench: MakeBench) -> None:
+    bench, caller = make_bench(1, 1), Caller()
     first = bench.hold(gate, name="first")
     waiting = bench.hold(gate, caller, name="gone")
     caller.hang_up()
@@ -126,8 +142,8 @@ def test_a_cancelled_call_leaves_the_queue(gate: threading.Event) -> None:
     assert bench.order == ["first", "third"]
 
 
-def test_a_call_that_ended_before_it_waits_never_works(gate: threading.Event) -> None:
-    bench, caller = Bench(1, 1), Caller()
+def test_a_call_that_ended_before_it_waits_never_works(gate: threading.Event, make_bench: MakeBench) -> None:
+    bench, caller = make_bench(1, 1), Caller()
     first = bench.hold(gate)
     caller.hang_up()
     with pytest.raises(CallCancelled):
