@@ -12,13 +12,14 @@ from tyro.conf import OmitArgPrefixes, Suppress
 from curio_train.errors import UsageError
 
 Term = Literal["image", "curiosity", "sleep", "label"]
-Method = Literal["our", "noncur", "super", "wake_sleep", "wake_sleep_critic"]
+Method = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic"]
 Preset = Literal["laptop", "paper"]
 
 METHODS: Mapping[Method, frozenset[Term]] = {
     "our": frozenset({"image", "curiosity"}),
     "noncur": frozenset({"image"}),
     "super": frozenset({"label"}),
+    "sleep": frozenset({"sleep"}),
     "wake_sleep": frozenset({"image", "sleep"}),
     "wake_sleep_critic": frozenset({"image", "curiosity", "sleep"}),
 }
@@ -103,7 +104,8 @@ class Recipe:
         gradient_penalty_every: Steps between penalties, each weighted up by as many.
         sleep_weight: Of the distance between sleep codes and what the network reads from their renderings.
         sleep_noise: Standard deviation of sleep codes around the network's own predictions, in half ranges.
-        sleep_drawn: Share of sleep codes drawn from the world's known range instead of around own predictions.
+        sleep_drawn: Share of sleep codes drawn from the world's known range instead of around own predictions; all are
+            with --method sleep, which makes no predictions of the data.
         gradient_clip: Largest L2 norm of a step's gradient, of the network and of the critic each.
         precision: Of the convolutions; everything else is in float32.
         budget_images: Images to show where neither --minutes nor --images is given.
@@ -148,8 +150,9 @@ class Recipe:
 PRESETS: Mapping[Preset, Recipe] = {
     "paper": Recipe(),
     "laptop": Recipe(
-        batch_size=32,
-        learning_rate=1e-3,
+        batch_size=64,
+        micro_batch_size=64,
+        learning_rate=2e-3,
         critic_learning_rate=1e-4,
         warm_up_steps=50,
         final_learning_rate=0.02,
@@ -169,7 +172,8 @@ class RunConfig:
     Attributes:
         world: The world's own options.
         method: our: image loss and critic. noncur: image loss alone. super: true scene codes. Beyond the paper,
-            wake_sleep: image loss, and renderings of self-made codes to regress; wake_sleep_critic: both.
+            sleep: renderings of codes from the world's known range, to regress. wake_sleep: image loss, and sleep
+            with half of the codes around own predictions. wake_sleep_critic: that and the critic.
         labels: Share of the training images that --method super sees, with their true codes (paper: 0.05, 0.1, 1).
         preset: Hyperparameters to start from: laptop (measured on two cores) or paper (the paper's).
         seed: Of the initial weights and every random draw.
