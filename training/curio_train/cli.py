@@ -214,3 +214,40 @@ def _export(command: ExportCommand) -> int:
         + (f", from the float32 weights by {done.rounding_error:.2g}" if command.half else "")
     )
     return 0
+
+
+@dataclass(frozen=True)
+class DoctorCommand:
+    """Check this machine, and a mesh, a camera file and photographs where they are given, before training on them.
+
+    Attributes:
+        mesh: Mesh file: PLY, OBJ, STL, glTF or OFF.
+        mesh_unit: Unit of its coordinates; the file's own, or metres, unless given.
+        camera: Camera JSON, or BOP's camera.json.
+        photos: Folder of photographs, taken with that camera where one is given.
+        cache: Where image sets that a world draws once will be kept.
+    """
+
+    mesh: Path | None = None
+    mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
+    camera: Path | None = None
+    photos: Path | None = None
+    cache: Path = Session.cache
+
+
+def doctor(arguments: Sequence[str] | None = None) -> None:
+    """``curio-doctor …``: exit status 1 where something will not work."""
+    command = tyro.cli(DoctorCommand, args=arguments, prog="curio-doctor")
+    sys.exit(answer(lambda _: _examine(command)))
+
+
+def _examine(command: DoctorCommand) -> int:
+    from curio_train.doctor import examine
+
+    colours = {"good": "green", "warning": "yellow", "bad": "bold red"}
+    console, status = Console(highlight=False, soft_wrap=True), 0
+    for finding in examine(command.mesh, command.mesh_unit, command.camera, command.photos, command.cache):
+        console.print(f"[{colours[finding.state]}]{finding.state:>7}[/]  [bold]{finding.subject}[/]: ", end="")
+        console.print(finding.text, markup=False)
+        status = max(status, finding.state == "bad")
+    return status
