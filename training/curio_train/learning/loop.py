@@ -23,10 +23,12 @@ from curio_train.learning.parallel import Ranks
 from curio_train.learning.progress import Reporter
 from curio_train.learning.sleep import sleep_codes
 from curio_train.learning.state import TrainState
+from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import Batch, ImageSource, World
 
 _SMOOTHING = 0.98  # of the image loss that convergence is judged by: a memory of about 50 steps
 _NUM_PAIRS = 8
+_ASLEEP = 1  # marks draws of sleep, so that they are not those of the data
 
 
 class Outcome(Enum):
@@ -86,7 +88,9 @@ class Trainer:
             losses: dict[str, Tensor] = {}
 
             # Awake: read the images, render what was read, compare one by one (image) and as a set (curiosity).
-            raw, code = self._read(batch.images)
+            raw = None
+            if terms != {"sleep"}:
+                raw, code = self._read(batch.images)
             if terms & {"image", "curiosity"}:
                 rendered = self.world.render(code, batch.backgrounds)
             if "image" in terms:
@@ -100,10 +104,15 @@ class Trainer:
             # Asleep: render codes of one's own making, read them back.
             if "sleep" in terms:
                 seed = (self.config.seed, number)
-                dream = sleep_codes(self.world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
+                if raw is None:
+                    dream = self._to_device_code(self.world.sample(recipe.micro_batch_size, (*seed, _ASLEEP)))
+                else:
+                    dream = sleep_codes(self.world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
                 with torch.no_grad():
                     dreamt = self.world.disturb(self.world.render(dream, batch.backgrounds), seed)
-                losses["sleep"] = supervised_loss(self.world.layout, self._read(dreamt)[1], dream, self._groups)
+                losses["sleep"] = supervised_loss(
+                    self.world.layout, self._read(dreamt)[1], dream, self._groups, self.world.sleep_weights
+                )
 
             torch.stack([weights[name] * loss for name, loss in losses.items()]).sum().div(self._num_micro).backward()
 
@@ -156,8 +165,11 @@ class Trainer:
             batch,
             images=batch.images.to(device),
             backgrounds=None if batch.backgrounds is None else batch.backgrounds.to(device),
-            code=None if batch.code is None else {name: value.to(device) for name, value in batch.code.items()},
+            code=None if batch.code is None else self._to_device_code(batch.code),
         )
+
+    def _to_device_code(self, code: SceneCode) -> dict[str, Tensor]:
+        return {name: value.to(self.ranks.device) for name, value in code.items()}
 
     def _add_up_over_ranks(self, sums: Counter[str]) -> dict[str, float]:
         """Sum gradients and losses over all processes, average batch norm's running statistics."""

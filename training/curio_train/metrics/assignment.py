@@ -5,7 +5,7 @@ w = 1; objects are paired by the least sum of distances in position alone; a pre
 squared confidence, an object without a prediction costs 1. Every slot is a prediction, however low its confidence.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -77,7 +77,11 @@ def assign(layout: Layout, predicted: SceneCode, true: SceneCode, groups: Groups
 
 
 def scene_error(
-    layout: Layout, predicted: SceneCode, true: SceneCode, groups: Groups | None = None
+    layout: Layout,
+    predicted: SceneCode,
+    true: SceneCode,
+    groups: Groups | None = None,
+    weights: Mapping[str, float] | None = None,
 ) -> Float[Tensor, " batch"]:
     """Eq. 1 for each image, differentiable in the prediction; 0 where both scenes are the same.
 
@@ -86,13 +90,16 @@ def scene_error(
         predicted: The code to judge. Rotations count as rotations: the length of (i, j) or of a 6D rotation does not.
         true: The scene's own.
         groups: As in :func:`assign`.
+        weights: The equation's w by field name, 1 for fields not named; scores have none.
     """
+    weights = weights or {}
     pairs = assign(layout, predicted, true, groups)
     a, b = canonical(predicted), canonical(true)
     error = pairs.missing.sum(dim=1).to(a[TRANSLATION].dtype)
     error = error + (_confidence(layout, a).square() * pairs.surplus).sum(dim=1)
     for field in layout.fields:
-        of_a, of_b = field.relative(a[field.name]), field.relative(b[field.name])
+        weight = weights.get(field.name, 1.0)
+        of_a, of_b = (weight * field.relative(code[field.name]) for code in (a, b))
         if field.per_object:
             distance = (of_a[pairs.image, pairs.predicted] - of_b[pairs.image, pairs.true]).norm(dim=-1)
             error = error.index_add(0, pairs.image, distance)

@@ -115,6 +115,8 @@ class World(ABC):
     layout: Layout
     camera: Camera
     objects: tuple[ObjectKind, ...]
+    sleep_weights: Mapping[str, float] = {}
+    """Weights of Eq. 1 by field in the sleep loss; fields not named weigh 1."""
     mesh: "Mesh | None" = None
 
     @property

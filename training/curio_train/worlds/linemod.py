@@ -10,6 +10,7 @@ Constants fixed before any training:
 * light from the camera's half space, of strength 0.2 to 1.1 over an ambient radiance of 0.4.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,8 @@ class Linemod(World):
     """
 
     name = "linemod"
+    # Where the object is comes first: until it is found, what its light and rotation would teach is noise.
+    sleep_weights: Mapping[str, float] = {TRANSLATION: 4.0, ROTATION_6D: 0.4, LIGHT: 0.2}
 
     def __init__(self, options: LinemodOptions) -> None:
         """Read mesh, camera and symmetries.

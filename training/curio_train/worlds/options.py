@@ -49,7 +49,7 @@ class LinemodOptions(WorldOptions):
         backgrounds: Folder of photographs to see the object in front of; clutter is rendered where none is given.
     """
 
-    default_method: ClassVar[Method] = "wake_sleep"
+    default_method: ClassVar[Method] = "sleep"
     default_network: ClassVar[NetworkConfig] = NetworkConfig(reading="attention")
 
     class_name: Annotated[str, tyro.conf.arg(name="class")]
