@@ -66,9 +66,11 @@ def evaluate(
     """
     if num_images < 1:
         raise UsageError(f"--num-images is {num_images}, expected at least 1")
-    subject = load_subject(path, data)
     if bop_results is not None and data is None:
         raise UsageError("--bop-results needs the real frames that it is about: --data DIR")
+    subject = load_subject(path, data)
+    if data is not None and subject.world.mesh is None:
+        raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
     progress(f"{num_images} images of the {split} split")
     held_out = draw(subject.world, split, num_images, cache)
     result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images)}
@@ -76,7 +78,7 @@ def evaluate(
     result["metrics"] = score(subject.world, subject.predict, held_out)
     progress("the same network untrained")
     result["untrained"] = score(subject.world, subject.untrained(), held_out)
-    if data is not None and subject.world.mesh is not None:
+    if data is not None:
         progress(f"real frames in {data}")
         result["real"] = evaluate_real_frames(subject, data, bop_results)
     if (path / CONFIG_FILE).exists():
