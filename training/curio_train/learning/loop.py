@@ -28,6 +28,7 @@ from curio_train.worlds.base import Batch, ImageSource, World
 
 _SMOOTHING = 0.98  # of the image loss that convergence is judged by: a memory of about 50 steps
 _NUM_PAIRS = 8
+_NUM_REHEARSED = 32
 _ASLEEP = 1  # marks draws of sleep, so that they are not those of the data
 
 
@@ -130,6 +131,14 @@ class Trainer:
         means = self._add_up_over_ranks(sums)
         self._move(means, rate)
         return means
+
+    @torch.no_grad()
+    def rehearse(self) -> None:
+        """Do what takes most of a step's time, without a trace, so that it can be timed."""
+        side = self.world.camera.width
+        self.state.pose.network.eval()
+        self._read(torch.zeros(_NUM_REHEARSED, 3, side, side, device=self.ranks.device))
+        self.state.pose.network.train()
 
     @torch.no_grad()
     def pairs(self) -> tuple[Tensor, Tensor]:

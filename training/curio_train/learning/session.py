@@ -12,6 +12,7 @@ from curio_train.learning.parallel import ranks
 from curio_train.learning.progress import reporting
 from curio_train.learning.provenance import note_sitting
 from curio_train.learning.state import Course
+from curio_train.learning.threads import choose_threads
 from curio_train.worlds import build
 
 
@@ -53,6 +54,8 @@ def learn(
             run.write_config(new=not resume)
             note_sitting(path)
         trainer = Trainer(config, world, source, here)
+        if here.device.type == "cpu":
+            choose_threads(trainer.rehearse)
         if resume:
             run.restore(trainer.state)
         with reporting(path, trainer.state.course) if here.leads else nullcontext() as reporter:
