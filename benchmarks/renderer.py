@@ -2,7 +2,7 @@
 
     python benchmarks/renderer.py --json            the comparison: minutes
 
-Same poses, same samples a pixel, same run, taken in turns. Stock Mitsuba renders one image at a time (its scenes hold one
+Same poses, same samples a pixel, same run, in turns. Stock Mitsuba renders one image at a time (a scene holds one
 camera and one pose), moved through the mesh's vertices. Each renderer's gradient of a squared image error, at exactly
 the settings that are timed, is compared with central differences of its own converged rendering.
 """
@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
-from torch import Tensor
-
 from curio_train.data.meshes import Mesh
 from curio_train.data.shapes import sphere
 from curio_train.rendering.renderer import Renderer
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 SIDE = 128
 SAMPLES_PER_PIXEL = 4

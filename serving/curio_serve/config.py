@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from curio_serve.arguments import parse
 from curio_serve.errors import UsageError
 
 ENV_PREFIX = "CURIO_SERVE_"
@@ -125,7 +126,8 @@ def read_config(arguments: list[str], environment: Mapping[str, str]) -> ServeCo
 
 
 def _parse(arguments: list[str], default: ServeConfig, source: str = "") -> ServeConfig:
-    return tyro.cli(ServeConfig, args=arguments, default=default, prog=f"curio-serve {source}".strip())
+    config: ServeConfig = parse(ServeConfig, args=arguments, default=default, prog=f"curio-serve {source}".strip())
+    return config
 
 
 def _flag(name: str) -> str:

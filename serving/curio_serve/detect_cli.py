@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import tyro
 
+from curio_serve.arguments import parse
 from curio_serve.errors import CameraError, CurioError, UsageError
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ class DetectArguments:
 
 def main() -> NoReturn:
     """Entry point of the command."""
-    arguments = tyro.cli(DetectArguments, prog="curio-detect")
+    arguments: DetectArguments = parse(DetectArguments, prog="curio-detect")
     signal.signal(signal.SIGTERM, _terminate)
     try:
         status = run(arguments)
