@@ -317,7 +317,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object on the last line")
     parser.add_argument("--seconds", type=float, default=8.0, help="a renderer and round")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--outline-samples", type=int, default=256, help="points on each outline, of ours")
+    parser.add_argument("--outline-samples", type=int, default=512, help="points on each outline, of ours")
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # the little that torch does here must not spin beside the renderer's threads
     result = compare(arguments.seconds, arguments.rounds, arguments.outline_samples)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import onnx
 import pytest
@@ -276,3 +277,14 @@ def start_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[
 def server(start_server: Callable[..., RunningServer], models_dir: Path) -> RunningServer:
     """One server with the models of ``models_dir``, shared by the tests that leave it as it is."""
     return start_server(models_dir, "--metrics-port", "0")
+
+
+@pytest.fixture
+def frames(tmp_path: Path, spot_image: Callable[..., np.ndarray]) -> Path:
+    """Folder of six frames; the spot of frame n is at (100 + 20 n, 120)."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for number in range(6):
+        pixels = spot_image(320, 240, 100 + 20 * number, 120, 12, 12, (255, 128, 0))
+        cv2.imwrite(str(folder / f"{number:06d}.png"), pixels[..., ::-1])
+    return folder

@@ -1,0 +1,123 @@
+"""``curio-detect`` as a process: killed, stopped, left by its reader, and where training cannot be imported."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+def command(*arguments: str | Path) -> list[str]:
+    return [sys.executable, "-c", "from curio_serve.detect_cli import main; main()", *map(str, arguments)]
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+@pytest.fixture
+def many_frames(frames: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "many"
+    folder.mkdir()
+    for number in range(600):
+        os.link(frames / f"{number % 6:06d}.png", folder / f"{number:04d}.png")
+    return folder
+
+
+def wait_for_lines(out: Path, count: int, process: subprocess.Popen[str]) -> None:
+    while not out.exists() or out.read_bytes().count(b"\n") < count:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
+
+
+def without_times(out: Path) -> list[dict[str, Any]]:
+    lines = read(out)
+    for line in lines:
+        del line["milliseconds"]
+    return lines
+
+
+def test_killed_again_and_again_it_neither_repeats_nor_loses_a_line(
+    models_dir: Path, many_frames: Path, tmp_path: Path
+) -> None:
+    out, whole = tmp_path / "out.jsonl", tmp_path / "whole.jsonl"
+    for count in (1, 100, 250):
+        with subprocess.Popen(
+            command(models_dir / "flat", many_frames, "--out", out), stderr=subprocess.PIPE, text=True
+        ) as p:
+            wait_for_lines(out, count, p)
+            p.kill()
+        assert count <= out.read_bytes().count(b"\n") < 600
+    subprocess.run(command(models_dir / "flat", many_frames, "--out", out), check=True, capture_output=True)
+    assert detect(models_dir / "flat", many_frames, out=whole) == 0
+    assert len(without_times(out)) == 600
+    assert without_times(out) == without_times(whole)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_it_says_how_to_go_on(
+    number: int, status: int, models_dir: Path, many_frames: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.jsonl"
+    arguments = command(models_dir / "flat", many_frames, "--out", out)
+    with subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True) as process:
+        wait_for_lines(out, 20, process)
+        process.send_signal(number)
+        told = process.communicate()[1]
+    assert process.returncode == status
+    assert "Traceback" not in told
+    assert f"--out {out}" in told
+    assert out.read_bytes().endswith(b"\n")
+    subprocess.run(arguments, check=True, capture_output=True)
+    assert len(read(out)) == 600
+
+
+def test_a_reader_that_leaves_is_no_traceback(models_dir: Path, many_frames: Path) -> None:
+    with subprocess.Popen(
+        command(models_dir / "flat", many_frames), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.readline()
+        process.stdout.close()
+        told = process.stderr.read()
+    assert process.returncode == 1
+    assert told == ""
+
+
+def test_it_runs_where_the_training_stack_cannot_be_imported(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    for name in ("torch", "mitsuba", "drjit", "onnx", "trimesh", "curio_train"):
+        (tmp_path / f"{name}.py").write_text("raise ImportError(__name__)")
+    done = subprocess.run(
+        command(models_dir / "flat", frames),
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    assert len(done.stdout.splitlines()) == 6
+
+
+def test_help_imports_nothing_heavy() -> None:
+    program = "import sys, curio_serve.detect_cli; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"numpy", "cv2", "onnxruntime", "scipy", "grpc", "google.protobuf"} & set(loaded)
+
+
+def test_errors_are_one_clear_line_and_the_right_status(models_dir: Path, frames: Path) -> None:
+    for arguments, status in (
+        (["none", str(frames)], 2),
+        ([str(models_dir), str(frames)], 1),
+        ([str(models_dir / "flat"), str(frames), "--out", "/proc/none/out.jsonl"], 1),
+        ([str(models_dir / "flat"), str(frames), "--out", "/dev/full"], 1),
+    ):
+        done = subprocess.run(command(*arguments), capture_output=True, text=True)
+        assert done.returncode == status
+        assert done.stderr.startswith("curio-detect: error: ")
+        assert done.stderr.count("\n") == 1
+        assert done.stdout == ""
