@@ -1,42 +1,57 @@
-"""Layers to pixels: per ray sample, by depth, attenuated by confidence; with confidence 1 that is exact occlusion.
+"""Layers over each other: per ray sample, by depth, attenuated by confidence; with confidence 1 exact occlusion.
 
-Paper, section "Differentiable Rendering with Confidence".
+Paper, section "Differentiable Rendering with Confidence". A hit's weight is its confidence times what all nearer hits
+of the same sample let through, so the colour of a sample is ``background + Σ weight · (color − background)``: every hit
+can be added to the image by itself.
 """
 
 from types import ModuleType
 from typing import Any
 
-from curio_train.rendering.layers import Layer
+from curio_train.rendering.pixels import Place
+from curio_train.rendering.rows import Rows
 
 
-def composite(dr: ModuleType, layers: list[Layer], background: list[Any]) -> list[Any]:
-    """Colour of each sample, 3 arrays.
+class Occlusion:
+    """Depth of every slot at every sample that hits anything."""
 
-    A layer's weight is its alpha times what all nearer layers let through. Written without a sort, every layer asks
-    every other whether it is nearer (equal depths: the earlier slot), so the program does not depend on the data.
-    """
-    rgb = [0.0, 0.0, 0.0]
-    through = 1.0
-    for i, layer in enumerate(layers):
-        weight = layer.alpha
-        for j, other in enumerate(layers):
-            if i == j:
-                continue
-            nearer = other.depth_m <= layer.depth_m if j < i else other.depth_m < layer.depth_m
-            weight = weight * dr.select(nearer, 1 - other.alpha, 1)
-        rgb = [total + weight * value for total, value in zip(rgb, layer.rgb, strict=True)]
-        through = through * (1 - layer.alpha)
-    return [total + through * value for total, value in zip(rgb, background, strict=True)]
+    def __init__(self, mi: ModuleType, dr: ModuleType, num_slots: int, per_group: int) -> None:
+        """Prepare for samples in groups (pixels) of ``per_group``; only groups with a hit cost memory."""
+        self.mi, self.dr, self.num_slots, self.per_group = mi, dr, num_slots, per_group
+        self.table: Any = None
+        self.entry_of_group: Any = None
 
+    def build(self, place: Place, depth_m: Any, num_groups: int) -> None:
+        """Enter hits at their depths."""
+        mi, dr = self.mi, self.dr
+        group = place.sample // self.per_group
+        self.entry_of_group = dr.zeros(mi.UInt32, num_groups)
+        dr.scatter(self.entry_of_group, mi.UInt32(1), group)
+        used = dr.compress(self.entry_of_group > 0)
+        dr.scatter(self.entry_of_group, dr.arange(mi.UInt32, len(used)), used)
+        self.table = dr.full(mi.Float, dr.inf, len(used) * self.per_group * self.num_slots)
+        dr.scatter(self.table, depth_m, self._first_entry(place) + place.row % self.num_slots)
+        dr.eval(self.entry_of_group, self.table)
 
-def gather_layer(dr: ModuleType, layer: Layer, ray: Any, present: Any) -> Layer:
-    """One slot's layer for each sample: its ray's entry, or nothing where the slot has no ray there.
+    def weight(self, rows: Rows, place: Place, depth_m: Any) -> Any:
+        """What a hit contributes to its sample: its confidence times what the nearer hits let through.
 
-    Each ray belongs to one sample, so gradients are scattered without conflict.
-    """
+        Written without a sort: every slot is asked whether it is nearer (equal depths: the earlier slot), so the
+        program does not depend on the data.
+        """
+        weight = rows.confidence(place.row)
+        if self.num_slots == 1:
+            return weight
+        image = place.row // self.num_slots
+        own, first = place.row - image * self.num_slots, self._first_entry(place)
+        for slot in range(self.num_slots):
+            other = self.dr.gather(self.mi.Float, self.table, first + slot)
+            nearer = (other < depth_m) | ((other == depth_m) & (slot < own))
+            confidence = rows.confidence(image * self.num_slots + slot)
+            weight *= self.dr.select(nearer, 1 - confidence, 1)
+        return weight
 
-    def take(values: Any) -> Any:
-        return dr.gather(type(values), values, ray, active=present, mode=dr.ReduceMode.Permute)
-
-    depth = dr.select(present, dr.gather(type(layer.depth_m), layer.depth_m, ray, active=present), dr.inf)
-    return Layer(take(layer.alpha), depth, [take(c) for c in layer.rgb])
+    def _first_entry(self, place: Place) -> Any:
+        group = place.sample // self.per_group
+        entry = self.dr.gather(self.mi.UInt32, self.entry_of_group, group)
+        return (entry * self.per_group + place.sample - group * self.per_group) * self.num_slots

@@ -28,7 +28,8 @@ class EdgeTable:
         radius: float32 [clusters].
         axis: float32 [clusters, 3], of the cone that holds the cluster's normals.
         angle: float32 [clusters], its half-angle in radians; π where the cluster may never be passed over.
-        fold: float32 [clusters], 1 where its edges are folds: candidates unless both faces look away.
+        facing: float32 [clusters], how many faces of an edge must look at the camera: 1 or 2 at folds, where shading
+            jumps too; 0 for exactly one.
         first_cluster: int64 [kinds + 1], where each kind's clusters begin.
     """
 
@@ -40,7 +41,7 @@ class EdgeTable:
     radius: np.ndarray
     axis: np.ndarray
     angle: np.ndarray
-    fold: np.ndarray
+    facing: np.ndarray
     first_cluster: np.ndarray
 
 
@@ -48,20 +49,23 @@ def build_edges(meshes: Sequence[tuple[np.ndarray, Adjacency]]) -> EdgeTable:
     """The table of several meshes, each given as vertices [v, 3] in the scene frame and its adjacency."""
     edges, clusters, counts = [], [], []
     for vertices, mesh in meshes:
-        for fold, table in enumerate(_candidates(np.asarray(vertices, dtype=np.float64), mesh)):
+        for quorum, table in _candidates(np.asarray(vertices, dtype=np.float64), mesh).items():
             table = _pad(table[_spatial_order(table)])
             edges.append(table)
-            clusters.append((*_bound(table), np.full(len(table) // CLUSTER_SIZE, float(fold))))
-        counts.append(sum(len(table) for table in edges[-2:]) // CLUSTER_SIZE)
+            clusters.append((*_bound(table), np.full(len(table) // CLUSTER_SIZE, float(quorum))))
+        counts.append(sum(len(table) for table in edges[-3:]) // CLUSTER_SIZE)
     flat = np.concatenate(edges).astype(np.float32)
-    center, radius, axis, angle, fold = (np.concatenate(c).astype(np.float32) for c in zip(*clusters, strict=True))
+    center, radius, axis, angle, facing = (np.concatenate(c).astype(np.float32) for c in zip(*clusters, strict=True))
     start, end, normal_a, normal_b = (np.ascontiguousarray(flat[:, i]) for i in range(4))
     first = np.concatenate([[0], np.cumsum(counts)])
-    return EdgeTable(start, end, normal_a, normal_b, center, radius, axis, angle, fold, first)
+    return EdgeTable(start, end, normal_a, normal_b, center, radius, axis, angle, facing, first)
 
 
-def _candidates(vertices: np.ndarray, mesh: Adjacency) -> tuple[np.ndarray, np.ndarray]:
-    """[edges, 4, 3], both ends and both normals: of edges on smooth surface or border, and of folds."""
+def _candidates(vertices: np.ndarray, mesh: Adjacency) -> dict[int, np.ndarray]:
+    """Edges by the number of their faces that must look at the camera, [edges, 4, 3]: both ends and both normals.
+
+    0: exactly one face, or unknown: smooth surface and borders. 1: at least one: convex folds. 2: both: concave folds.
+    """
     paired = mesh.paired[:, None]
     # Without an inside nobody can say which side of a fold looks away: such folds are always candidates.
     known = paired & (mesh.closed | ~mesh.crease[:, None])
@@ -72,7 +76,14 @@ def _candidates(vertices: np.ndarray, mesh: Adjacency) -> tuple[np.ndarray, np.n
     ends = [vertices[corners[h]] for h in (mesh.first, mesh.first - mesh.first % 3 + (mesh.first + 1) % 3)]
     table = np.stack([*ends, normal_a, normal_b], axis=1)
     flat = mesh.paired & (mesh.cosine > 1 - 1e-12)
-    return table[~flat & ~mesh.crease], table[mesh.crease]
+    # Where a closed surface bends inwards, the face that looks away hides the edge from whoever could see it.
+    beyond = vertices[corners[mesh.second - mesh.second % 3 + (mesh.second + 2) % 3]] - ends[0]
+    concave = mesh.closed & (np.einsum("ed,ed->e", normal_a, beyond) > 0)
+    return {
+        0: table[~flat & ~mesh.crease & ~concave],
+        1: table[mesh.crease & ~concave],
+        2: table[mesh.crease & concave],
+    }
 
 
 def _signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
@@ -100,20 +111,17 @@ def _spatial_order(table: np.ndarray) -> np.ndarray:
 
 def _pad(table: np.ndarray) -> np.ndarray:
     """Fill the last cluster with copies of length zero, which are never sampled."""
-    missing = -len(table) % CLUSTER_SIZE
-    if len(table) == 0:
-        return np.zeros((CLUSTER_SIZE, 4, 3))
-    filler = np.repeat(table[-1:], missing, axis=0)
+    filler = np.repeat(table[-1:], -len(table) % CLUSTER_SIZE, axis=0)
     filler[:, 1] = filler[:, 0]
     return np.concatenate([table, filler])
 
 
 def _bound(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     groups = table.reshape(-1, CLUSTER_SIZE, 4, 3)
-    ends = groups[:, :, :2].reshape(len(groups), -1, 3)
+    ends = groups[:, :, :2].reshape(len(groups), 2 * CLUSTER_SIZE, 3)
     center = (ends.min(1) + ends.max(1)) / 2
     radius = np.linalg.norm(ends - center[:, None], axis=2).max(1)
-    normals = groups[:, :, 2:].reshape(len(groups), -1, 3)
+    normals = groups[:, :, 2:].reshape(len(groups), 2 * CLUSTER_SIZE, 3)
     mean = normals.sum(1)
     length = np.linalg.norm(mean, axis=1, keepdims=True)
     axis = np.divide(mean, length, out=np.zeros_like(mean), where=length > 1e-9)

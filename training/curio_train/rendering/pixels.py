@@ -1,98 +1,129 @@
-"""Which pixels can an object touch: projected bounding spheres and the lists of pixels to trace (numpy)."""
+"""Which pixels each row traces, in tiles of 2x2, and where in a pixel each of its samples lies."""
 
+import math
 from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
-MARGIN_PX = 1.0
+from curio_train.rendering.bounds import DIRECTIONS, ImageBounds
+
+TILE = 2  # with 4 samples a pixel, the 16 rays of a tile are one packet of neighbours
+TILE_AREA = TILE * TILE
 
 
 @dataclass(frozen=True)
-class PixelList:
-    """Pixels to trace, grouped by row (one row an image and slot), row after row.
+class Place:
+    """Points in images, with one entry a ray.
 
     Attributes:
-        row: uint32 [num_pixels], image · num_slots + slot.
-        x: float32 [num_pixels], column.
-        y: float32 [num_pixels], line.
-        index: uint32 [num_pixels], (image · height + y) · width + x.
+        row: Object and image.
+        pixel: (image · height + line) · width + column.
+        sample: Which of its image's samples this is; samples with equal numbers are the same point.
+        x, y: Position in pixels, centres at integers.
     """
 
-    row: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    index: np.ndarray
+    row: Any
+    pixel: Any
+    sample: Any
+    x: Any
+    y: Any
 
 
-def sphere_bounds(
-    centers_m: np.ndarray, radii_m: np.ndarray, intrinsics: np.ndarray, width: int, height: int
-) -> np.ndarray:
-    """Pixel rectangles that hold the projections of spheres.
+class PixelSamples:
+    """The rays of one part of a batch: (tile, pixel of the tile, sample of the pixel), the last running fastest."""
 
-    Args:
-        centers_m: [rows, 3], camera frame.
-        radii_m: [rows].
-        intrinsics: [rows, 4]: fx, fy, cx, cy in pixels, pixel centres at integers.
-        width: Of the image.
-        height: Of the image.
+    def __init__(
+        self,
+        mi: ModuleType,
+        dr: ModuleType,
+        bounds: ImageBounds,
+        num_slots: int,
+        size: tuple[int, int],
+        samples_per_pixel: int,
+        key: Any,
+    ) -> None:
+        """List the tiles.
 
-    Returns:
-        int64 [rows, 4]: x0, y0, x1, y1, the end exclusive; empty (x1 <= x0) for a sphere behind the camera or out of
-        frame, the whole image for a sphere around the camera.
-    """
-    x, y, z = centers_m.astype(np.float64).T
-    radii = radii_m.astype(np.float64)
-    in_front = z > radii * 1.001
-    bounds = np.empty((len(z), 4))
-    size = (width, height)
-    for axis, lateral in enumerate((x, y)):
-        # Tangents from the origin to a circle in the plane of this axis and z.
-        square = np.where(in_front, z**2 - radii**2, 1.0)
-        root = radii * np.sqrt(np.maximum(lateral**2 + square, 0.0))
-        focal, center = intrinsics[:, axis], intrinsics[:, 2 + axis]
-        low = focal * (lateral * z - root) / square + center
-        high = focal * (lateral * z + root) / square + center
-        bounds[:, axis] = np.where(in_front, np.clip(np.floor(low - MARGIN_PX), 0, size[axis]), 0)
-        bounds[:, 2 + axis] = np.where(in_front, np.clip(np.ceil(high + MARGIN_PX) + 1, 0, size[axis]), size[axis])
-    hopeless = ~np.isfinite(centers_m).all(1) | (z < -radii)
-    bounds[hopeless] = 0
-    return bounds.astype(np.int64)
+        Args:
+            mi: Mitsuba.
+            dr: Dr.Jit.
+            bounds: Of each row.
+            num_slots: Rows an image.
+            size: Width and height of the images.
+            samples_per_pixel: Rays a pixel and row.
+            key: UInt32, added to the pixel's number to draw the jitter: depends on seed and place in the batch alone.
+        """
+        self.mi, self.dr = mi, dr
+        self.num_slots, self.size, self.samples_per_pixel, self.key = num_slots, size, samples_per_pixel, key
+        self.tile_row, self.tile_corner = self._list_tiles(bounds)
 
+    def __len__(self) -> int:
+        return len(self.tile_row) * TILE_AREA * self.samples_per_pixel
 
-def list_pixels(
-    centers_m: np.ndarray, radii_m: np.ndarray, intrinsics: np.ndarray, num_slots: int, width: int, height: int
-) -> PixelList:
-    """All pixels that the bounding spheres can touch; arguments as in :func:`sphere_bounds`.
+    def _list_tiles(self, bounds: ImageBounds) -> tuple[Any, Any]:
+        """Row and corner (line · width + column) of each tile that the bounds touch."""
+        mi, dr = self.mi, self.dr
+        x0, y0, x1, y1 = bounds.rectangle.T
+        x0, y0 = x0 // TILE, y0 // TILE
+        across, down = -(-x1 // TILE) - x0, -(-y1 // TILE) - y0
+        counts = np.where((x1 > x0 * TILE) & (y1 > y0 * TILE), across * down, 0)
+        if counts.sum() == 0:
+            return mi.UInt32(), mi.UInt32()
+        row = mi.UInt32(np.repeat(np.arange(len(counts), dtype=np.uint32), counts))
+        start, x0, y0, across = (mi.UInt32(v.astype(np.uint32)) for v in (np.cumsum(counts) - counts, x0, y0, across))
+        local = dr.arange(mi.UInt32, len(row)) - dr.gather(mi.UInt32, start, row)
+        # Also the lanes beside the last one divide, and those gather zeros.
+        across = dr.maximum(dr.gather(mi.UInt32, across, row), 1)
+        line = local // across
+        column = (dr.gather(mi.UInt32, x0, row) + local - line * across) * TILE
+        line = (dr.gather(mi.UInt32, y0, row) + line) * TILE
+        kept = dr.compress(self._touched(bounds, row, column, line))
+        row, corner = (dr.gather(mi.UInt32, v, kept) for v in (row, line * self.size[0] + column))
+        dr.eval(row, corner)
+        return row, corner
 
-    ``num_slots`` is the number of rows an image.
-    """
-    bounds = sphere_bounds(centers_m, radii_m, intrinsics, width, height)
-    x0, y0, x1, y1 = bounds.T
-    widths, heights = np.maximum(x1 - x0, 0), np.maximum(y1 - y0, 0)
-    counts = widths * heights
-    row = np.repeat(np.arange(len(bounds), dtype=np.uint32), counts)
-    starts = np.repeat((np.cumsum(counts) - counts).astype(np.int32), counts)
-    local = np.arange(len(row), dtype=np.int32) - starts
-    row_width = np.maximum(widths, 1).astype(np.int32)[row]
-    line = local // row_width
-    x = (local - line * row_width).astype(np.float32) + x0.astype(np.float32)[row]
-    y = line.astype(np.float32) + y0.astype(np.float32)[row]
-    keep = _near_sphere(x, y, row, centers_m, radii_m, intrinsics)
-    row, x, y = row[keep], x[keep], y[keep]
-    image = row // np.uint32(num_slots)
-    index = (image * np.uint32(height) + y.astype(np.uint32)) * np.uint32(width) + x.astype(np.uint32)
-    return PixelList(row, x, y, index)
+    def _touched(self, bounds: ImageBounds, row: Any, column: Any, line: Any) -> Any:
+        """Whether the object's bounds, seen from each direction, overlap the tile."""
+        mi, dr = self.mi, self.dr
+        low, high = mi.Float(bounds.low.ravel()), mi.Float(bounds.high.ravel())
+        x, y = mi.Float(column) + (TILE - 1) / 2, mi.Float(line) + (TILE - 1) / 2
+        touched = mi.Bool(True)
+        for i, (a, b) in enumerate(DIRECTIONS):
+            middle, half = a * x + b * y, (abs(a) + abs(b)) * TILE / 2
+            at = row * len(DIRECTIONS) + i
+            touched &= dr.gather(mi.Float, low, at) <= middle + half
+            touched &= dr.gather(mi.Float, high, at) >= middle - half
+        return touched
 
+    def at(self, lane: Any) -> tuple[Place, Any]:
+        """Where a ray passes, and whether that is inside the image (sizes may be odd)."""
+        mi, dr, spp, (width, height) = self.mi, self.dr, self.samples_per_pixel, self.size
+        entry = lane // spp
+        tile = entry // TILE_AREA
+        within = entry - tile * TILE_AREA
+        row, corner = dr.gather(mi.UInt32, self.tile_row, tile), dr.gather(mi.UInt32, self.tile_corner, tile)
+        line = corner // width
+        column = corner - line * width + within % TILE
+        line += within // TILE
+        pixel = (row // self.num_slots * height + line) * width + column
+        dx, dy = self._jitter(pixel, lane - entry * spp)
+        place = Place(row, pixel, pixel * spp + lane - entry * spp, mi.Float(column) + dx, mi.Float(line) + dy)
+        return place, (column < width) & (line < height)
 
-def _near_sphere(
-    x: np.ndarray, y: np.ndarray, row: np.ndarray, centers_m: np.ndarray, radii_m: np.ndarray, intrinsics: np.ndarray
-) -> np.ndarray:
-    """Whether a pixel's ray passes within the sphere, widened by the margin: (d·c)² ≥ |d|² (|c|² − r²)."""
-    fx, fy, cx, cy = intrinsics.astype(np.float32).T
-    center = centers_m.astype(np.float32)
-    radius = (radii_m + MARGIN_PX * 1.5 * np.abs(centers_m[:, 2]) / np.minimum(fx, fy)).astype(np.float32)
-    power = np.nan_to_num((center**2).sum(1) - radius**2, nan=0.0, posinf=0.0)
-    dx = (x - cx[row]) / fx[row]
-    dy = (y - cy[row]) / fy[row]
-    along = dx * center[row, 0] + dy * center[row, 1] + center[row, 2]
-    return along * along >= (dx * dx + dy * dy + 1) * power[row]
+    def _jitter(self, pixel: Any, sample: Any) -> tuple[Any, Any]:
+        """Offset from the pixel's centre in [−0.5, 0.5), the same for all rows of an image.
+
+        With n² samples a pixel, each has its own cell of n x n, its own column of n² and its own row of n² (the
+        canonical arrangement of multi-jittered sampling, Chiu et al. 1994), rotated at random in each pixel.
+        """
+        mi, spp = self.mi, self.samples_per_pixel
+        n = math.isqrt(spp)
+        u, v = (mi.Float(bits) * 2.0**-32 for bits in mi.sample_tea_32(pixel + self.key, sample))
+        if n * n == spp:
+            across, down = (bits % n for bits in mi.sample_tea_32(pixel + self.key, mi.UInt32(spp)))
+            i, j = sample % n, sample // n
+            u = (mi.Float(i * n + (j + across) % n) + u) / spp
+            v = (mi.Float(j * n + (i + down) % n) + v) / spp
+        return u - 0.5, v - 0.5

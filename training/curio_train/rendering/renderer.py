@@ -1,6 +1,6 @@
 """Scene codes to images for torch: forward and backward of a whole batch, in a few launches."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,9 +10,11 @@ from torch import Tensor
 
 from curio_train.data.meshes import Mesh
 from curio_train.errors import RendererError
-from curio_train.rendering.layers import ROW_SIZE, LayerTracer, rows_from
-from curio_train.rendering.passes import Pass, Setting, View
-from curio_train.rendering.pixels import PixelList, list_pixels
+from curio_train.rendering.bounds import project_bounds
+from curio_train.rendering.launch import Setting, View
+from curio_train.rendering.layers import LayerTracer
+from curio_train.rendering.passes import Pass
+from curio_train.rendering.rows import ROW_SIZE
 from curio_train.rendering.scene import build_scene
 from curio_train.rendering.silhouettes import OutlineSampler
 from curio_train.rendering.variant import Variant, load_mitsuba
@@ -76,6 +78,7 @@ class Renderer:
         self._center = torch.tensor(np.array([p.center_m for p in placements]), dtype=torch.float32)
         self._radius = torch.tensor([p.radius_m for p in placements], dtype=torch.float32)
         self._offset = torch.tensor(np.array([p.offset for p in placements]), dtype=torch.float32)
+        self._corners_m = torch.tensor(np.array([p.corners_m for p in placements]), dtype=torch.float32)
 
     def __call__(
         self,
@@ -115,9 +118,9 @@ class Renderer:
                 f"of {setting.num_slots} slots and {setting.width}x{setting.height} pixels"
             )
         rows = self._pack(rotation, translation_m, light, color, confidence)
-        centers = torch.einsum("bnij,nj->bni", rotation, self._center) + translation_m
-        views = self._views(centers.detach().reshape(-1, 3).numpy(), _intrinsics(camera_matrix, batch))
-        return _Render.apply(rows, backgrounds, self, views, seed)
+        corners = self._corners_m @ rotation.detach().transpose(-1, -2) + translation_m.detach()[:, :, None]
+        views = self._views(corners.flatten(0, 1).numpy(), _intrinsics(camera_matrix, batch), seed)
+        return _Render.apply(rows, backgrounds, self.setting, views)
 
     def _pack(
         self, rotation: Tensor, translation_m: Tensor, light: Tensor, color: Tensor | None, confidence: Tensor | None
@@ -134,71 +137,55 @@ class Renderer:
         parts = [origin, matrix.flatten(2), light_in_object, albedo, confidence[..., None]]
         return torch.cat(parts, dim=-1).reshape(-1, ROW_SIZE)
 
-    def _views(self, centers_m: np.ndarray, intrinsics: np.ndarray) -> list[View]:
-        n, width, height = self.setting.num_slots, self.setting.width, self.setting.height
-        radii = np.tile(self._radius.numpy(), len(intrinsics))
+    def _views(self, corners_m: np.ndarray, intrinsics: np.ndarray, seed: int) -> list[View]:
+        setting, n = self.setting, self.setting.num_slots
         per_row = np.repeat(intrinsics, n, axis=0)
-        pixels = list_pixels(centers_m, radii, per_row, n, width, height)
-        image = pixels.row // np.uint32(n)
-        counts = np.bincount(image, minlength=len(intrinsics)) * self.setting.samples_per_pixel
+        bounds = project_bounds(corners_m, per_row, setting.width, setting.height)
+        camera = np.hstack([per_row, np.tile(self._offset.numpy(), (len(intrinsics), 1))])
+        key = setting.dr.opaque(setting.mi.UInt32, seed * 2654435761 & 0xFFFFFFFF)
+        num_rays = bounds.num_pixels.reshape(-1, n).sum(1) * setting.samples_per_pixel
         views, first = [], 0
         while first < len(intrinsics):
-            total = np.cumsum(counts[first:])
-            last = first + max(1, int(np.searchsorted(total, MAX_RAYS, side="right")))
-            low, high = np.searchsorted(image, [first, last])
-            part = PixelList(
-                pixels.row[low:high] - np.uint32(first * n),
-                pixels.x[low:high],
-                pixels.y[low:high],
-                pixels.index[low:high] - np.uint32(first * width * height),
-            )
-            views.append(View((first, last), part, per_row[first * n : last * n]))
+            last = first + max(1, int(np.searchsorted(np.cumsum(num_rays[first:]), MAX_RAYS, side="right")))
+            low, high = first * n, last * n
+            views.append(View((first, last), bounds.part(low, high), setting.mi.Float(camera[low:high].ravel()), key))
             first = last
         return views
 
 
 class _Render(torch.autograd.Function):
-    """The bridge between torch and Dr.Jit: whole arrays, once each way a view."""
+    """The bridge between torch and Dr.Jit: whole arrays, shared where both are on one device, once each way a view."""
 
     @staticmethod
-    def forward(
-        ctx: Any, rows: Tensor, backgrounds: Tensor, renderer: Renderer, views: list[View], seed: int
-    ) -> Tensor:
-        ctx.renderer = renderer
-        ctx.passes = [Pass(renderer.setting, view, seed) for view in views]
-        ctx.save_for_backward(rows, backgrounds)
-        images = torch.empty_like(backgrounds, dtype=torch.float32, memory_format=torch.contiguous_format)
-        with renderer.setting.dr.suspend_grad():
-            for part in ctx.passes:
-                low, high = part.view.images
-                image = part.image(
-                    rows_from(_columns(renderer, rows, part.view)), _flat(renderer, backgrounds[low:high])
-                )
-                images[low:high] = torch.from_numpy(image.numpy()).reshape(high - low, *backgrounds.shape[1:])
+    def forward(ctx: Any, rows: Tensor, backgrounds: Tensor, setting: Setting, views: list[View]) -> Tensor:
+        ctx.setting, ctx.passes = setting, [Pass(setting, view) for view in views]
+        parts = []
+        for part, (values, background) in zip(ctx.passes, _parts(ctx, rows, backgrounds), strict=True):
+            parts.append(_tensor(part.image(values, background), (-1, *backgrounds.shape[1:])))
+        images = torch.cat(parts) if len(parts) > 1 else parts[0]
+        ctx.save_for_backward(rows, backgrounds, images)
         return images
 
     @staticmethod
-    def backward(ctx: Any, adjoint: Tensor) -> tuple[Tensor, None, None, None, None]:
-        rows, backgrounds = ctx.saved_tensors
-        renderer = ctx.renderer
-        parts = []
-        for part in ctx.passes:
-            low, high = part.view.images
-            columns = _columns(renderer, rows, part.view)
-            parts.append(
-                part.gradient(columns, _flat(renderer, backgrounds[low:high]), _flat(renderer, adjoint[low:high]))
-            )
-        return torch.from_numpy(np.nan_to_num(np.concatenate(parts))).to(rows), None, None, None, None
+    def backward(ctx: Any, adjoint: Tensor) -> tuple[Tensor, None, None, None]:
+        rows, *images = ctx.saved_tensors
+        gradients = []
+        for part, arrays in zip(ctx.passes, _parts(ctx, rows, *images, adjoint), strict=True):
+            gradients.append(_tensor(part.gradient(*arrays), (-1, ROW_SIZE)))
+        return torch.cat(gradients).to(rows), None, None, None
 
 
-def _columns(renderer: Renderer, rows: Tensor, view: View) -> list[Any]:
-    low, high = (i * renderer.setting.num_slots for i in view.images)
-    values = rows[low:high].detach().float().cpu().numpy()
-    return [renderer.setting.mi.Float(np.ascontiguousarray(column)) for column in values.T]
+def _parts(ctx: Any, rows: Tensor, *images: Tensor) -> Iterator[list[Any]]:
+    """Each view's rows and images as flat Dr.Jit arrays."""
+    for part in ctx.passes:
+        first, last = part.view.images
+        n = ctx.setting.num_slots
+        tensors = [rows[first * n : last * n], *(image[first:last] for image in images)]
+        yield [ctx.setting.mi.Float(t.detach().float().cpu().contiguous().view(-1)) for t in tensors]
 
 
-def _flat(renderer: Renderer, images: Tensor) -> Any:
-    return renderer.setting.mi.Float(images.detach().float().contiguous().cpu().numpy().ravel())
+def _tensor(array: Any, shape: tuple[int, ...]) -> Tensor:
+    return torch.from_numpy(array.numpy()).view(shape)
 
 
 def _intrinsics(camera_matrix: np.ndarray, batch: int) -> np.ndarray:

@@ -13,19 +13,25 @@ import numpy as np
 
 from curio_train.data.meshes import Mesh
 from curio_train.errors import RendererError
+from curio_train.rendering.bounds import enclosing_polytope
 from curio_train.rendering.edges import EdgeTable, build_edges
 from curio_train.rendering.topology import Adjacency, adjacency, smooth_normals
 
 SPACING = 4.0
+NUM_CORNERS = 80  # simple polytopes of 42 sides have 2 · 42 − 4
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a kind of object lies in the static scene: ``scene = (object − center) / radius + offset``."""
+    """Where a kind of object lies in the static scene: ``scene = (object − center) / radius + offset``.
+
+    ``corners_m`` [n, 3] are those of a polytope around it, object frame, repeated to the same number for every kind.
+    """
 
     center_m: np.ndarray
     radius_m: float
     offset: np.ndarray
+    corners_m: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,8 @@ def place(meshes: Sequence[Mesh]) -> tuple[Placement, ...]:
         radius = float(np.linalg.norm(used - center, axis=1).max())
         if not np.isfinite(radius) or radius <= 0:
             raise RendererError(f"mesh {kind} has no extent (radius {radius}); it cannot be rendered")
-        placements.append(Placement(center, radius, np.array([SPACING * kind, 0.0, 0.0])))
+        corners = np.resize(enclosing_polytope((used - center) / radius), (NUM_CORNERS, 3)) * radius + center
+        placements.append(Placement(center, radius, np.array([SPACING * kind, 0.0, 0.0]), corners))
     return tuple(placements)
 
 
@@ -71,18 +78,36 @@ def build_scene(mitsuba: Any, meshes: Sequence[Mesh]) -> StaticScene:
         neighbours = adjacency(unit, mesh.faces)
         if len(neighbours.faces) == 0:
             raise RendererError(f"mesh {kind} has no face with an area; it cannot be rendered")
-        shapes[f"kind_{kind}"] = _shape(mitsuba, f"kind_{kind}", mesh, unit + placement.offset, neighbours)
+        shapes[f"kind_{kind}"] = mesh_shape(mitsuba, f"kind_{kind}", mesh, unit + placement.offset, neighbours)
         edges.append((unit + placement.offset, neighbours))
     scene = mitsuba.load_dict({"type": "scene", **shapes})
     return StaticScene(scene, placements, build_edges(edges))
 
 
-def _shape(mitsuba: Any, name: str, mesh: Mesh, vertices: np.ndarray, neighbours: Adjacency) -> Any:
+def mesh_shape(
+    mitsuba: Any,
+    name: str,
+    mesh: Mesh,
+    vertices: np.ndarray,
+    neighbours: Adjacency,
+    tint: np.ndarray | tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> Any:
+    """A ``mitsuba.Mesh`` with smooth normals between folds and a diffuse BSDF of the mesh's own colours.
+
+    Args:
+        mitsuba: The module.
+        name: Of the shape.
+        mesh: Faces and colours.
+        vertices: [v, 3], where the mesh's vertices stand in the scene.
+        neighbours: Its edges.
+        tint: Linear albedo that multiplies the mesh's own.
+    """
     source, faces, normals = smooth_normals(vertices, neighbours)
     uv = mesh.uv if mesh.texture is not None else None
     colors = mesh.vertex_colors_srgb if uv is None else None
     properties = mitsuba.Properties()
-    properties["bsdf"] = mitsuba.load_dict({"type": "diffuse", "reflectance": _reflectance(mitsuba, mesh)})
+    reflectance = _reflectance(mitsuba, mesh, np.asarray(tint, dtype=np.float32))
+    properties["bsdf"] = mitsuba.load_dict({"type": "diffuse", "reflectance": reflectance})
     shape = mitsuba.Mesh(
         name,
         vertex_count=len(source),
@@ -92,7 +117,7 @@ def _shape(mitsuba: Any, name: str, mesh: Mesh, vertices: np.ndarray, neighbours
         props=properties,
     )
     if colors is not None:
-        shape.add_attribute("vertex_color", 3, _flat(linear_from_srgb(colors[source])))
+        shape.add_attribute("vertex_color", 3, _flat(linear_from_srgb(colors[source]) * tint))
     parameters = mitsuba.traverse(shape)
     parameters["vertex_positions"] = _flat(vertices[source])
     parameters["faces"] = np.ascontiguousarray(faces, dtype=np.uint32).ravel()
@@ -104,13 +129,13 @@ def _shape(mitsuba: Any, name: str, mesh: Mesh, vertices: np.ndarray, neighbours
     return shape
 
 
-def _reflectance(mitsuba: Any, mesh: Mesh) -> dict[str, Any]:
+def _reflectance(mitsuba: Any, mesh: Mesh, tint: np.ndarray) -> dict[str, Any]:
     if mesh.texture is not None and mesh.uv is not None:
-        linear = mitsuba.Bitmap(np.ascontiguousarray(linear_from_srgb(mesh.texture.astype(np.float32) / 255)))
+        linear = mitsuba.Bitmap(np.ascontiguousarray(linear_from_srgb(mesh.texture.astype(np.float32) / 255) * tint))
         return {"type": "bitmap", "bitmap": linear, "raw": True}
     if mesh.vertex_colors_srgb is not None:
         return {"type": "mesh_attribute", "name": "vertex_color"}
-    return {"type": "rgb", "value": 1.0}
+    return {"type": "rgb", "value": [float(v) for v in tint]}
 
 
 def _flat(values: np.ndarray) -> np.ndarray:

@@ -1,36 +1,70 @@
 """The visibility term: moving outlines, by edge sampling (Li et al. 2018), the whole batch in a few launches.
 
-∂I/∂θ at an outline is the jump of colour across it times the speed with which it moves along its normal. Silhouette
-edges are found in scene space (two dot products an edge), sampled in proportion to their projected length, and the
-image is composited a little to either side. A jump hidden behind another surface is no jump: occlusion, also by the
-object itself, needs no further care.
+∂I/∂θ at an outline is the jump of colour across it times the speed with which it moves along its normal. The image is
+composited a little to either side (passes.py): a jump hidden behind another surface is no jump, so occlusion, also by
+the object itself, needs no further care.
+
+Most edges at which a detailed mesh turns away from the camera are hidden or jump by next to nothing. So edges are cut
+into pieces of a pixel or two, and pieces are sampled in proportion to their length and to what the rendered image and
+the adjoint around them promise; the weights undo the preference.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-
-from curio_train.rendering.edges import CLUSTER_SIZE, EdgeTable
-from curio_train.rendering.layers import Rows
+from curio_train.rendering.bounds import NEAR_M
+from curio_train.rendering.edge_search import EdgeSearch
+from curio_train.rendering.edges import EdgeTable
+from curio_train.rendering.rows import Rows
 
 OFFSET_PX = 0.001
-NEAR_M = 1e-3
+"""How far beside an outline the image is looked at; with more, outlines that fold back are counted twice."""
+
+PIECE_PX = 2.0
+MAX_PIECES = 256  # of one edge: next to the camera an edge can be endless
+_SEARCH_END = 1 << 25  # fixed, so that the number of steps and with it the program does not depend on the data
+
+Promise = Callable[["Pieces"], Any]
+"""How much colour, weighed by the adjoint, may jump at pieces of outlines; zero only where it cannot."""
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Short pieces of outlines, rows ascending.
+
+    Attributes:
+        row: Which object in which image.
+        edge: Of the table.
+        start: Where the piece begins, as a share of the edge's projection.
+        share: Its length, likewise.
+        length: In pixels.
+        x, y: Position of its middle, pixels, centres at integers.
+        tangent_x, tangent_y: Unit vector along it.
+    """
+
+    row: Any
+    edge: Any
+    start: Any
+    share: Any
+    length: Any
+    x: Any
+    y: Any
+    tangent_x: Any
+    tangent_y: Any
 
 
 @dataclass(frozen=True)
 class OutlineSamples:
-    """Points on outlines, ``num_samples`` a row, row after row.
+    """Points on outlines, the same number a row, row after row.
 
     Attributes:
         row: Which object in which image.
-        x, y: Position in pixels (K's convention: centres at integers).
+        x, y: Position in pixels, centres at integers.
         normal_x, normal_y: Unit normal of the outline in the image.
         weight: Length of outline that the sample stands for, pixels; 0 where the row has no outline.
         scene_point: The point on the edge, scene frame.
-        camera_point: The same in the camera frame, metres.
     """
 
     row: Any
@@ -40,7 +74,6 @@ class OutlineSamples:
     normal_y: Any
     weight: Any
     scene_point: Any
-    camera_point: Any
 
 
 class OutlineSampler:
@@ -48,144 +81,106 @@ class OutlineSampler:
 
     def __init__(self, mi: ModuleType, dr: ModuleType, edges: EdgeTable, kind_of_slot: Sequence[int]) -> None:
         self.mi, self.dr = mi, dr
-        self.edges = {
-            name: mi.Float(np.ascontiguousarray(getattr(edges, name)).ravel())
-            for name in ("start", "end", "normal_a", "normal_b", "center", "radius", "axis", "angle", "fold")
-        }
-        pairs = [
-            (slot, c)
-            for slot, k in enumerate(kind_of_slot)
-            for c in range(edges.first_cluster[k], edges.first_cluster[k + 1])
-        ]
-        self.slot_of_pair = mi.UInt32(np.array([p[0] for p in pairs], dtype=np.uint32))
-        self.cluster_of_pair = mi.UInt32(np.array([p[1] for p in pairs], dtype=np.uint32))
-        self.num_pairs, self.num_slots = len(pairs), len(kind_of_slot)
+        self.search = EdgeSearch(mi, dr, edges, kind_of_slot)
 
-    def sample(self, rows: Rows, intrinsics: list[Any], jitter: np.ndarray) -> OutlineSamples | None:
-        """Sample outlines in proportion to their length, stratified; None where no row has any.
+    def sample(self, rows: Rows, num_rows: int, num_samples: int, key: Any, promise: Promise) -> OutlineSamples | None:
+        """Sample outlines by length and promise, evenly spaced in each row; None where no row has any.
 
         Args:
             rows: All rows, detached.
-            intrinsics: fx, fy, cx, cy, one entry a row.
-            jitter: float [rows, samples a row] in [0, 1).
+            num_rows: Their number.
+            num_samples: Points a row.
+            key: UInt32, added to the row's number to draw the offset of its points.
+            promise: See :data:`Promise`.
         """
         mi, dr = self.mi, self.dr
-        num_rows, num_samples = jitter.shape
-        row, edge = self._silhouette_edges(rows, num_rows)
+        row, edge = self.search.find(rows, num_rows)
         if len(row) == 0:
             return None
-        ends = [self._to_camera(rows, row, self._point(name, edge)) for name in ("start", "end")]
-        length = self._projected_length(ends, [dr.gather(mi.Float, v, row) for v in intrinsics]).numpy()
-        # The sums over a batch's edges are few; they are taken on the host, in double precision.
-        total = np.cumsum(length, dtype=np.float64)
-        border = np.searchsorted(row.numpy(), np.arange(num_rows + 1))
-        before = np.r_[0.0, total][border]
-        row_length = np.diff(before)
-        target = before[:-1, None] + (np.arange(num_samples) + jitter) / num_samples * row_length[:, None]
-        found = np.minimum(np.searchsorted(total, target.ravel(), side="right"), len(total) - 1)
-        fraction = 1 - (total[found] - target.ravel()) / np.maximum(length[found], 1e-12)
-        weight = np.repeat(row_length / num_samples, num_samples)
-        return self._at(
-            rows,
-            mi.UInt32(np.repeat(np.arange(num_rows, dtype=np.uint32), num_samples)),
-            mi.UInt32(edge.numpy()[found]),
-            mi.Float(np.clip(fraction, 0, 1).astype(np.float32)),
-            intrinsics,
-            mi.Float(weight.astype(np.float32)),
-        )
+        pieces = self._cut(rows, row, edge)
+        density = promise(pieces)
+        # In double precision: these are sums over all outlines of a batch.
+        total = dr.cumsum(mi.Float64(density * pieces.length))
+        border = self._first_of_rows(pieces.row, num_rows)
+        lane = dr.arange(mi.UInt32, num_rows * num_samples)
+        row = lane // num_samples
+        first, end = (dr.gather(mi.UInt32, border, row + i) for i in range(2))
+        before, after = self._until(total, first), self._until(total, end)
+        jitter = mi.Float64(mi.sample_tea_32(row + key, mi.UInt32(0x9E3779B9))[0]) * 2.0**-32
+        spacing = (after - before) / num_samples
+        target = before + (mi.Float64(lane - row * num_samples) + jitter) * spacing
+        found = self._count_below(lambda i: dr.gather(mi.Float64, total, i) <= target, len(total))
+        found = dr.clip(found, first, dr.maximum(end, first + 1) - 1)
+        lower, upper = self._until(total, found), self._until(total, found + 1)
+        within = mi.Float(dr.clip((target - lower) / dr.maximum(upper - lower, 1e-30), 0, 1))
+        weight = mi.Float(spacing) / dr.gather(mi.Float, density, found)
+        points = self._at(rows, pieces, row, found, within, dr.select(spacing > 0, weight, 0))
+        dr.eval(points.__dict__)
+        return points
 
-    def _silhouette_edges(self, rows: Rows, num_rows: int) -> tuple[Any, Any]:
-        """(row, edge) of every silhouette edge, rows ascending."""
+    def _cut(self, rows: Rows, row: Any, edge: Any) -> Pieces:
+        """Cut edges, so that what is known of a piece's middle holds for all of it."""
         mi, dr = self.mi, self.dr
-        num_images = num_rows // self.num_slots
-        lane = dr.arange(mi.UInt32, num_images * self.num_pairs)
-        image = lane // self.num_pairs
-        pair = lane - image * self.num_pairs
-        row = image * self.num_slots + dr.gather(mi.UInt32, self.slot_of_pair, pair)
-        cluster = dr.gather(mi.UInt32, self.cluster_of_pair, pair)
-        kept = dr.compress(self._may_have_outline(rows, row, cluster))
-        row, cluster = dr.gather(mi.UInt32, row, kept), dr.gather(mi.UInt32, cluster, kept)
-        if len(row) == 0:
-            return row, cluster
-        dr.eval(row, cluster)
-        lane = dr.arange(mi.UInt32, len(row) * CLUSTER_SIZE)
-        source = lane // CLUSTER_SIZE
-        row = dr.gather(mi.UInt32, row, source)
-        edge = dr.gather(mi.UInt32, cluster, source) * CLUSTER_SIZE + (lane & (CLUSTER_SIZE - 1))
-        kept = dr.compress(self._is_outline(rows, row, edge))
-        row, edge = dr.gather(mi.UInt32, row, kept), dr.gather(mi.UInt32, edge, kept)
-        dr.eval(row, edge)
-        return row, edge
-
-    def _may_have_outline(self, rows: Rows, row: Any, cluster: Any) -> Any:
-        """False only where every face of the cluster surely looks to the same side of the camera."""
-        mi, dr = self.mi, self.dr
-        to_camera = self._origin(rows, row) - self._point("center", cluster)
-        distance = dr.norm(to_camera)
-        radius = dr.gather(mi.Float, self.edges["radius"], cluster)
-        cosine = dr.dot(to_camera, self._point("axis", cluster)) / dr.maximum(distance, 1e-12)
-        between = dr.acos(dr.clip(cosine, -1, 1))
-        spread = dr.gather(mi.Float, self.edges["angle"], cluster) + dr.asin(
-            dr.clip(radius / dr.maximum(distance, 1e-12), 0, 1)
-        )
-        beyond = between - dr.pi / 2
-        fold = dr.gather(mi.Float, self.edges["fold"], cluster) > 0
-        return dr.select(fold, beyond, dr.abs(beyond)) <= spread
-
-    def _is_outline(self, rows: Rows, row: Any, edge: Any) -> Any:
-        """Both sides of the camera, an open border, or a fold with a face towards the camera."""
-        dr = self.dr
-        to_camera = self._origin(rows, row) - self._point("start", edge)
-        a, b = self._point("normal_a", edge), self._point("normal_b", edge)
-        towards_a, towards_b = dr.dot(a, to_camera), dr.dot(b, to_camera)
-        fold = dr.gather(self.mi.Float, self.edges["fold"], edge // CLUSTER_SIZE) > 0
-        return (towards_a * towards_b <= 0) | (fold & (towards_a > 0))
-
-    def _projected_length(self, ends: list[Any], intrinsics: list[Any]) -> Any:
-        dr = self.dr
+        ends = [rows.to_camera(row, p) for p in self.search.ends(edge)]
         visible = (ends[0].z > NEAR_M) & (ends[1].z > NEAR_M)
-        pixels = [self._project(p, intrinsics) for p in ends]
-        length = dr.hypot(pixels[1][0] - pixels[0][0], pixels[1][1] - pixels[0][1])
-        return dr.select(visible & dr.isfinite(length), length, 0)
+        (xa, ya), (xb, yb) = (rows.project(row, p) for p in ends)
+        length = dr.hypot(xb - xa, yb - ya)
+        length = dr.select(visible & dr.isfinite(length), length, 0)
+        count = mi.UInt32(dr.clip(dr.ceil(length / PIECE_PX), 1, MAX_PIECES))
+        dr.eval(row, edge, xa, ya, xb, yb, length, count)
+        after = dr.cumsum(count)
+        owner = dr.zeros(mi.UInt32, int(after[-1]))
+        dr.scatter(owner, dr.arange(mi.UInt32, len(count)), after - count)
+        owner = dr.prefix_reduce(dr.ReduceOp.Max, owner, exclusive=False)
+        row, edge, xa, ya, xb, yb, length, count, after = (
+            dr.gather(type(v), v, owner) for v in (row, edge, xa, ya, xb, yb, length, count, after)
+        )
+        share = 1 / mi.Float(count)
+        start = (mi.Float(dr.arange(mi.UInt32, dr.width(owner)) + count) - mi.Float(after)) * share
+        middle, inverse = start + share / 2, 1 / dr.maximum(length, 1e-9)
+        pieces = Pieces(
+            row,
+            edge,
+            start,
+            share,
+            length * share,
+            dr.lerp(xa, xb, middle),
+            dr.lerp(ya, yb, middle),
+            (xb - xa) * inverse,
+            (yb - ya) * inverse,
+        )
+        dr.eval(pieces.__dict__)
+        return pieces
 
-    def _at(self, rows: Rows, row: Any, edge: Any, fraction: Any, intrinsics: list[Any], weight: Any) -> OutlineSamples:
+    def _until(self, total: Any, index: Any) -> Any:
+        """Sum of all entries before ``index``, from the inclusive prefix sum ``total``."""
+        dr = self.dr
+        return dr.select(index > 0, dr.gather(self.mi.Float64, total, index - 1, index > 0), 0)
+
+    def _count_below(self, below: Any, count: int) -> Any:
+        """How many entries of an ascending array of ``count`` satisfy ``below(index)``."""
+        dr, size = self.dr, self.dr.opaque(self.mi.UInt32, count)
+        return self.mi.UInt32(dr.binary_search(0, _SEARCH_END, lambda i: (i < size) & below(dr.minimum(i, size - 1))))
+
+    def _first_of_rows(self, row: Any, num_rows: int) -> Any:
+        """UInt32 [num_rows + 1], where each row begins in the ascending ``row``."""
         mi, dr = self.mi, self.dr
-        camera = [dr.gather(mi.Float, v, row) for v in intrinsics]
-        ends = [self._point(name, edge) for name in ("start", "end")]
-        in_camera = [self._to_camera(rows, row, p) for p in ends]
-        (xa, ya), (xb, yb) = (self._project(p, camera) for p in in_camera)
-        length = dr.maximum(dr.hypot(xb - xa, yb - ya), 1e-9)
-        x, y = dr.lerp(xa, xb, fraction), dr.lerp(ya, yb, fraction)
+        wanted = dr.arange(mi.UInt32, num_rows + 1)
+        first = self._count_below(lambda i: dr.gather(mi.UInt32, row, i) < wanted, len(row))
+        dr.eval(first)
+        return first
+
+    def _at(self, rows: Rows, pieces: Pieces, row: Any, piece: Any, within: Any, weight: Any) -> OutlineSamples:
+        mi, dr = self.mi, self.dr
+        start, share, tangent_x, tangent_y = (
+            dr.gather(mi.Float, v, piece) for v in (pieces.start, pieces.share, pieces.tangent_x, pieces.tangent_y)
+        )
+        ends = self.search.ends(dr.gather(mi.UInt32, pieces.edge, piece))
+        in_camera = [rows.to_camera(row, p) for p in ends]
+        (xa, ya), (xb, yb) = (rows.project(row, p) for p in in_camera)
+        fraction = dr.fma(within, share, start)
         # Uniform along the projection is not uniform along the edge: undo the perspective.
         za, zb = in_camera[0].z, in_camera[1].z
         along = fraction * za / dr.maximum(dr.lerp(zb, za, fraction), 1e-9)
-        scene_point = dr.lerp(ends[0], ends[1], along)
-        return OutlineSamples(
-            row,
-            x,
-            y,
-            (ya - yb) / length,
-            (xb - xa) / length,
-            weight,
-            scene_point,
-            dr.lerp(in_camera[0], in_camera[1], along),
-        )
-
-    def _to_camera(self, rows: Rows, row: Any, point: Any) -> Any:
-        """Scene to camera frame: p = matrix · q + origin with matrix = Rᵀ / s, hence q = s² matrixᵀ (p − origin)."""
-        mi, dr = self.mi, self.dr
-        m = [dr.gather(mi.Float, v, row) for v in rows.matrix]
-        d = point - self._origin(rows, row)
-        scale = 1 / (dr.square(m[0]) + dr.square(m[1]) + dr.square(m[2]))
-        return scale * mi.Vector3f(*[m[i] * d.x + m[3 + i] * d.y + m[6 + i] * d.z for i in range(3)])
-
-    def _origin(self, rows: Rows, row: Any) -> Any:
-        return self.mi.Point3f(*[self.dr.gather(self.mi.Float, v, row) for v in rows.origin])
-
-    def _point(self, name: str, index: Any) -> Any:
-        return self.mi.Vector3f(*[self.dr.gather(self.mi.Float, self.edges[name], index * 3 + i) for i in range(3)])
-
-    @staticmethod
-    def _project(point: Any, intrinsics: list[Any]) -> tuple[Any, Any]:
-        fx, fy, cx, cy = intrinsics
-        return fx * point.x / point.z + cx, fy * point.y / point.z + cy
+        x, y = dr.lerp(xa, xb, fraction), dr.lerp(ya, yb, fraction)
+        return OutlineSamples(row, x, y, -tangent_y, tangent_x, weight, dr.lerp(ends[0], ends[1], along))

@@ -103,5 +103,10 @@ def load_mitsuba(variant: Variant = "llvm_ad_rgb") -> ModuleType:
         os.environ["DRJIT_LIBLLVM_PATH"] = check_llvm()
     import mitsuba
 
+    if mitsuba.variant() not in (None, variant):
+        raise RendererError(
+            f"Mitsuba already runs as {mitsuba.variant()} in this process and cannot also run as {variant}: render with "
+            "one variant a process."
+        )
     mitsuba.set_variant(variant)
     return mitsuba
