@@ -44,9 +44,9 @@ $(READY): pyproject.toml
 demo: $(READY)
 	@$(BIN)/python benchmarks/demo.py
 
-# Two threads: the tests train tiny networks, which more threads make slower.
+# One thread: the tests train tiny networks beside the renderer's own threads, which waiting threads would only slow down.
 test: $(READY)
-	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-2} $(BIN)/pytest
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest
 
 check: $(READY)
 	@$(BIN)/ruff check .
