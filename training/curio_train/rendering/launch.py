@@ -95,7 +95,7 @@ class Launch:
         if len(lane) == 0:
             return None
         place, inside = at(lane)
-        record = tracer.intersect(tracer.ray(rows, place.row, place.x, place.y), inside)
+        record = tracer.intersect(rows, place.row, tracer.ray(rows, place.row, place.x, place.y), inside)
         dr.eval(record)
         hit = dr.compress(record.is_valid())
         if len(hit) == 0:

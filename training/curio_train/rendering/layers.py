@@ -3,7 +3,11 @@
 from types import ModuleType
 from typing import Any
 
+from curio_train.rendering.bounds import NEAR_M
 from curio_train.rendering.rows import Rows
+
+SPHERE = 1.001
+"""Radius of the objects' bounding spheres in the static scene, with room for rounding."""
 
 
 class LayerTracer:
@@ -17,17 +21,30 @@ class LayerTracer:
         """Rays of the given rows through pixels (x, y), scene frame; the ray parameter is the depth in metres."""
         return self.mi.Ray3f(rows.origin(row), rows.turned(row, rows.direction(row, x, y)))
 
-    def near(self, rows: Rows, row: Any, x: Any, y: Any) -> Any:
-        """Whether the rays through pixels (x, y) pass the rows' bounding spheres."""
+    def near(self, rows: Rows, row: Any, ray: Any) -> Any:
+        """Whether rays pass the rows' bounding spheres."""
         dr = self.dr
-        arm = rows.sphere_center(row) - rows.origin(row)
-        along = rows.turned(row, rows.direction(row, x, y))
-        return dr.squared_norm(arm) - dr.square(dr.dot(arm, along)) / dr.squared_norm(along) <= 1.0001
+        arm = rows.sphere_center(row) - ray.o
+        return dr.squared_norm(arm) - dr.square(dr.dot(arm, ray.d)) / dr.squared_norm(ray.d) <= SPHERE * SPHERE
 
-    def intersect(self, ray: Any, active: Any) -> Any:
-        """The detached preliminary intersection: which face, where on it."""
-        with self.dr.suspend_grad():
-            return self.scene.ray_intersect_preliminary(self.dr.detach(ray), coherent=True, active=active)
+    def intersect(self, rows: Rows, row: Any, ray: Any, active: Any) -> Any:
+        """The detached preliminary intersection with the row's own object: which face, where on it, at which depth.
+
+        Only the part of the ray within the object's bounding sphere is traced. The other objects of the static scene
+        are then out of reach, and float32 is spent on the object instead of on the way there.
+        """
+        dr = self.dr
+        with dr.suspend_grad():
+            origin, direction = dr.detach(ray.o), dr.detach(ray.d)
+            inverse = dr.rcp(dr.squared_norm(direction))
+            middle = dr.dot(rows.sphere_center(row) - origin, direction) * inverse
+            reach = SPHERE * dr.sqrt(inverse)
+            start = dr.maximum(middle - reach, NEAR_M)
+            part = self.mi.Ray3f(dr.fma(direction, start, origin), direction)
+            part.maxt = middle + reach - start
+            hit = self.scene.ray_intersect_preliminary(part, coherent=True, active=active & (part.maxt > 0))
+            hit.t += start
+            return hit
 
     def shade(self, rows: Rows, row: Any, ray: Any, hit: Any) -> list[Any]:
         """Colour of hits in sRGB, 3 arrays: albedo · (ambient + max(0, n·l)), encoded."""

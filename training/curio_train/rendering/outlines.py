@@ -66,7 +66,9 @@ class Outlines(Launch):
 
         if self.set.num_slots > 1:
             place, inside = at(lane)
-            lane = dr.compress(inside & self.set.tracer.near(rows, place.row, place.x, place.y))
+            lane = dr.compress(
+                inside & self.set.tracer.near(rows, place.row, self.set.tracer.ray(rows, place.row, place.x, place.y))
+            )
         hits = self.trace(rows, lane, at, 1, num_points * 2)
         jump = dr.zeros(mi.Float, num_points)
         if hits:

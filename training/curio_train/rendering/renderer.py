@@ -39,7 +39,7 @@ class Renderer:
         *,
         ambient: float,
         samples_per_pixel: int = 4,
-        outline_samples: int = 256,
+        outline_samples: int = 512,
         variant: Variant = "llvm_ad_rgb",
     ) -> None:
         """Build the static scene.

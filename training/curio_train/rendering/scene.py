@@ -17,7 +17,7 @@ from curio_train.rendering.bounds import enclosing_polytope
 from curio_train.rendering.edges import EdgeTable, build_edges
 from curio_train.rendering.topology import Adjacency, adjacency, smooth_normals
 
-SPACING = 4.0
+SPACING = 4.0  # of bounding spheres of radius 1
 NUM_CORNERS = 80  # simple polytopes of 42 sides have 2 · 42 − 4
 
 

@@ -105,8 +105,8 @@ def load_mitsuba(variant: Variant = "llvm_ad_rgb") -> ModuleType:
 
     if mitsuba.variant() not in (None, variant):
         raise RendererError(
-            f"Mitsuba already runs as {mitsuba.variant()} in this process and cannot also run as {variant}: render with "
-            "one variant a process."
+            f"Mitsuba already runs as {mitsuba.variant()} in this process and cannot also run as {variant}: render "
+            "with one variant a process."
         )
     mitsuba.set_variant(variant)
     return mitsuba
