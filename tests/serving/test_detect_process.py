@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+NUM_MANY = 3000  # enough that no machine is done before it is stopped
+
 
 def command(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-c", "from curio_serve.detect_cli import main; main()", *map(str, arguments)]
@@ -24,7 +26,7 @@ def read(path: Path) -> list[dict[str, Any]]:
 def many_frames(frames: Path, tmp_path: Path) -> Path:
     folder = tmp_path / "many"
     folder.mkdir()
-    for number in range(600):
+    for number in range(NUM_MANY):
         os.link(frames / f"{number % 6:06d}.png", folder / f"{number:04d}.png")
     return folder
 
@@ -52,10 +54,10 @@ def test_killed_again_and_again_it_neither_repeats_nor_loses_a_line(
         ) as p:
             wait_for_lines(out, count, p)
             p.kill()
-        assert count <= out.read_bytes().count(b"\n") < 600
+        assert count <= out.read_bytes().count(b"\n") < NUM_MANY
     subprocess.run(command(models_dir / "flat", many_frames, "--out", out), check=True, capture_output=True)
     subprocess.run(command(models_dir / "flat", many_frames, "--out", whole), check=True, capture_output=True)
-    assert len(without_times(out)) == 600
+    assert len(without_times(out)) == NUM_MANY
     assert without_times(out) == without_times(whole)
 
 
@@ -74,7 +76,7 @@ def test_stopped_it_says_how_to_go_on(
     assert f"--out {out}" in told
     assert out.read_bytes().endswith(b"\n")
     subprocess.run(arguments, check=True, capture_output=True)
-    assert len(read(out)) == 600
+    assert len(read(out)) == NUM_MANY
 
 
 def test_a_reader_that_leaves_is_no_traceback(models_dir: Path, many_frames: Path) -> None:

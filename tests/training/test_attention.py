@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 import torch
-
 from curio_train.config import NetworkConfig
 from curio_train.networks.attention import LATENT, AttentionEncoder
 from curio_train.networks.pose import PoseNetwork

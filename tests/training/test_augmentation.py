@@ -1,6 +1,5 @@
 import numpy as np
 import torch
-
 from curio_train.data.augmentation import disturb
 
 
