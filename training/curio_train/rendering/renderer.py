@@ -60,9 +60,9 @@ class Renderer:
         import drjit
 
         mitsuba = load_mitsuba(variant)
+        static = build_scene(mitsuba, meshes)
         if not kind_of_slot or not all(0 <= k < len(meshes) for k in kind_of_slot):
             raise RendererError(f"kind_of_slot is {list(kind_of_slot)}; every slot needs one of {len(meshes)} meshes")
-        static = build_scene(mitsuba, meshes)
         self.setting = Setting(
             mitsuba,
             drjit,

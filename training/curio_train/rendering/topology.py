@@ -68,26 +68,46 @@ def adjacency(vertices: np.ndarray, faces: np.ndarray) -> Adjacency:
 def smooth_normals(vertices: np.ndarray, mesh: Adjacency) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Split vertices at folds and give each piece the angle-weighted mean normal of its faces.
 
+    Where neighbours are wound against each other, each face sees the mean from its own side.
+
     Returns:
         source: int [v'], the original vertex of each new one; faces: int [f, 3]; normals: [v', 3], unit length.
     """
-    num_corners = mesh.faces.size
+    piece = _smooth_pieces(mesh)
+    weighted = mesh.face_normals.repeat(3, axis=0) * _corner_angles(vertices, mesh.faces).reshape(-1, 1)
+    if len(piece) > len(weighted):
+        weighted = np.concatenate([weighted, -weighted])
+    sums = np.stack([np.bincount(piece, weights=weighted[:, i]) for i in range(3)], axis=1)
+    pair = np.stack([piece[: mesh.faces.size], mesh.faces.ravel()], axis=1)
+    unique, first, corner = np.unique(pair, axis=0, return_index=True, return_inverse=True)
+    normals = sums[unique[:, 0]]
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    # Faces on both sides of one sheet cancel out: there each has its own normal.
+    own = mesh.face_normals[first // 3]
+    normals = np.where(length > 1e-9, normals / np.maximum(length, 1e-12), own)
+    return unique[:, 1], corner.reshape(-1, 3), normals
+
+
+def _smooth_pieces(mesh: Adjacency) -> np.ndarray:
+    """Number of the smooth piece that each face corner belongs to, [3 f].
+
+    Where any neighbours are wound against each other, [6 f]: a second copy of all corners stands for their other side.
+    """
     smooth = mesh.paired & ~mesh.crease
     first, second, same_way = mesh.first[smooth], mesh.second[smooth], mesh.sign[smooth] > 0
     # A face passes the edge from one corner to its next; a neighbour wound alike passes it the other way round.
-    mate_of_start = np.where(same_way, _next(second), second)
-    mate_of_end = np.where(same_way, second, _next(second))
-    joins = np.r_[first, _next(first)], np.r_[mate_of_start, mate_of_end]
-    graph = coo_matrix((np.ones(len(joins[0]), dtype=np.int8), joins), shape=(num_corners, num_corners))
-    _, piece = connected_components(graph, directed=False)
-    weighted = mesh.face_normals.repeat(3, axis=0) * _corner_angles(vertices, mesh.faces).reshape(-1, 1)
-    sums = np.stack([np.bincount(piece, weights=weighted[:, i]) for i in range(3)], axis=1)
-    pair = np.stack([piece, mesh.faces.ravel()], axis=1)
-    unique, corner = np.unique(pair, axis=0, return_inverse=True)
-    normals = sums[unique[:, 0]]
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.divide(normals, length, out=np.tile([0.0, 0.0, 1.0], (len(normals), 1)), where=length > 1e-12)
-    return unique[:, 1], corner.reshape(-1, 3), normals
+    start = np.where(same_way, _next(second), second)
+    end = np.where(same_way, second, _next(second))
+    size = mesh.faces.size
+    joins = np.stack([np.r_[first, _next(first)], np.r_[start, end]])
+    if not same_way.all():
+        across = np.tile(np.where(same_way, 0, size), 2)
+        joins = np.concatenate(
+            [joins + [[0], [1]] * across, joins + np.stack([0 * across + size, size - across])], axis=1
+        )
+        size *= 2
+    graph = coo_matrix((np.ones(joins.shape[1], dtype=np.int8), joins), shape=(size, size))
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def _next(half_edge: np.ndarray) -> np.ndarray:
