@@ -74,7 +74,9 @@ class DetectArguments:
 def main() -> NoReturn:
     """Entry point of the command."""
     arguments: DetectArguments = parse(DetectArguments, prog="curio-detect")
-    signal.signal(signal.SIGTERM, _terminate)
+    # Both by name: a process started in the background inherits an ignored SIGINT, and Python then leaves it so.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _terminate)
     try:
         status = run(arguments)
     except BrokenPipeError:
