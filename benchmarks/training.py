@@ -19,16 +19,26 @@ import numpy as np
 import torch
 from curio_train.config import PRESETS, NetworkConfig, RunConfig, WorldOptions
 from curio_train.data.meshes import Mesh
-from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.data.shapes import sphere
+from curio_train.geometry import matrix_from_rotation_6d, random_rotations, rotation_6d_from_matrix
 from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Batch, Camera, ImageSource, ObjectKind, Split, World
-from renderer import AMBIENT, CAMERA, SIDE, draw_poses, lump
 from torch import Tensor
 
 BATCH = 128
+SIDE = 128
+AMBIENT = 0.3
+CAMERA = np.array([[160.0, 0, 63.5], [0, 160.0, 63.5], [0, 0, 1]])
+
+
+def lump(subdivisions: int) -> Mesh:
+    """An asymmetric, coloured object of about 0.1 m."""
+    ball = sphere(0.05, subdivisions)
+    vertices = ball.vertices_m * (1 + 0.3 * np.sin(60 * ball.vertices_m[:, :1]) + 4 * ball.vertices_m[:, 2:])
+    return Mesh(vertices, ball.faces, 0.5 + 0.5 * np.sin(40 * vertices + np.arange(3)))
 
 
 class LumpWorld(World):
@@ -50,11 +60,13 @@ class LumpWorld(World):
         self.seconds = 0.0
 
     def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:
-        rotation, translation, light = draw_poses(count, sum(seed))
+        random = np.random.default_rng(seed)
+        position = random.uniform([-0.05, -0.05, 0.28], [0.05, 0.05, 0.55], (count, 3))
+        light = random.normal(size=(count, 3)) * [0.6, 0.6, 0.2] - [0, 0, 0.6]
         return {
-            TRANSLATION: translation[:, None],
-            ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None],
-            LIGHT: light,
+            TRANSLATION: torch.from_numpy(position).float()[:, None],
+            ROTATION_6D: rotation_6d_from_matrix(random_rotations(count, random))[:, None],
+            LIGHT: torch.from_numpy(light).float(),
         }
 
     def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
