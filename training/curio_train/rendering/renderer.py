@@ -78,7 +78,7 @@ class Renderer:
         self._center = torch.tensor(np.array([p.center_m for p in placements]), dtype=torch.float32)
         self._radius = torch.tensor([p.radius_m for p in placements], dtype=torch.float32)
         self._offset = torch.tensor(np.array([p.offset for p in placements]), dtype=torch.float32)
-        self._corners_m = torch.tensor(np.array([p.corners_m for p in placements]), dtype=torch.float32)
+        self._corners_m = np.array([p.corners_m for p in placements], dtype=np.float32)
 
     def __call__(
         self,
@@ -118,8 +118,10 @@ class Renderer:
                 f"of {setting.num_slots} slots and {setting.width}x{setting.height} pixels"
             )
         rows = self._pack(rotation, translation_m, light, color, confidence)
-        corners = self._corners_m @ rotation.detach().transpose(-1, -2) + translation_m.detach()[:, :, None]
-        views = self._views(corners.flatten(0, 1).numpy(), _intrinsics(camera_matrix, batch), seed)
+        # In numpy: torch would wake its threads for it, and those then spin beside the renderer's.
+        turn, shift = (v.detach().float().cpu().numpy() for v in (rotation, translation_m))
+        corners_m = self._corners_m @ turn.swapaxes(-1, -2) + shift[:, :, None]
+        views = self._views(corners_m.reshape(-1, *corners_m.shape[2:]), _intrinsics(camera_matrix, batch), seed)
         return _Render.apply(rows, backgrounds, self.setting, views)
 
     def _pack(
