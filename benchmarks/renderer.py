@@ -1,330 +1,326 @@
-"""Our renderer beside stock Mitsuba: images a second, forward and backward, and how right the gradients are.
+"""Our renderer and stock Mitsuba on the same poses: images a second, and how good the gradients are.
 
-    python benchmarks/renderer.py --json            the comparison: minutes
+    python benchmarks/renderer.py --json       one run, within ten minutes: ours, stock at its best, stock as it comes
+    python benchmarks/renderer.py --sweep      how cost grows with batch, slots, faces and image size; docs/results
+    python benchmarks/renderer.py --memory     peak of 128 images with 8 slots, growth over 2,000 steps; docs/results
 
-Same poses, same samples a pixel, same run, in turns. Stock Mitsuba renders one image at a time (a scene holds one
-camera and one pose), moved through the mesh's vertices. Each renderer's gradient of a squared image error, at exactly
-the settings that are timed, is compared with central differences of its own converged rendering.
+Gradients are compared at exactly the settings that are timed, as the cosine to central differences of a converged
+rendering of the same renderer, the loss being the squared error to another pose; the worse of rotation and position is
+the figure. Ours and stock take turns, so that a busy machine slows both.
 """
 
 import argparse
 import json
-import os
-import platform
+import resource
+import statistics
+import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from curio_train.data.meshes import Mesh
-from curio_train.data.shapes import sphere
+from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.rendering import baseline
+from curio_train.rendering.baseline import StockPoses
+from curio_train.rendering.differences import TURN, central_differences, cosine, gradients, turned
 from curio_train.rendering.renderer import Renderer
+from curio_train.rendering.variant import load_mitsuba
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-SIDE = 128
-SAMPLES_PER_PIXEL = 4
-BATCH = 128
-AMBIENT = 0.3
-FOCAL = 160.0
-CAMERA = np.array([[FOCAL, 0, (SIDE - 1) / 2], [0, FOCAL, (SIDE - 1) / 2], [0, 0, 1]])
-NUM_REFERENCE = 32
-CONVERGED_SPP = 256
-TURN_STEP, MOVE_STEP_M = 0.01, 0.0005
-
-Poses = tuple[Tensor, Tensor, Tensor]  # rotation [b, 3, 3], translation_m [b, 3], light [b, 3]
+RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
+SIZE, BATCH, SAMPLES = 128, 128, 4
+AMBIENT, LIGHT = 0.3, np.array([0.3, -0.4, -0.8])
+NUM_COMPARED, NUM_STOCK_COMPARED, NUM_DEFAULTS_COMPARED = 64, 24, 6
+POSITION = "translation_m"
+OFFSETS = {TURN: 0.3, POSITION: 0.01}
 
 
-def lump(subdivisions: int = 4) -> Mesh:
-    """An asymmetric, partly concave, coloured object of about 0.1 m: 5,120 faces after four subdivisions."""
-    ball = sphere(1.0, subdivisions)
-    v = ball.vertices_m
-    swell = 1 + 0.3 * np.sin(3 * v[:, :1]) * np.cos(4 * v[:, 1:2]) + 0.2 * v[:, 2:]
-    vertices = 0.05 * v * swell
-    return Mesh(vertices, ball.faces, 0.5 + 0.5 * np.sin(40 * vertices + np.arange(3)))
+def log(text: str) -> None:
+    """Progress, on stderr."""
+    print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
 
 
-def draw_poses(count: int, seed: int, share: tuple[float, float] = (0.25, 0.5), side: int = SIDE) -> Poses:
-    """Random poses with the object between a quarter and a half of the image's width."""
-    random = np.random.default_rng(seed)
-    depth = FOCAL * side / SIDE * 0.11 / (side * random.uniform(*share, count))
-    lateral = random.uniform(-0.25, 0.25, (count, 2)) * depth[:, None] * SIDE / FOCAL
-    light = random.normal(size=(count, 3)) * [0.6, 0.6, 0.2] - [0, 0, 0.6]
-    rotation = Rotation.random(count, rng=random).as_matrix()
-    return tuple(torch.from_numpy(x).float() for x in (rotation, np.c_[lateral, depth], light))
+def root_mesh(subdivisions: int = 4) -> Mesh:
+    """A decimetre of root: concave, without symmetry, with vertex colours; 20 · 4**subdivisions faces (5,120)."""
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
+    x, y, z = np.asarray(sphere.vertices).T[:, :, None]
+    vertices = 0.05 * sphere.vertices * (1 + 0.3 * np.sin(3 * x) * np.cos(4 * y) + 0.2 * z)
+    return Mesh(vertices, np.asarray(sphere.faces), 0.5 + 0.4 * np.sin(40 * vertices + [0, 1, 2]))
 
 
-def ours(renderer: Renderer, poses: Poses, target: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Gradient by (turn, translation) [b, 6] of each image's squared error, and the errors [b]."""
-    rotation, translation, light = poses
-    turn = torch.zeros_like(translation, requires_grad=True)
-    move = torch.zeros_like(translation, requires_grad=True)
-    image = _render(renderer, (turned(rotation, turn), translation + move, light), seed)
-    error = (image - target).square().sum((1, 2, 3))
-    error.sum().backward()
-    return torch.cat([turn.grad, move.grad], dim=1), error.detach()
+@dataclass(frozen=True)
+class Poses:
+    """Objects that fill a quarter to a half of the image's width: rotation [b, n, 3, 3], translation_m [b, n, 3], K."""
+
+    rotation: Tensor
+    translation_m: Tensor
+    matrix: np.ndarray
+    size: int
+
+    def first(self, count: int) -> "Poses":
+        return Poses(self.rotation[:count], self.translation_m[:count], self.matrix, self.size)
 
 
-def _render(renderer: Renderer, poses: Poses, seed: int) -> Tensor:
-    rotation, translation, light = poses
-    side = renderer.setting.width
-    return renderer(
-        rotation[:, None],
-        translation[:, None],
-        camera_matrix=_camera(side),
-        backgrounds=torch.zeros(len(rotation), 3, side, side),
-        light=light,
-        seed=seed,
-    )
+def draw_poses(mesh: Mesh, batch: int, num_slots: int = 1, size: int = SIZE) -> Poses:
+    """The same for the same arguments."""
+    rng = np.random.default_rng(0)
+    focal = 0.9 * size
+    matrix = np.array([[focal, 0, (size - 1) / 2], [0, focal, (size - 1) / 2], [0, 0, 1]])
+    share = rng.uniform(0.25, 0.5, (batch, num_slots, 1))
+    depth = 0.9 * mesh.diameter_m / share
+    lateral = rng.uniform(-1, 1, (batch, num_slots, 2)) * (0.5 - share / 2) * depth / 0.9
+    rotation = Rotation.random(batch * num_slots, random_state=0).as_matrix().reshape(batch, num_slots, 3, 3)
+    place = np.concatenate([lateral, depth], axis=2)
+    return Poses(*(torch.tensor(v, dtype=torch.float32) for v in (rotation, place)), matrix, size)
 
 
-def _camera(side: int) -> np.ndarray:
-    scale = side / SIDE
-    return np.array([[FOCAL * scale, 0, (side - 1) / 2], [0, FOCAL * scale, (side - 1) / 2], [0, 0, 1]])
+def background(count: int, size: int) -> Tensor:
+    """What stock shows behind its object: the ambient light, in sRGB."""
+    return torch.full((count, 3, size, size), 1.055 * AMBIENT ** (1 / 2.4) - 0.055)
 
 
-def turned(rotation: Tensor, turn: Tensor) -> Tensor:
-    """Rotations turned by rotation vectors [b, 3] in the camera frame."""
-    zero = torch.zeros_like(turn[:, 0])
-    x, y, z = turn.unbind(1)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).unflatten(1, (3, 3))
-    return torch.matrix_exp(skew) @ rotation
+def our_images(renderer: Renderer, poses: Poses, moved: dict[str, Tensor], seed: int, behind: Tensor) -> Tensor:
+    """Images of displaced poses, see differences.py."""
+    rotation, translation_m = turned(poses.rotation, moved[TURN]), poses.translation_m + moved[POSITION]
+    return render(renderer, rotation, translation_m, poses.matrix, seed, behind)
+
+
+def render(renderer: Renderer, rotation: Tensor, translation_m: Tensor, matrix: np.ndarray, seed: int, behind: Tensor):
+    light = torch.tensor(LIGHT, dtype=torch.float32).expand(len(behind), 3)
+    return renderer(rotation, translation_m, camera_matrix=matrix, backgrounds=behind, light=light, seed=seed)
+
+
+def our_step(renderer: Renderer, poses: Poses, *, backward: bool = True) -> Callable[[int], None]:
+    """One forward pass from scene codes, and one backward pass to them."""
+    behind = background(len(poses.rotation), poses.size)
+    adjoint = torch.randn(behind.shape, generator=torch.Generator().manual_seed(0))
+    rotation_6d = rotation_6d_from_matrix(poses.rotation)
+
+    def step(seed: int) -> None:
+        code = [v.clone().requires_grad_(backward) for v in (rotation_6d, poses.translation_m)]
+        images = render(renderer, matrix_from_rotation_6d(code[0]), code[1], poses.matrix, seed, behind)
+        if backward:
+            images.backward(adjoint)
+
+    return step
+
+
+def seconds(step: Callable[[int], Any], repeats: int) -> list[float]:
+    """Wall times of single calls."""
+    found = []
+    for seed in range(repeats):
+        start = time.perf_counter()
+        step(seed)
+        found.append(time.perf_counter() - start)
+    return found
+
+
+def our_cosine(mesh: Mesh, poses: Poses) -> float:
+    """Of the gradients at the timed samples to central differences at 144 a pixel."""
+    timed = Renderer([mesh], [0], SIZE, SIZE, ambient=AMBIENT, samples_per_pixel=SAMPLES)
+    converged = Renderer([mesh], [0], SIZE, SIZE, ambient=AMBIENT, samples_per_pixel=144)
+    behind = background(len(poses.rotation), SIZE)
+    zeros = {name: torch.zeros_like(poses.translation_m) for name in OFFSETS}
+    noise = torch.Generator().manual_seed(9)
+    offsets = {name: scale * torch.randn(zeros[name].shape, generator=noise) for name, scale in OFFSETS.items()}
+    with torch.no_grad():
+        target = our_images(converged, poses, offsets, 1, behind)
+
+    def loss(renderer: Renderer, seed: int) -> Callable[[Any], Tensor]:
+        return lambda m: (our_images(renderer, poses, m, seed, behind) - target).square().flatten(1).sum(1)
+
+    expected = central_differences(loss(converged, 2), zeros, list(OFFSETS))
+    found = gradients(loss(timed, 3), zeros)
+    cosines = {name: cosine(found[name], expected[name]) for name in OFFSETS}
+    log(f"ours: cosine of {cosines} over {len(poses.rotation)} poses")
+    return min(cosines.values())
 
 
 class Stock:
-    """Stock Mitsuba, one image at a time: pose through the vertices, ``direct_projective``, gradients by its own AD."""
+    """Stock Mitsuba on single poses of a batch."""
 
-    def __init__(self, mesh: Mesh, best: bool) -> None:
-        """Load the scene; ``best``: without the sampling of indirect silhouettes, which do not exist here."""
+    def __init__(self, mesh: Mesh, poses: Poses) -> None:
         import drjit
-        import mitsuba
 
-        self.mi, self.dr = mitsuba, drjit
-        linear = np.where(
-            mesh.vertex_colors_srgb <= 0.04045,
-            mesh.vertex_colors_srgb / 12.92,
-            ((mesh.vertex_colors_srgb + 0.055) / 1.055) ** 2.4,
-        )
-        properties = mitsuba.Properties()
-        properties["bsdf"] = mitsuba.load_dict(
-            {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
-        )
-        shape = mitsuba.Mesh("lump", len(mesh.vertices_m), len(mesh.faces), has_vertex_normals=True, props=properties)
-        shape.add_attribute("vertex_color", 3, linear.astype(np.float32).ravel())
-        parameters = mitsuba.traverse(shape)
-        parameters["vertex_positions"] = mesh.vertices_m.astype(np.float32).ravel()
-        parameters["faces"] = mesh.faces.astype(np.uint32).ravel()
-        parameters.update()
-        projective = {"sppi": 0, "guiding": "none"} if best else {}
-        # A camera at the origin that looks along z with y down is Mitsuba's own turned by 180° about z.
-        to_world = mitsuba.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, 1], up=[0, -1, 0])
-        self.scene = mitsuba.load_dict(
-            {
-                "type": "scene",
-                "integrator": {"type": "direct_projective", "hide_emitters": True, **projective},
-                "sensor": {
-                    "type": "perspective",
-                    "to_world": to_world,
-                    "fov": float(np.degrees(2 * np.arctan(SIDE / 2 / FOCAL))),
-                    "near_clip": 0.001,
-                    "film": {
-                        "type": "hdrfilm",
-                        "width": SIDE,
-                        "height": SIDE,
-                        "pixel_format": "rgb",
-                        "rfilter": {"type": "box"},
-                        "sample_border": True,
-                    },
-                    "sampler": {"type": "independent"},
-                },
-                "ambient": {"type": "constant", "radiance": AMBIENT},
-                "sun": {
-                    "type": "directional",
-                    "direction": [0, 0, 1],
-                    "irradiance": {"type": "rgb", "value": [1, 1, 1]},
-                },
-                "lump": shape,
-            }
-        )
-        self.parameters = mitsuba.traverse(self.scene)
-        self.vertices = mitsuba.Point3f(*mesh.vertices_m.astype(np.float32).T)
+        mitsuba = load_mitsuba()
+        self.rotation, self.place = (v[:, 0].double().numpy() for v in (poses.rotation, poses.translation_m))
 
-    def image(self, poses: Poses, index: int, offset: Any, spp: int, seed: int) -> Any:
-        """Linear radiance [height, width, 3] of one pose; ``offset`` (turn 3, move 3) may carry a gradient."""
-        mi, dr = self.mi, self.dr
-        rotation, translation, light = (x[index].tolist() for x in poses)
-        matrix = mi.Matrix3f(rotation)
-        point = matrix @ self.vertices
-        turn, move = mi.Vector3f(*offset[:3]), mi.Vector3f(*offset[3:])
-        # Rodrigues to second order: exact for the small steps taken here.
-        point = point + dr.cross(turn, point) + 0.5 * dr.cross(turn, dr.cross(turn, point))
-        point = point + mi.Vector3f(*translation) + move
-        self.parameters["lump.vertex_positions"] = dr.ravel(point)
-        strength = float(np.linalg.norm(light))
-        direction = [-value / strength for value in light]
-        self.parameters["sun.to_world"] = mi.Transform4f().look_at(
-            origin=[0, 0, 0], target=direction, up=[0.3, 0.9, 0.1]
-        )
-        self.parameters["sun.irradiance.value"] = mi.Color3f(np.pi * strength)
-        self.parameters.update()
-        return mi.render(self.scene, self.parameters, spp=spp, seed=seed, seed_grad=seed + 1)
+        def build(integrator: Any, samples: int) -> StockPoses:
+            size = (poses.size, poses.size)
+            return StockPoses(mitsuba, drjit, mesh, poses.matrix, size, AMBIENT, LIGHT, integrator, samples)
 
-    def error(self, poses: Poses, index: int, target: np.ndarray, offset: Any, spp: int, seed: int) -> Any:
-        """Squared error of one image against a linear target."""
-        difference = self.image(poses, index, offset, spp, seed) - self.mi.TensorXf(target)
-        return self.dr.sum(difference * difference, axis=None)
+        self.best, self.defaults = build(baseline.BEST, SAMPLES), build(baseline.DEFAULTS, SAMPLES)
+        self.converged = build(baseline.REFERENCE, 256)
+        self.black = np.zeros((poses.size, poses.size, 3), dtype=np.float32)
 
-    def gradient(self, poses: Poses, index: int, target: np.ndarray, spp: int, seed: int) -> np.ndarray:
-        """[6], by (turn, translation)."""
-        dr = self.dr
-        offset = [self.mi.Float(0.0) for _ in range(6)]
-        dr.enable_grad(offset)
-        dr.backward(self.error(poses, index, target, offset, spp, seed))
-        return np.array([dr.grad(value).numpy()[0] for value in offset])
+    def step(self, poses: StockPoses) -> Callable[[int], np.ndarray]:
+        """One forward and backward pass of the pose with the seed's number."""
+        return lambda seed: poses.gradient(self.rotation[seed], self.place[seed], self.black, seed)
+
+    def cosines(self) -> dict[str, float]:
+        """Of the gradients at the timed samples to central differences at 256 a pixel, best and defaults."""
+        rng = np.random.default_rng(9)
+        found: dict[str, list[np.ndarray]] = {"best": [], "defaults": [], "expected": []}
+        for i in range(NUM_STOCK_COMPARED):
+            turn, shift = rng.normal(size=(2, 3)) * [[OFFSETS[TURN]], [OFFSETS[POSITION]]]
+            target = self.converged.image(_turned(turn) @ self.rotation[i], self.place[i] + shift, 1)
+            found["best"].append(self.best.gradient(self.rotation[i], self.place[i], target, i))
+            if i < NUM_DEFAULTS_COMPARED:
+                found["defaults"].append(self.defaults.gradient(self.rotation[i], self.place[i], target, i))
+            found["expected"].append(self._differences(i, target))
+        result = {}
+        for name in ("best", "defaults"):
+            pairs = [np.array(found[key][: len(found[name])]).reshape(-1, 2, 3) for key in (name, "expected")]
+            groups = [cosine(*(torch.tensor(v[:, k]) for v in pairs)) for k in range(2)]
+            log(f"stock, {name}: cosine of rotation, position {groups} over {len(found[name])} poses")
+            result[name] = min(groups)
+        return result
+
+    def _differences(self, i: int, target: np.ndarray) -> np.ndarray:
+        found = []
+        for step in np.diag([0.01] * 3 + [0.0005] * 3):
+            ends = [
+                np.square(
+                    self.converged.image(_turned(s * step[:3]) @ self.rotation[i], self.place[i] + s * step[3:], 2)
+                    - target
+                ).sum()
+                for s in (1, -1)
+            ]
+            found.append((ends[0] - ends[1]) / (2 * step.max()))
+        return np.array(found)
 
 
-def central_differences(error: Callable[[int, float], np.ndarray]) -> np.ndarray:
-    """[b, 6] from an error [b] that is a function of axis and step."""
-    steps = [TURN_STEP] * 3 + [MOVE_STEP_M] * 3
-    return np.stack([(error(i, s) - error(i, -s)) / (2 * s) for i, s in enumerate(steps)], axis=1)
+def _turned(rotvec: np.ndarray) -> np.ndarray:
+    return Rotation.from_rotvec(rotvec).as_matrix()
 
 
-def cosines(found: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Cosine of gradients stacked over all poses, for each group of parameters."""
-    groups = {"rotation": slice(0, 3), "position": slice(3, 6)}
-    pairs = {name: (found[:, part].ravel(), reference[:, part].ravel()) for name, part in groups.items()}
-    return {name: float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b))) for name, (a, b) in pairs.items()}
-
-
-def moved(poses: Poses, axis: int, step: float) -> Poses:
-    """All poses turned (axes 0–2) or moved (3–5) by a step."""
-    rotation, translation, light = poses
-    change = torch.zeros(len(rotation), 6)
-    change[:, axis] = step
-    return turned(rotation, change[:, :3]), translation + change[:, 3:], light
-
-
-def our_cosines(mesh: Mesh, renderer: Renderer, poses: Poses, targets: Poses) -> dict[str, float]:
-    """Of our gradients at the timed settings."""
-    exact = Renderer([mesh], [0], SIDE, SIDE, ambient=AMBIENT, samples_per_pixel=CONVERGED_SPP)
-    with torch.no_grad():
-        target = _render(exact, targets, 7)
-
-        def error(axis: int, step: float) -> np.ndarray:
-            image = _render(exact, moved(poses, axis, step), 1)
-            return (image - target).square().sum((1, 2, 3)).double().numpy()
-
-        reference = central_differences(error)
-    return cosines(ours(renderer, poses, target, 3)[0].numpy(), reference)
-
-
-def stock_reference(stock: Stock, poses: Poses, targets: Poses) -> tuple[list[np.ndarray], np.ndarray]:
-    """Converged targets of stock Mitsuba, and central differences of its converged rendering."""
-    still = [stock.mi.Float(0.0)] * 6
-    count = len(poses[0])
-    images = [np.array(stock.image(targets, i, still, CONVERGED_SPP, 7)) for i in range(count)]
-
-    def error(axis: int, step: float) -> np.ndarray:
-        offset = [stock.mi.Float(step if i == axis else 0.0) for i in range(6)]
-        values = [stock.error(poses, i, images[i], offset, CONVERGED_SPP, 1).numpy() for i in range(count)]
-        return np.array(values, dtype=float).ravel()
-
-    return images, central_differences(error)
-
-
-def rate(work: Callable[[int], int], seconds: float) -> float:
-    """Images a second: ``work(round)`` says how many it did; the first round is not counted."""
-    work(0)
-    begun, done, number = time.perf_counter(), 0, 1
-    while time.perf_counter() - begun < seconds:
-        done += work(number)
-        number += 1
-    return done / (time.perf_counter() - begun)
-
-
-def compare(seconds: float, rounds: int, outline_samples: int) -> dict[str, Any]:
-    """The comparison: rates are medians of rounds in which all renderers take turns."""
-    mesh = lump()
-    poses, targets = draw_poses(BATCH, 1), draw_poses(BATCH, 2)
-    targets = (poses[0], poses[1] + 0.1 * (targets[1] - poses[1]), poses[2])
-    renderer = Renderer(
-        [mesh],
-        [0],
-        SIDE,
-        SIDE,
-        ambient=AMBIENT,
-        samples_per_pixel=SAMPLES_PER_PIXEL,
-        outline_samples=outline_samples,
-    )
-    best, defaults = Stock(mesh, best=True), Stock(mesh, best=False)
-    few = tuple(x[:NUM_REFERENCE] for x in poses), tuple(x[:NUM_REFERENCE] for x in targets)
-    with torch.no_grad():
-        target = _render(renderer, targets, 5)
-    images, reference = stock_reference(best, *few)
-
-    def forward(number: int) -> int:
-        with torch.no_grad():
-            _render(renderer, poses, number)
-        return BATCH
-
-    def both(number: int) -> int:
-        ours(renderer, poses, target, number)
-        return BATCH
-
-    def one(stock: Stock) -> Callable[[int], int]:
-        def work(number: int) -> int:
-            index = number % NUM_REFERENCE
-            stock.gradient(poses, index, images[index], SAMPLES_PER_PIXEL, number)
-            return 1
-
-        return work
-
-    works = {"forward": forward, "ours": both, "stock": one(best), "defaults": one(defaults)}
-    rates = [{name: rate(work, seconds) for name, work in works.items()} for _ in range(rounds)]
-    medians = {name: float(np.median([r[name] for r in rates])) for name in works}
-    stock_gradients = np.stack(
-        [best.gradient(few[0], i, images[i], SAMPLES_PER_PIXEL, 3) for i in range(NUM_REFERENCE)]
-    )
-    our, theirs = our_cosines(mesh, renderer, *few), cosines(stock_gradients, reference)
+def compare() -> dict[str, float]:
+    """The figures of ``--json``."""
+    mesh = root_mesh()
+    poses = draw_poses(mesh, BATCH)
+    renderer = Renderer([mesh], [0], SIZE, SIZE, ambient=AMBIENT, samples_per_pixel=SAMPLES)
+    step, forward, stock = our_step(renderer, poses), our_step(renderer, poses, backward=False), Stock(mesh, poses)
+    log("compiling kernels")
+    for warm in (step, forward, stock.step(stock.best), stock.step(stock.defaults)):
+        seconds(warm, 2)
+    ours, ours_forward, best, defaults = [], [], [], []
+    for turn in range(8):
+        ours += seconds(step, 4)
+        best += seconds(stock.step(stock.best), 6)
+        ours_forward += seconds(forward, 2)
+        defaults += seconds(stock.step(stock.defaults), 1)
+        log(f"round {turn + 1} of 8: {BATCH / ours[-1]:.0f} images/s, stock {1 / best[-1]:.1f} images/s")
+    images_per_s, stock_images_per_s = BATCH / statistics.median(ours), 1 / statistics.median(best)
+    log("differences of converged renderings")
+    stock_cosines = stock.cosines()
     return {
-        "images_per_s": medians["ours"],
-        "stock_images_per_s": medians["stock"],
-        "ratio": float(np.median([r["ours"] / r["stock"] for r in rates])),
-        "ratio_defaults": float(np.median([r["ours"] / r["defaults"] for r in rates])),
-        "gradient_cosine": min(our.values()),
-        "stock_gradient_cosine": min(theirs.values()),
-        "forward_images_per_s": medians["forward"],
-        "gradient_cosines": our,
-        "stock_gradient_cosines": theirs,
-        "stock_default_images_per_s": medians["defaults"],
-        "rounds": rates,
-        "settings": {
-            "batch": BATCH,
-            "side_px": SIDE,
-            "samples_per_pixel": SAMPLES_PER_PIXEL,
-            "faces": len(mesh.faces),
-            "outline_samples": renderer.setting.outline_samples,
-            "reference_poses": NUM_REFERENCE,
-        },
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "images_per_s": round(images_per_s, 1),
+        "stock_images_per_s": round(stock_images_per_s, 2),
+        "ratio": round(images_per_s / stock_images_per_s, 1),
+        "ratio_defaults": round(images_per_s * statistics.median(defaults), 1),
+        "gradient_cosine": round(our_cosine(mesh, poses.first(NUM_COMPARED)), 4),
+        "stock_gradient_cosine": round(stock_cosines["best"], 4),
+        "forward_images_per_s": round(BATCH / statistics.median(ours_forward), 1),
     }
 
 
+def sweep_point(subdivisions: int, batch: int, num_slots: int, size: int) -> dict[str, float]:
+    """Forward and backward of one combination."""
+    mesh = root_mesh(subdivisions)
+    start = time.perf_counter()
+    renderer = Renderer([mesh], [0] * num_slots, size, size, ambient=AMBIENT, samples_per_pixel=SAMPLES)
+    built = time.perf_counter() - start
+    step = our_step(renderer, draw_poses(mesh, batch, num_slots, size))
+    seconds(step, 2)
+    wall = statistics.median(seconds(step, 7))
+    log(f"{len(mesh.faces)} faces, {batch} images, {num_slots} slots, {size} px: {batch / wall:.1f} images/s")
+    return {
+        "images_per_s": round(batch / wall, 1),
+        "seconds_per_step": round(wall, 4),
+        "seconds_to_build": round(built, 2),
+    }
+
+
+def sweep() -> dict[str, list[dict[str, float]]]:
+    """One axis at a time, the others as in the comparison (image sizes with 16 images)."""
+    return {
+        "batch": [{"batch": n, **sweep_point(4, n, 1, SIZE)} for n in (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)],
+        "slots": [{"slots": n, **sweep_point(4, BATCH, n, SIZE)} for n in (1, 2, 4, 6, 8, 10)],
+        "faces": [{"faces": 20 * 4**s, **sweep_point(s, BATCH, 1, SIZE)} for s in range(1, 9)],
+        "image_size": [{"image_size": n, **sweep_point(4, 16, 1, n)} for n in (64, 96, 128, 192, 256, 384, 512)],
+    }
+
+
+def plot(points: dict[str, list[dict[str, float]]], path: Path) -> None:
+    """Four panels of images a second."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    titles = {
+        "batch": "images a batch",
+        "slots": "slots an image",
+        "faces": "faces",
+        "image_size": "image size, pixels",
+    }
+    for axes, (name, label) in zip(figure.subplots(2, 2).flat, titles.items(), strict=True):
+        axes.plot([p[name] for p in points[name]], [p["images_per_s"] for p in points[name]], marker="o")
+        axes.set(xlabel=label, ylabel="images/s, forward + backward", xscale="log", yscale="log")
+        axes.grid(True, which="both", alpha=0.3)
+    figure.suptitle(
+        "One object of 5,120 faces, 128 images of 128x128, 4 samples a pixel, unless the axis says otherwise"
+    )
+    figure.savefig(path, dpi=110)
+
+
+def memory() -> dict[str, float]:
+    """Peak of the whole process in GiB at 128 images with 8 slots, then growth over 2,000 smaller steps."""
+    mesh = root_mesh()
+    renderer = Renderer([mesh], [0] * 8, SIZE, SIZE, ambient=AMBIENT, samples_per_pixel=SAMPLES)
+    seconds(our_step(renderer, draw_poses(mesh, BATCH, 8)), 3)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    log(f"peak {peak:.2f} GiB")
+    step = our_step(renderer, draw_poses(mesh, 8, 8))
+    resident = []
+    for seed in range(2100):
+        step(seed)
+        if seed % 100 == 99:
+            resident.append(_resident_mib())
+    log(f"resident MiB every 100 steps: {[round(v) for v in resident]}")
+    return {"peak_gib": round(peak, 2), "growth_mib_in_2000_steps": round(resident[-1] - resident[0], 1)}
+
+
+def _resident_mib() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
 def main() -> None:
-    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object on the last line")
-    parser.add_argument("--seconds", type=float, default=8.0, help="a renderer and round")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--outline-samples", type=int, default=512, help="points on each outline, of ours")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)  # the little that torch does here must not spin beside the renderer's threads
-    result = compare(arguments.seconds, arguments.rounds, arguments.outline_samples)
-    if not arguments.json:
-        for name, value in result.items():
-            print(f"{name:>24}  {value}")
-    print(json.dumps(result))
+    parser.add_argument(
+        "--json", action="store_true", help="print the comparison as one JSON object (the default prints lines)"
+    )
+    parser.add_argument(
+        "--sweep", action="store_true", help="measure how cost grows; writes renderer_sweep.json and .png"
+    )
+    parser.add_argument("--memory", action="store_true", help="measure memory; writes renderer_memory.json")
+    wanted = parser.parse_args()
+    if wanted.sweep:
+        points = sweep()
+        (RESULTS / "renderer_sweep.json").write_text(json.dumps(points, indent=1) + "\n")
+        plot(points, RESULTS / "renderer_sweep.png")
+    elif wanted.memory:
+        (RESULTS / "renderer_memory.json").write_text(json.dumps(memory()) + "\n")
+    else:
+        figures = compare()
+        print(
+            json.dumps(figures) if wanted.json else "\n".join(f"{key:>24} {value:g}" for key, value in figures.items())
+        )
 
 
 if __name__ == "__main__":
