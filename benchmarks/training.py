@@ -112,7 +112,7 @@ def measure(world: LumpWorld, precision: str, steps: int) -> tuple[list[float], 
     recipe = replace(PRESETS["laptop"], batch_size=BATCH, micro_batch_size=BATCH, precision=precision)
     config = RunConfig(WorldOptions(), method="our", recipe=recipe, network=NetworkConfig())
     source = world.source("train", 0, with_code=False, cache=Path())
-    trainer = Trainer(config, world, source, Ranks(0, 1, torch.device("cpu")))
+    trainer = Trainer(config, world, [source], Ranks(0, 1, torch.device("cpu")))
     trainer.step(1.0)  # compiles the kernels
     world.seconds, begun = 0.0, time.perf_counter()
     losses = [trainer.step(1.0)["image"] for _ in range(steps)]

@@ -34,17 +34,16 @@ def _pebble() -> Mesh:
     return Mesh(vertices, faces, _colors(vertices))
 
 
-def _root() -> Mesh:
+def _root(subdivisions: int) -> Mesh:
     """Concave and without symmetry, smooth, with vertex colours."""
-    directions, faces = _sphere(3)
+    directions, faces = _sphere(subdivisions)
     x, y, z = directions.T[:, :, None]
     vertices = 0.05 * directions * (1 + 0.3 * np.sin(3 * x) * np.cos(4 * y) + 0.2 * z)
     return Mesh(vertices, faces, _colors(vertices))
 
 
-def _ring() -> Mesh:
+def _ring(around: int, across: int) -> Mesh:
     """A torus with a texture that is different everywhere."""
-    around, across = 48, 24
     u, v = np.meshgrid(np.arange(around + 1) / around, np.arange(across + 1) / across, indexing="ij")
     a, b = 2 * np.pi * u, 2 * np.pi * v
     reach = 0.035 + 0.015 * np.cos(b)
@@ -68,7 +67,13 @@ def _box() -> Mesh:
 @pytest.fixture(scope="session")
 def meshes() -> dict[str, Mesh]:
     """The test objects, about a decimetre across: pebble, root, ring and box."""
-    return {"pebble": _pebble(), "root": _root(), "ring": _ring(), "box": _box()}
+    return {"pebble": _pebble(), "root": _root(3), "ring": _ring(48, 24), "box": _box()}
+
+
+@pytest.fixture(scope="session")
+def fine_meshes() -> dict[str, Mesh]:
+    """The root with 327,680 faces and the ring with 120,000."""
+    return {"root": _root(7), "ring": _ring(300, 200)}
 
 
 @pytest.fixture(scope="session")

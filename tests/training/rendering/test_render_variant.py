@@ -86,6 +86,34 @@ def test_without_cuda_images_are_rendered_on_the_cpu(caplog: pytest.LogCaptureFi
     assert "libnvoptix.so.1" in caplog.text
 
 
+def test_cuda_is_taken_where_the_driver_brings_optix(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With two libraries that every machine can load standing for the driver's."""
+    monkeypatch.delenv(variant.FORCED, raising=False)
+    monkeypatch.setattr(variant, "CUDA_LIBRARIES", ("libc.so.6", "libm.so.6"))
+    assert variant.choose_variant(prefer_cuda=True) == "cuda_ad_rgb"
+    assert variant.choose_variant(prefer_cuda=False) == "llvm_ad_rgb"
+
+
+def test_without_optix_cuda_is_left_to_the_networks(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.delenv(variant.FORCED, raising=False)
+    monkeypatch.setattr(variant, "CUDA_LIBRARIES", ("libc.so.6", "libnowhere.so.1"))
+    variant._say_fallback_once.cache_clear()
+    assert [variant.choose_variant(prefer_cuda=True) for _ in range(3)] == ["llvm_ad_rgb"] * 3
+    assert len(caplog.records) == 1
+    assert "networks stay on the GPU" in caplog.text
+
+
+def test_the_environment_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variant, "CUDA_LIBRARIES", ("libc.so.6", "libm.so.6"))
+    monkeypatch.setenv(variant.FORCED, "llvm_ad_rgb")
+    assert variant.choose_variant(prefer_cuda=True) == "llvm_ad_rgb"
+    monkeypatch.setenv(variant.FORCED, "scalar_rgb")
+    with pytest.raises(RendererError, match="CURIO_VARIANT is 'scalar_rgb', expected one of llvm_ad_rgb, cuda_ad_rgb"):
+        variant.choose_variant(prefer_cuda=True)
+
+
 def test_a_second_variant_is_refused(mitsuba) -> None:
     with pytest.raises(RendererError, match="already runs as llvm_ad_rgb"):
         variant.load_mitsuba("cuda_ad_rgb")

@@ -57,7 +57,7 @@ class EdgeSearch:
     def _may_have_outline(self, rows: Rows, row: Any, cluster: Any) -> Any:
         """False only where every face of the cluster surely looks to the same side of the camera."""
         mi, dr = self.mi, self.dr
-        to_camera = rows.origin(row) - self._point("center", cluster)
+        to_camera = rows.toward(row, self._point("center", cluster))
         distance = dr.norm(to_camera)
         radius = dr.gather(mi.Float, self.edges["radius"], cluster)
         cosine = dr.dot(to_camera, self._point("axis", cluster)) / dr.maximum(distance, 1e-12)
@@ -72,7 +72,7 @@ class EdgeSearch:
     def _is_outline(self, rows: Rows, row: Any, edge: Any) -> Any:
         """One face towards the camera and one away, or an open border; at folds as many towards it as are needed."""
         dr = self.dr
-        to_camera = rows.origin(row) - self._point("start", edge)
+        to_camera = rows.toward(row, self._point("start", edge))
         a, b = (dr.dot(self._point(name, edge), to_camera) for name in ("normal_a", "normal_b"))
         facing = dr.gather(self.mi.Float, self.edges["facing"], edge // CLUSTER_SIZE)
         unknown = (a == 0) & (b == 0)

@@ -7,9 +7,10 @@ from typing import Any
 
 from curio_train.rendering.bounds import ImageBounds
 from curio_train.rendering.compositing import Occlusion
-from curio_train.rendering.layers import LayerTracer
+from curio_train.rendering.layers import LayerTracer, Sight
 from curio_train.rendering.pixels import Place
 from curio_train.rendering.rows import Rows
+from curio_train.rendering.shadows import Blockers
 from curio_train.rendering.silhouettes import OutlineSampler
 
 Places = Callable[[Any], tuple[Place, Any]]
@@ -30,6 +31,7 @@ class Setting:
         num_slots: Objects an image.
         samples_per_pixel: Rays a pixel and slot.
         outline_samples: Points on each object's outline.
+        object_shadows: Whether objects stand in each other's light.
     """
 
     mi: ModuleType
@@ -41,6 +43,7 @@ class Setting:
     num_slots: int
     samples_per_pixel: int
     outline_samples: int
+    object_shadows: bool
 
 
 @dataclass(frozen=True)
@@ -49,12 +52,14 @@ class View:
 
     Attributes:
         images: First and last + 1 image.
+        sight: What is looked for.
         bounds: Of the part's rows.
         camera: Float, see :class:`Rows`.
         key: Of all random numbers of the batch, UInt32.
     """
 
     images: tuple[int, int]
+    sight: Sight
     bounds: ImageBounds
     camera: Any
     key: Any
@@ -74,16 +79,18 @@ class Hits:
         at: Where they pass.
         record: Faces hit, Mitsuba's preliminary intersections.
         occlusion: Of the samples that the rays belong to.
+        blockers: What keeps the light from the hits, or None.
     """
 
     lane: Any
     at: Places
     record: Any
     occlusion: Occlusion
+    blockers: Blockers | None
 
 
 class Launch:
-    """Rays over one part of a batch, in front of its backgrounds (flat [b, 3, h, w])."""
+    """Rays over one part of a batch, in front of its backgrounds (flat [b, c, h, w])."""
 
     def __init__(self, setting: Setting, view: View, background: Any) -> None:
         self.set, self.view, self.background = setting, view, background
@@ -95,7 +102,8 @@ class Launch:
         if len(lane) == 0:
             return None
         place, inside = at(lane)
-        record = tracer.intersect(rows, place.row, tracer.ray(rows, place.row, place.x, place.y), inside)
+        ray = rows.ray(place.row, place.x, place.y)
+        record = tracer.intersect(rows, place.row, ray, inside, self.view.sight.reach_from_m)
         dr.eval(record)
         hit = dr.compress(record.is_valid())
         if len(hit) == 0:
@@ -105,13 +113,20 @@ class Launch:
         occlusion = Occlusion(mi, dr, self.set.num_slots, per_group)
         if self.set.num_slots > 1:
             occlusion.build(at(lane)[0], record.t, num_groups)
-        return Hits(lane, at, record, occlusion)
+        return Hits(lane, at, record, occlusion, self._blockers(rows, at(lane)[0], record.t))
+
+    def _blockers(self, rows: Rows, place: Place, depth_m: Any) -> Blockers | None:
+        if not self.set.object_shadows or self.set.num_slots == 1 or not self.view.sight.shaded:
+            return None
+        blockers = Blockers(self.mi, self.dr, self.set.tracer, self.set.num_slots)
+        blockers.find(rows.detached(), place, depth_m)
+        return blockers
 
     def contributions(self, rows: Rows, hits: Hits) -> tuple[Place, list[Any]]:
-        """What each hit adds to the colour of its sample: weight · (color − background), 3 arrays."""
-        tracer, (place, _) = self.set.tracer, hits.at(hits.lane)
-        ray = tracer.ray(rows, place.row, place.x, place.y)
-        colors = tracer.shade(rows, place.row, ray, hits.record)
+        """What each hit adds to the colour of its sample: weight · (color − background), one array a channel."""
+        place, _ = hits.at(hits.lane)
+        lit = hits.blockers.lit(rows, place) if hits.blockers else 1.0
+        colors = self.view.sight.colors(self.set.tracer, rows, place, hits.record, lit)
         weight = hits.occlusion.weight(rows, place, hits.record.t)
         behind = self.look(self.background, place.pixel)
         return place, [weight * (color - under) for color, under in zip(colors, behind, strict=True)]
@@ -122,14 +137,14 @@ class Launch:
         return place, sum(c * w for c, w in zip(colors, self.look(adjoint, place.pixel), strict=True))
 
     def look(self, flat: Any, pixel: Any) -> list[Any]:
-        """The three channels of a flat [b, 3, h, w] array at pixels."""
+        """The channels of a flat [b, c, h, w] array at pixels."""
         return [self.dr.gather(self.mi.Float, flat, i) for i in self.planes(pixel)]
 
     def planes(self, pixel: Any) -> list[Any]:
-        """Where a pixel's three channels are in a flat [b, 3, h, w] array."""
-        area = self.set.width * self.set.height
-        first = pixel + (pixel // area) * (2 * area)
-        return [first + channel * area for channel in range(3)]
+        """Where a pixel's channels are in a flat [b, c, h, w] array."""
+        area, channels = self.set.width * self.set.height, self.view.sight.channels
+        first = pixel + (pixel // area) * ((channels - 1) * area)
+        return [first + channel * area for channel in range(channels)]
 
     def nearest_pixel(self, image: Any, x: Any, y: Any, margin: float = 0.0) -> tuple[Any, Any]:
         """The pixel at (x, y), or the nearest one inside; and whether (x, y) is inside, give or take a margin."""

@@ -1,9 +1,11 @@
 """Layers: what the rays of one row see of their object, through the static scene, shaded by the mesh's own BSDF."""
 
+from abc import ABC, abstractmethod
 from types import ModuleType
 from typing import Any
 
 from curio_train.rendering.bounds import NEAR_M
+from curio_train.rendering.pixels import Place
 from curio_train.rendering.rows import Rows
 
 SPHERE = 1.001
@@ -16,10 +18,8 @@ class LayerTracer:
     def __init__(self, mi: ModuleType, dr: ModuleType, scene: Any, ambient: float) -> None:
         self.mi, self.dr, self.scene = mi, dr, scene
         self.ambient = ambient
-
-    def ray(self, rows: Rows, row: Any, x: Any, y: Any) -> Any:
-        """Rays of the given rows through pixels (x, y), scene frame; the ray parameter is the depth in metres."""
-        return self.mi.Ray3f(rows.origin(row), rows.turned(row, rows.direction(row, x, y)))
+        shapes = scene.shapes()
+        self.only_shape = shapes[0] if len(shapes) == 1 else None
 
     def near(self, rows: Rows, row: Any, ray: Any) -> Any:
         """Whether rays pass the rows' bounding spheres."""
@@ -27,11 +27,12 @@ class LayerTracer:
         arm = rows.sphere_center(row) - ray.o
         return dr.squared_norm(arm) - dr.square(dr.dot(arm, ray.d)) / dr.squared_norm(ray.d) <= SPHERE * SPHERE
 
-    def intersect(self, rows: Rows, row: Any, ray: Any, active: Any) -> Any:
+    def intersect(self, rows: Rows, row: Any, ray: Any, active: Any, nearest: float) -> Any:
         """The detached preliminary intersection with the row's own object: which face, where on it, at which depth.
 
         Only the part of the ray within the object's bounding sphere is traced. The other objects of the static scene
-        are then out of reach, and float32 is spent on the object instead of on the way there.
+        are then out of reach, and float32 is spent on the object instead of on the way there. Nothing before the ray
+        parameter ``nearest`` is seen.
         """
         dr = self.dr
         with dr.suspend_grad():
@@ -39,24 +40,72 @@ class LayerTracer:
             inverse = dr.rcp(dr.squared_norm(direction))
             middle = dr.dot(rows.sphere_center(row) - origin, direction) * inverse
             reach = SPHERE * dr.sqrt(inverse)
-            start = dr.maximum(middle - reach, NEAR_M)
+            start = dr.maximum(middle - reach, nearest)
             part = self.mi.Ray3f(dr.fma(direction, start, origin), direction)
             part.maxt = middle + reach - start
             hit = self.scene.ray_intersect_preliminary(part, coherent=True, active=active & (part.maxt > 0))
             hit.t += start
             return hit
 
-    def shade(self, rows: Rows, row: Any, ray: Any, hit: Any) -> list[Any]:
-        """Colour of hits in sRGB, 3 arrays: albedo · (ambient + max(0, n·l)), encoded."""
+    def shade(self, rows: Rows, row: Any, ray: Any, hit: Any, lit: Any) -> list[Any]:
+        """Colour of hits in sRGB, 3 arrays: albedo · (ambient + lit · max(0, n·l)), encoded."""
         mi, dr = self.mi, self.dr
-        flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame | mi.RayFlags.UV
-        surface = hit.compute_surface_interaction(ray, flags)
+        surface, bsdf = self._surface(ray, hit)
         normal = mi.Normal3f(surface.sh_frame.n)
         # Meshes wound inside out or open show their back: both sides shade alike.
         normal = dr.select(dr.dot(surface.n, ray.d) > 0, -normal, normal)
-        radiance = self.ambient + dr.maximum(0, dr.dot(normal, rows.light(row)))
-        own = surface.bsdf(ray).eval_diffuse_reflectance(surface)
+        radiance = self.ambient + lit * dr.maximum(0, dr.dot(normal, rows.light(row)))
+        own = bsdf.eval_diffuse_reflectance(surface)
         return [srgb_from_linear(dr, own[i] * albedo * radiance) for i, albedo in enumerate(rows.albedo(row))]
+
+    def _surface(self, ray: Any, hit: Any) -> tuple[Any, Any]:
+        """Where rays hit, and the BSDF there; a single shape is asked itself, which saves looking up whose it is."""
+        flags = self.mi.RayFlags.Minimal | self.mi.RayFlags.ShadingFrame | self.mi.RayFlags.UV
+        if self.only_shape is not None:
+            return self.only_shape.compute_surface_interaction(ray, hit, flags), self.only_shape.bsdf()
+        surface = hit.compute_surface_interaction(ray, flags)
+        return surface, surface.bsdf(ray)
+
+
+class Sight(ABC):
+    """What rays through pixels look for, and what they show of it.
+
+    Attributes:
+        channels: Of the image.
+        reach_from_m: Nothing nearer to the rays' origins is seen.
+        shaded: Whether light matters to what is shown.
+    """
+
+    channels: int
+    shaded: bool
+    reach_from_m: float
+
+    @abstractmethod
+    def rows(self, values: Any, camera: Any) -> Rows:
+        """Rows as they are looked at, of packed values."""
+
+    @abstractmethod
+    def colors(self, tracer: LayerTracer, rows: Rows, place: Place, hit: Any, lit: Any) -> list[Any]:
+        """What hits look like, one array a channel; ``lit`` is the share of the light that reaches them."""
+
+
+class Objects(Sight):
+    """Shows the objects themselves."""
+
+    channels = 3
+    shaded = True
+    reach_from_m = NEAR_M
+
+    def __init__(self, mi: ModuleType, dr: ModuleType) -> None:
+        self.mi, self.dr = mi, dr
+
+    def rows(self, values: Any, camera: Any) -> Rows:
+        """Seen by the camera."""
+        return Rows(self.mi, self.dr, values, camera)
+
+    def colors(self, tracer: LayerTracer, rows: Rows, place: Place, hit: Any, lit: Any) -> list[Any]:
+        """Shaded by the mesh's own BSDF."""
+        return tracer.shade(rows, place.row, rows.ray(place.row, place.x, place.y), hit, lit)
 
 
 def srgb_from_linear(dr: ModuleType, linear: Any) -> Any:

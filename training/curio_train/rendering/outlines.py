@@ -49,7 +49,7 @@ class Outlines(Launch):
         here, left, right = (look(image, -s * ty, s * tx) for s in (0, 1, -1))
         weights = [look(adjoint, s * tx * PIECE_PX / 2, s * ty * PIECE_PX / 2) for s in (0, 1, -1)]
         promise = 0.0
-        for c in range(3):
+        for c in range(self.view.sight.channels):
             contrast = dr.abs(here[c] - left[c]) + dr.abs(here[c] - right[c])
             promise += sum(dr.abs(w[c]) for w in weights) * (contrast + CONTRAST_FLOOR)
         inside = self.nearest_pixel(where, pieces.x, pieces.y, PIECE_PX)[1]
@@ -66,14 +66,14 @@ class Outlines(Launch):
 
         if self.set.num_slots > 1:
             place, inside = at(lane)
-            lane = dr.compress(
-                inside & self.set.tracer.near(rows, place.row, self.set.tracer.ray(rows, place.row, place.x, place.y))
-            )
+            lane = dr.compress(inside & self.set.tracer.near(rows, place.row, rows.ray(place.row, place.x, place.y)))
         hits = self.trace(rows, lane, at, 1, num_points * 2)
         jump = dr.zeros(mi.Float, num_points)
         if hits:
             place, value = self.weighed(rows, hits, adjoint)
-            dr.scatter_add(jump, dr.select((place.sample & 1) == 0, value, -value), place.sample >> 1)
+            signed = dr.select((place.sample & 1) == 0, value, -value)
+            # Left to itself, Dr.Jit chooses a way that writes the number of points into the program.
+            dr.scatter_add(jump, signed, place.sample >> 1, mode=dr.ReduceMode.Local)
         dr.eval(jump)
         return jump
 

@@ -17,7 +17,7 @@ class Pass:
         self.hits: Hits | None = None
 
     def image(self, values: Any, background: Any) -> Any:
-        """The flat [b, 3, h, w] image; keeps what was hit."""
+        """The flat [b, c, h, w] image; keeps what was hit."""
         dr, rows, launch = self.dr, self._rows(values), Launch(self.set, self.view, background)
         self.hits = self._trace_pixels(launch, rows)
         out = dr.opaque(background)  # memory of its own: the background's belongs to torch
@@ -43,8 +43,21 @@ class Pass:
         dr.eval(gradient)
         return gradient
 
+    def gradient_of_background(self, values: Any, background: Any, adjoint: Any) -> Any:
+        """Gradient by ``background``: the adjoint where and as far as the background is seen."""
+        dr, launch = self.dr, Launch(self.set, self.view, background)
+        through = dr.opaque(adjoint)
+        if self.hits:
+            place, _ = self.hits.at(self.hits.lane)
+            hidden = self.hits.occlusion.weight(self._rows(values), place, self.hits.record.t)
+            hidden /= self.set.samples_per_pixel
+            for weight, where in zip(launch.look(adjoint, place.pixel), launch.planes(place.pixel), strict=True):
+                dr.scatter_add(through, -hidden * weight, where, mode=dr.ReduceMode.Local)
+        dr.eval(through)
+        return through
+
     def _rows(self, values: Any) -> Rows:
-        return Rows(self.mi, self.dr, values, self.view.camera)
+        return self.view.sight.rows(values, self.view.camera)
 
     def _trace_pixels(self, launch: Launch, rows: Rows) -> Hits | None:
         setting, view = self.set, self.view

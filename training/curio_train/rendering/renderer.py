@@ -9,18 +9,24 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.data.meshes import Mesh
+from curio_train.data.simplification import simplified
 from curio_train.errors import RendererError
 from curio_train.rendering.bounds import project_bounds
+from curio_train.rendering.color import linear_from_srgb
+from curio_train.rendering.ground import Ground
 from curio_train.rendering.launch import Setting, View
-from curio_train.rendering.layers import LayerTracer
+from curio_train.rendering.layers import LayerTracer, Objects, Sight
 from curio_train.rendering.passes import Pass
 from curio_train.rendering.rows import ROW_SIZE
 from curio_train.rendering.scene import build_scene
+from curio_train.rendering.shadows import GroundShadows, fallen
 from curio_train.rendering.silhouettes import OutlineSampler
 from curio_train.rendering.variant import Variant, load_mitsuba
 
 MAX_RAYS = 4_000_000
 """Rays traced at once; larger batches are split, with the same result."""
+MIN_FACES = 16_384
+"""What a mesh may keep in any image; in larger images it is one face a pixel."""
 
 
 class Renderer:
@@ -40,19 +46,21 @@ class Renderer:
         ambient: float,
         samples_per_pixel: int = 4,
         outline_samples: int = 512,
-        variant: Variant = "llvm_ad_rgb",
+        object_shadows: bool = False,
+        variant: Variant | None = None,
     ) -> None:
         """Build the static scene.
 
         Args:
-            meshes: One a kind of object.
+            meshes: One a kind of object. Those with many more faces than the images have pixels are traced simplified.
             kind_of_slot: Index into ``meshes`` for each slot of the scene code.
             width: Of the images, pixels.
             height: Of the images, pixels.
             ambient: Radiance from everywhere.
             samples_per_pixel: Rays a pixel.
             outline_samples: Points on each object's outline, for the gradient.
-            variant: See variant.py.
+            object_shadows: Objects stand in each other's light; the moving border of these shadows has no gradient.
+            variant: Of Mitsuba; None: chosen for this machine, see variant.py.
 
         Raises:
             RendererError: No usable libLLVM, or a mesh that cannot be rendered.
@@ -60,7 +68,7 @@ class Renderer:
         import drjit
 
         mitsuba = load_mitsuba(variant)
-        static = build_scene(mitsuba, meshes)
+        static = build_scene(mitsuba, [simplified(mesh, max(MIN_FACES, width * height)) for mesh in meshes])
         if not kind_of_slot or not all(0 <= k < len(meshes) for k in kind_of_slot):
             raise RendererError(f"kind_of_slot is {list(kind_of_slot)}; every slot needs one of {len(meshes)} meshes")
         self.setting = Setting(
@@ -73,6 +81,7 @@ class Renderer:
             len(kind_of_slot),
             samples_per_pixel,
             outline_samples,
+            object_shadows,
         )
         placements = [static.placements[k] for k in kind_of_slot]
         self._center = torch.tensor(np.array([p.center_m for p in placements]), dtype=torch.float32)
@@ -105,24 +114,60 @@ class Renderer:
             seed: Of the jitter within pixels and along outlines.
 
         Returns:
-            sRGB images. Gradients flow to everything but ``camera_matrix`` and ``backgrounds``.
+            sRGB images. Gradients flow to everything but ``camera_matrix``.
 
         Raises:
             RendererError: The camera matrix has skew or the shapes differ.
         """
-        batch, setting = rotation.shape[0], self.setting
-        expected = (batch, 3, setting.height, setting.width)
+        setting = self.setting
+        expected = (rotation.shape[0], 3, setting.height, setting.width)
         if tuple(backgrounds.shape) != expected or rotation.shape[1] != setting.num_slots:
             raise RendererError(
                 f"rotations {tuple(rotation.shape)} and backgrounds {tuple(backgrounds.shape)} do not fit a renderer "
                 f"of {setting.num_slots} slots and {setting.width}x{setting.height} pixels"
             )
+        device = rotation.device
+        rotation, translation_m, light, color, confidence = _on_host(rotation, translation_m, light, color, confidence)
         rows = self._pack(rotation, translation_m, light, color, confidence)
+        corners_m, intrinsics = self._corners(rotation, translation_m), _intrinsics(camera_matrix, len(rotation))
+        views = self._views(corners_m, intrinsics, Objects(setting.mi, setting.dr), seed)
+        return _Render.apply(rows, backgrounds.cpu(), setting, views).to(device)
+
+    def shadows(
+        self,
+        rotation: Float[Tensor, "batch slots 3 3"],
+        translation_m: Float[Tensor, "batch slots 3"],
+        *,
+        camera_matrix: np.ndarray,
+        ground: Ground,
+        light: Float[Tensor, "batch 3"],
+        confidence: Float[Tensor, "batch slots"] | None = None,
+        seed: int = 0,
+    ) -> Float[Tensor, "batch 1 height width"]:
+        """Share of the light that the objects keep from the ground seen in each pixel, see shadows.py.
+
+        Arguments are those of a call; gradients flow to pose, light and confidence. Light from below the ground's
+        horizon throws no shadow.
+
+        Raises:
+            RendererError: The camera matrix has skew.
+        """
+        setting, device = self.setting, rotation.device
+        rotation, translation_m, light, confidence = _on_host(rotation, translation_m, light, confidence)
+        rows = self._pack(rotation, translation_m, light, None, confidence)
+        towards = np.repeat(light.detach().numpy(), setting.num_slots, axis=0)
+        corners_m = fallen(self._corners(rotation, translation_m), towards, ground)
+        sight = GroundShadows(setting.mi, setting.dr, ground)
+        views = self._views(corners_m, _intrinsics(camera_matrix, len(rotation)), sight, seed)
+        unshaded = torch.zeros(len(rotation), 1, setting.height, setting.width)
+        return _Render.apply(rows, unshaded, setting, views).to(device)
+
+    def _corners(self, rotation: Tensor, translation_m: Tensor) -> np.ndarray:
+        """[batch · slots, n, 3], of polytopes around the objects, camera frame."""
         # In numpy: torch would wake its threads for it, and those then spin beside the renderer's.
-        turn, shift = (v.detach().float().cpu().numpy() for v in (rotation, translation_m))
+        turn, shift = (v.detach().numpy() for v in (rotation, translation_m))
         corners_m = self._corners_m @ turn.swapaxes(-1, -2) + shift[:, :, None]
-        views = self._views(corners_m.reshape(-1, *corners_m.shape[2:]), _intrinsics(camera_matrix, batch), seed)
-        return _Render.apply(rows, backgrounds, self.setting, views)
+        return np.asarray(corners_m.reshape(-1, *corners_m.shape[2:]))
 
     def _pack(
         self, rotation: Tensor, translation_m: Tensor, light: Tensor, color: Tensor | None, confidence: Tensor | None
@@ -139,7 +184,7 @@ class Renderer:
         parts = [origin, matrix.flatten(2), light_in_object, albedo, confidence[..., None]]
         return torch.cat(parts, dim=-1).reshape(-1, ROW_SIZE)
 
-    def _views(self, corners_m: np.ndarray, intrinsics: np.ndarray, seed: int) -> list[View]:
+    def _views(self, corners_m: np.ndarray, intrinsics: np.ndarray, sight: Sight, seed: int) -> list[View]:
         setting, n = self.setting, self.setting.num_slots
         per_row = np.repeat(intrinsics, n, axis=0)
         bounds = project_bounds(corners_m, per_row, setting.width, setting.height)
@@ -150,13 +195,14 @@ class Renderer:
         while first < len(intrinsics):
             last = first + max(1, int(np.searchsorted(np.cumsum(num_rays[first:]), MAX_RAYS, side="right")))
             low, high = first * n, last * n
-            views.append(View((first, last), bounds.part(low, high), setting.mi.Float(camera[low:high].ravel()), key))
+            part = setting.mi.Float(camera[low:high].ravel())
+            views.append(View((first, last), sight, bounds.part(low, high), part, key))
             first = last
         return views
 
 
 class _Render(torch.autograd.Function):
-    """The bridge between torch and Dr.Jit: whole arrays, shared where both are on one device, once each way a view."""
+    """The bridge between torch and Dr.Jit: whole arrays of the host, once each way a view."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, backgrounds: Tensor, setting: Setting, views: list[View]) -> Tensor:
@@ -169,12 +215,16 @@ class _Render(torch.autograd.Function):
         return images
 
     @staticmethod
-    def backward(ctx: Any, adjoint: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, adjoint: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
         rows, *images = ctx.saved_tensors
-        gradients = []
+        gradients, behind = [], []
         for part, arrays in zip(ctx.passes, _parts(ctx, rows, *images, adjoint), strict=True):
             gradients.append(_tensor(part.gradient(*arrays), (-1, ROW_SIZE)))
-        return torch.cat(gradients).to(rows), None, None, None
+            if ctx.needs_input_grad[1]:
+                values, background, _, weights = arrays
+                through = part.gradient_of_background(values, background, weights)
+                behind.append(_tensor(through, (-1, *adjoint.shape[1:])))
+        return torch.cat(gradients).to(rows), torch.cat(behind).to(adjoint) if behind else None, None, None
 
 
 def _parts(ctx: Any, rows: Tensor, *images: Tensor) -> Iterator[list[Any]]:
@@ -183,11 +233,16 @@ def _parts(ctx: Any, rows: Tensor, *images: Tensor) -> Iterator[list[Any]]:
         first, last = part.view.images
         n = ctx.setting.num_slots
         tensors = [rows[first * n : last * n], *(image[first:last] for image in images)]
-        yield [ctx.setting.mi.Float(t.detach().float().cpu().contiguous().view(-1)) for t in tensors]
+        yield [ctx.setting.mi.Float(t.detach().float().contiguous().view(-1)) for t in tensors]
 
 
 def _tensor(array: Any, shape: tuple[int, ...]) -> Tensor:
     return torch.from_numpy(array.numpy()).view(shape)
+
+
+def _on_host(*tensors: Any) -> list[Any]:
+    """Float32 on the CPU, from where Dr.Jit takes arrays whatever its variant; None stays None."""
+    return [None if tensor is None else tensor.float().cpu() for tensor in tensors]
 
 
 def _intrinsics(camera_matrix: np.ndarray, batch: int) -> np.ndarray:
@@ -196,9 +251,3 @@ def _intrinsics(camera_matrix: np.ndarray, batch: int) -> np.ndarray:
     if np.any(k[:, 0, 1]):
         raise RendererError(f"camera matrix with skew {k[0, 0, 1]}: only pinhole cameras without skew are rendered")
     return k[:, [0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
-
-
-def linear_from_srgb(srgb: Tensor) -> Tensor:
-    """Decode sRGB (IEC 61966-2-1) to linear light, differentiably; values are clipped to [0, 1]."""
-    srgb = srgb.clamp(0, 1)
-    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb.clamp(min=0.04) + 0.055) / 1.055) ** 2.4)

@@ -3,9 +3,9 @@
 Row = image · num_slots + slot.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any
+from typing import Any, Self
 
 ROW_SIZE = 19
 """Differentiable values a row: origin 3, matrix 9, light 3, linear albedo 3, confidence 1."""
@@ -34,9 +34,9 @@ class Rows:
     values: Any
     camera: Any
 
-    def detached(self) -> "Rows":
+    def detached(self) -> Self:
         """The same values, without gradients."""
-        return Rows(self.mi, self.dr, self.dr.detach(self.values), self.camera)
+        return replace(self, values=self.dr.detach(self.values))
 
     def origin(self, row: Any) -> Any:
         """Camera centre, scene frame."""
@@ -48,12 +48,28 @@ class Rows:
         m = self._take(row, 3, 9)
         return self.mi.Vector3f(*[m[3 * i] * x + m[3 * i + 1] * y + m[3 * i + 2] * z for i in range(3)])
 
+    def ray(self, row: Any, x: Any, y: Any) -> Any:
+        """What looks at the object through pixel (x, y), scene frame; the ray parameter is the depth in metres."""
+        return self.mi.Ray3f(self.origin(row), self.turned(row, self.direction(row, x, y)))
+
+    def toward(self, row: Any, point: Any) -> Any:
+        """From a point to where it is looked at from, scene frame."""
+        return self.origin(row) - point
+
     def to_camera(self, row: Any, point: Any) -> Any:
         """Scene frame to camera frame, metres: q = s² matrixᵀ (p − origin), as p = matrix · q + origin."""
         dr, m = self.dr, self._take(row, 3, 9)
         d = point - self.origin(row)
         scale = 1 / (dr.square(m[0]) + dr.square(m[1]) + dr.square(m[2]))
         return scale * self.mi.Vector3f(*[m[i] * d.x + m[3 + i] * d.y + m[6 + i] * d.z for i in range(3)])
+
+    def direction_to_camera(self, row: Any, vector: Any) -> Any:
+        """Turn a direction of the object's frame to the camera's: s matrixᵀ = R."""
+        dr, m = self.dr, self._take(row, 3, 9)
+        scale = dr.rsqrt(dr.square(m[0]) + dr.square(m[1]) + dr.square(m[2]))
+        return scale * self.mi.Vector3f(
+            *[m[i] * vector.x + m[3 + i] * vector.y + m[6 + i] * vector.z for i in range(3)]
+        )
 
     def light(self, row: Any) -> Any:
         """Towards the light in the object's frame, its length the strength."""

@@ -91,6 +91,7 @@ def mesh_shape(
     vertices: np.ndarray,
     neighbours: Adjacency,
     tint: np.ndarray | tuple[float, float, float] = (1.0, 1.0, 1.0),
+    opacity: float | None = None,
 ) -> Any:
     """A ``mitsuba.Mesh`` with smooth normals between folds and a diffuse BSDF of the mesh's own colours.
 
@@ -101,13 +102,17 @@ def mesh_shape(
         vertices: [v, 3], where the mesh's vertices stand in the scene.
         neighbours: Its edges.
         tint: Linear albedo that multiplies the mesh's own.
+        opacity: Of both sides of the surface; None: solid, from outside.
     """
     source, faces, normals = smooth_normals(vertices, neighbours)
     uv = mesh.uv if mesh.texture is not None else None
     colors = mesh.vertex_colors_srgb if uv is None else None
     properties = mitsuba.Properties()
     reflectance = _reflectance(mitsuba, mesh, np.asarray(tint, dtype=np.float32))
-    properties["bsdf"] = mitsuba.load_dict({"type": "diffuse", "reflectance": reflectance})
+    material: dict[str, Any] = {"type": "diffuse", "reflectance": reflectance}
+    if opacity is not None:
+        material = {"type": "mask", "opacity": opacity, "surface": {"type": "twosided", "material": material}}
+    properties["bsdf"] = mitsuba.load_dict(material)
     shape = mitsuba.Mesh(
         name,
         vertex_count=len(source),

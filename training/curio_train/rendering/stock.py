@@ -26,12 +26,14 @@ class PosedMesh:
         rotation: cam_from_obj, [3, 3].
         translation_m: cam_from_obj, [3].
         color_srgb: Albedo [3] that multiplies the mesh's own.
+        opacity: In [0, 1], seen from both sides; None: solid, and its inside is black, as Mitsuba has it by default.
     """
 
     mesh: Mesh
     rotation: np.ndarray
     translation_m: np.ndarray
-    color_srgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    color_srgb: tuple[float, ...] = (1.0, 1.0, 1.0)
+    opacity: float | None = None
 
 
 def sensor(mitsuba: Any, camera_matrix: np.ndarray, width: int, height: int, samples_per_pixel: int) -> dict[str, Any]:
@@ -87,4 +89,5 @@ def _posed_shape(mitsuba: Any, name: str, item: PosedMesh) -> Any:
     posed = item.mesh.vertices_m @ item.rotation.T + item.translation_m
     middle, size = item.translation_m, np.abs(item.mesh.vertices_m).max()
     neighbours = adjacency((posed - middle) / size, item.mesh.faces)
-    return mesh_shape(mitsuba, name, item.mesh, posed, neighbours, linear_from_srgb(np.array(item.color_srgb)))
+    tint = linear_from_srgb(np.array(item.color_srgb))
+    return mesh_shape(mitsuba, name, item.mesh, posed, neighbours, tint, item.opacity)

@@ -11,8 +11,11 @@ import glob
 import logging
 import os
 import re
+import sys
 from types import ModuleType
-from typing import Literal
+from typing import Literal, get_args
+
+import torch
 
 from curio_train.errors import RendererError
 
@@ -26,6 +29,12 @@ LIBRARY_FOLDERS = (
     "/usr/local/lib",
     "/usr/lib",
 )
+CUDA_LIBRARIES = ("libcuda.so.1", "libnvoptix.so.1")
+"""What the driver must bring for ``cuda_ad_rgb``: CUDA and OptiX."""
+
+FORCED = "CURIO_VARIANT"
+"""Environment variable that names the variant, whatever the machine has."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -69,8 +78,8 @@ def check_llvm() -> str:
 def optix_available() -> bool:
     """Whether the driver brings CUDA and OptiX, which ``cuda_ad_rgb`` needs."""
     try:
-        ctypes.CDLL("libcuda.so.1")
-        ctypes.CDLL("libnvoptix.so.1")
+        for name in CUDA_LIBRARIES:
+            ctypes.CDLL(name)
     except OSError:
         return False
     return True
@@ -85,7 +94,17 @@ def _say_fallback_once() -> None:
 
 
 def choose_variant(prefer_cuda: bool) -> Variant:
-    """CUDA where asked for and possible, else LLVM."""
+    """The environment's choice; else CUDA where asked for and possible, else LLVM.
+
+    Raises:
+        RendererError: The environment names another variant.
+    """
+    forced = os.environ.get(FORCED)
+    if forced:
+        known: dict[str, Variant] = {name: name for name in get_args(Variant)}
+        if forced not in known:
+            raise RendererError(f"{FORCED} is {forced!r}, expected one of {', '.join(known)}, or unset it")
+        return known[forced]
     if prefer_cuda and optix_available():
         return "cuda_ad_rgb"
     if prefer_cuda:
@@ -93,12 +112,18 @@ def choose_variant(prefer_cuda: bool) -> Variant:
     return "llvm_ad_rgb"
 
 
-def load_mitsuba(variant: Variant = "llvm_ad_rgb") -> ModuleType:
+def load_mitsuba(variant: Variant | None = None) -> ModuleType:
     """Import Mitsuba with that variant active in the calling thread.
+
+    Args:
+        variant: None: the one that is in use in this process already, else CUDA where torch computes there and the
+            driver brings OptiX, else LLVM.
 
     Raises:
         RendererError: libLLVM is missing or too old, or another variant is already in use.
     """
+    loaded = sys.modules.get("mitsuba")
+    variant = variant or (loaded and loaded.variant()) or choose_variant(torch.cuda.is_available())
     if variant == "llvm_ad_rgb":
         os.environ["DRJIT_LIBLLVM_PATH"] = check_llvm()
     import mitsuba

@@ -1,0 +1,176 @@
+"""curio-render: detections and scene codes to pictures."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from curio_train import cli
+from curio_train.views.scenes import mesh_world
+
+WIDTH, HEIGHT = 64, 48
+MATRIX = [[70.0, 0.0, 30.0], [0.0, 66.0, 25.0], [0.0, 0.0, 1.0]]
+PLACE = [0.02, -0.01, 0.4]
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Exit status, stdout and stderr of the command."""
+    with pytest.raises(SystemExit) as exit_:
+        cli.render([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return int(exit_.value.code or 0), out, err
+
+
+def pixels(path: Path) -> np.ndarray:
+    """[height, width, 3] in [0, 1]."""
+    image = cv2.imread(str(path))
+    assert image is not None, path
+    return image[..., ::-1].astype(np.float64) / 255
+
+
+def detection_line(**changes: Any) -> dict[str, Any]:
+    """A line as curio-detect writes it."""
+    detection = {
+        "object": "egg",
+        "confidence": 1.0,
+        "translation_m": PLACE,
+        "rotation": np.eye(3).tolist(),
+        "rotation_6d": [1, 0, 0, 0, 1, 0],
+        "quaternion_xyzw": [0, 0, 0, 1],
+        "color": [0.9, 0.4, 0.2],
+        "box_px": None,
+    }
+    line = {"image": "frames/one.jpg", "width": WIDTH, "height": HEIGHT, "camera_matrix": MATRIX}
+    return {
+        **line,
+        "detections": [detection],
+        "light": [0.2, -0.4, -0.4],
+        "model": {"name": "egg", "version": 1},
+    } | changes
+
+
+@pytest.fixture
+def egg(tmp_path: Path) -> Path:
+    """A convex mesh."""
+    shape = trimesh.creation.icosphere(subdivisions=3)
+    path = tmp_path / "egg.ply"
+    trimesh.Trimesh(np.asarray(shape.vertices) * [0.06, 0.08, 0.05], shape.faces).export(path)
+    return path
+
+
+@pytest.fixture
+def lines(tmp_path: Path) -> Path:
+    """Two detections, and between them a frame that could not be read."""
+    path = tmp_path / "poses.jsonl"
+    failed = {"image": "frames/two.jpg", "error": "not an image", "model": {"name": "egg", "version": 1}}
+    records = [detection_line(), failed, detection_line(image="three.png", light=None)]
+    path.write_text("".join(json.dumps(record) + "\n" for record in records))
+    return path
+
+
+def test_detections_become_pictures(capsys, lines: Path, egg: Path, tmp_path: Path) -> None:
+    status, out, err = run(capsys, lines, "--mesh", egg, "--out", tmp_path / "pictures")
+    assert (status, err) == (0, "")
+    assert [Path(line).name for line in out.splitlines()] == ["000001-one.png", "000003-three.png"]
+    image = pixels(Path(out.splitlines()[0]))
+    assert image.shape == (HEIGHT, WIDTH, 3)
+    line, column = np.nonzero(image.sum(-1) > 0.1)
+    x, y, z = PLACE
+    assert column.mean() == pytest.approx(70 * x / z + 30, abs=0.7)
+    assert line.mean() == pytest.approx(66 * y / z + 25, abs=0.7)
+    red, green, blue = image[25, 33]
+    assert red > green > blue
+
+
+def test_path_tracer_shows_the_same_object(capsys, lines: Path, egg: Path, tmp_path: Path) -> None:
+    """One convex object lights and hides nothing else: both draw the same, also where pixels are not square."""
+    for folder, flag in (("ours", []), ("traced", ["--path-traced", "--samples", 256])):
+        assert run(capsys, lines, "--mesh", egg, "--out", tmp_path / folder, "--height", 96, *flag)[0] == 0
+    ours, traced = (pixels(tmp_path / folder / "000001-one.png") for folder in ("ours", "traced"))
+    assert ours.shape == traced.shape == (96, 128, 3)
+    seen = (ours.sum(-1) > 0) | (traced.sum(-1) > 0)
+    assert seen.sum() > 300
+    assert np.abs(ours - traced)[seen].mean() < 0.02
+
+
+def test_objects_lie_over_their_photograph(capsys, egg: Path, tmp_path: Path) -> None:
+    photograph = tmp_path / "one.png"
+    content = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    cv2.imwrite(str(photograph), content)
+    scenes = tmp_path / "scene.json"
+    scenes.write_text(json.dumps(detection_line(image=str(photograph)), indent=1))
+    for flags in ([], ["--path-traced"]):
+        call = [scenes, "--mesh", f"egg={egg}", "--out", tmp_path, "--over-photograph", "--samples", 16, *flags]
+        status, out, _ = run(capsys, *call)
+        assert status == 0
+        image = pixels(Path(out.strip())) * 255
+        assert np.abs(image[:8] - content[:8, :, ::-1]).max() <= 1
+        assert np.abs(image[20:30, 30:36] - content[20:30, 30:36, ::-1]).mean() > 20
+
+
+@pytest.mark.parametrize("name", ["varied", "light"])
+def test_codes_look_as_in_their_world(capsys, tmp_path: Path, name: str) -> None:
+    """From the world's own camera and from 90° round the scene."""
+    world = mesh_world(name)
+    code = world.sample(1, (3, 4))
+    scenes = tmp_path / "codes.jsonl"
+    scenes.write_text(json.dumps({"world": name, "code": {key: value[0].tolist() for key, value in code.items()}}))
+    with torch.no_grad():
+        expected = {0: world.render(code), 90: world.novel_view(code)}
+    for turn, image in expected.items():
+        status, out, err = run(capsys, scenes, "--out", tmp_path / str(turn), "--turn-deg", turn)
+        assert status == 0, err
+        difference = np.abs(pixels(Path(out.strip())) - image[0].permute(1, 2, 0).numpy())
+        assert difference.mean() < 0.01, turn
+        assert image.std() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("content", "arguments", "status", "message"),
+    [
+        (None, [], 1, "cannot be read"),
+        ("", [], 1, "the file is empty"),
+        ('{"image": 1}\n{"broken', [], 1, "line 1: found .* expected a line of curio-detect"),
+        ('{"error": "no"}\n{"broken', [], 1, "line 2: not JSON"),
+        ("[1, 2]", [], 1, "expected a line of curio-detect"),
+        (detection_line(detections=[{"object": "egg"}]), [], 1, "line 1: not a scene"),
+        (detection_line(light=[0, 1]), [], 1, "light is .* expected finite numbers of shape"),
+        (detection_line(camera_matrix=None), [], 1, "it is flat"),
+        (detection_line(camera_matrix=[[1, 2], [3, 4]]), [], 1, "camera_matrix"),
+        (detection_line(), ["--over-photograph"], 1, "one.jpg: the image cannot be read"),
+        (detection_line(), ["--over-photograph", "--turn-deg", "5"], 2, "exclude each other"),
+        (detection_line(), ["--world", "chairs"], 2, "exclude each other"),
+        (detection_line(), ["--samples", "0"], 2, "at least 1"),
+        ({"world": "atlantis", "code": {}}, [], 1, "expected one of spheres"),
+        ({"world": "circles", "code": {}}, [], 1, "expected one of spheres"),
+        ({"world": "spheres", "code": {"light": [1, 2]}}, [], 1, "scene code has"),
+    ],
+)
+def test_bad_input_is_one_message(
+    capsys, egg: Path, tmp_path: Path, content: object, arguments: list[str], status: int, message: str
+) -> None:
+    scenes = tmp_path / "scenes.jsonl"
+    if content is not None:
+        scenes.write_text(content if isinstance(content, str) else json.dumps(content))
+    found, out, err = run(capsys, scenes, "--mesh", egg, "--out", tmp_path / "out", *arguments)
+    assert (found, out) == (status, "")
+    assert err.startswith("error: ")
+    assert re.search(message, err), err
+
+
+def test_missing_meshes_are_named(capsys, lines: Path, egg: Path, tmp_path: Path) -> None:
+    assert "add --mesh FILE or --world" in run(capsys, lines, "--out", tmp_path)[2]
+    assert "no mesh for object 'egg'" in run(capsys, lines, "--out", tmp_path, "--mesh", f"ball={egg}")[2]
+    assert "with different names" in run(capsys, lines, "--out", tmp_path, "--mesh", egg, egg)[2]
+
+
+def test_a_folder_that_cannot_be_made(capsys, lines: Path, egg: Path, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    status, _, err = run(capsys, lines, "--mesh", egg, "--out", tmp_path / "taken")
+    assert status == 1
+    assert "the picture cannot be written" in err

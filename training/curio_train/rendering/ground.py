@@ -1,0 +1,41 @@
+"""A level ground under the objects: a plane of one colour, lit like everything else."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from curio_train.rendering.color import linear_from_srgb, srgb_from_linear
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """A plane as a camera above it sees it; it fills the whole image, also above the horizon.
+
+    Attributes:
+        up: Its unit normal [3], camera frame.
+        camera_height_m: How far below the camera it lies.
+        albedo_srgb: Grey, in [0, 1].
+    """
+
+    up: np.ndarray
+    camera_height_m: float
+    albedo_srgb: float
+
+    def image(
+        self, ambient: float, light: Float[Tensor, "batch 3"], shadow: Float[Tensor, "batch 1 height width"]
+    ) -> Float[Tensor, "batch 3 height width"]:
+        """What is seen of it, in sRGB: albedo · (ambient + max(0, n·l)) where no shadow falls.
+
+        Args:
+            ambient: Radiance from everywhere; it knows no shadows.
+            light: Camera frame, towards the light; its length is the strength.
+            shadow: Share of each pixel that no light reaches.
+        """
+        albedo = linear_from_srgb(light.new_tensor(self.albedo_srgb))
+        sun = (light @ torch.as_tensor(self.up).to(light)).clamp(min=0)
+        lit, dark = srgb_from_linear(albedo * (ambient + sun)), srgb_from_linear(albedo * ambient)
+        lit = lit.view(-1, 1, 1, 1)
+        return (lit + shadow * (dark - lit)).expand(-1, 3, -1, -1)
