@@ -1,6 +1,6 @@
 """What serving costs over the bare model, and how it behaves below and beyond its limit.
 
-    python benchmarks/serving.py [--json] [--seconds 6] [--rounds 3]
+    python benchmarks/serving.py [--json] [--seconds 6] [--rounds 3] [--peers]
 
 Everything is measured on this machine, over the loopback: 640x480 JPEGs, the paper's network, a real ``curio-serve``
 process, and a load generator in a process of its own.
@@ -15,6 +15,10 @@ goodput_at_3x     good answers a second while three times the saturating rate is
 
 For the last two lines the server has one half of the cores and the load generator the other, so that making load does
 not pass for the server's weakness. ``offered_over_peak`` says what load was really made.
+
+With ``--peers``, other servers around the same decoding, warp and session stand beside ours under ``peers``, each with
+its version, the CPU time a request of all its processes, the answers a second at concurrency 4 with the load generator
+on the same cores, latency at concurrency 1, and the memory of all its processes.
 """
 
 import json
@@ -29,6 +33,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +41,9 @@ import grpc
 import numpy as np
 import tyro
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from load.generator import MODEL, WIDTH, K, bare_cpu_ms, closed_loop, make_frames, open_loop
+from load.generator import MODEL, WIDTH, K, Target, bare_cpu_ms, closed_loop, make_frames, open_loop, pose_target
 from load.network import write_model
+from load.peers import all_peers, installed_version, prepare, running_peer
 
 _START_LIMIT_S = 60.0
 _WARM_UP_S = 2.0
@@ -53,6 +59,8 @@ class Arguments:
     """Length of each measurement."""
     rounds: int = 3
     """How often bare loop and server are measured in turn."""
+    peers: bool = False
+    """Put the same load on other servers too; installs them into the user's cache folder the first time."""
 
 
 def main() -> None:
@@ -65,6 +73,8 @@ def main() -> None:
         figures = {"ready_s": round(statistics.median(start_time_s(models) for _ in range(3)), 3)}
         figures |= cost(models, frames, arguments)
         figures |= limits(models, frames, arguments.seconds)
+        if arguments.peers:
+            figures["peers"] = beside_peers(models, frames, arguments.seconds)
     if arguments.json:
         print(json.dumps(figures))
         return
@@ -77,17 +87,18 @@ def cost(models: Path, frames: list[bytes], arguments: Arguments) -> dict[str, A
     cores = sorted(os.sched_getaffinity(0))
     raw_ms, served_ms = [], []
     with running_server(models, cores) as (address, pid), worker(cores) as load:
-        load(closed_loop, address, frames, 4, _WARM_UP_S)
-        alone = load(closed_loop, address, frames, 1, arguments.seconds)
+        target = pose_target(address, frames)
+        load(closed_loop, target, 4, _WARM_UP_S)
+        alone = load(closed_loop, target, 1, arguments.seconds)
         for _ in range(arguments.rounds):
             with worker(cores) as bare:
                 raw_ms.append(bare(bare_cpu_ms, models / MODEL, frames, len(cores), arguments.seconds))
             before_s = cpu_s(pid)
-            served = load(closed_loop, address, frames, 4, arguments.seconds)
+            served = load(closed_loop, target, 4, arguments.seconds)
             served_ms.append(1000 * (cpu_s(pid) - before_s) / served["codes"]["OK"])
         rss_mb, peak_rss_mb = memory_mb(pid)
     return {
-        "served_over_raw": round(statistics.median(np.divide(raw_ms, served_ms)), 3),
+        "served_over_raw": round(float(np.median(np.divide(raw_ms, served_ms))), 3),
         "raw_cpu_ms": round(statistics.median(raw_ms), 3),
         "served_cpu_ms": round(statistics.median(served_ms), 3),
         "frame_ms": round(statistics.median(alone["latencies_ms"]), 3),
@@ -101,10 +112,11 @@ def limits(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any]:
     cores = sorted(os.sched_getaffinity(0))
     half = max(1, len(cores) // 2)
     with running_server(models, cores[:half]) as (address, _), worker(cores[half:] or cores) as load:
-        load(closed_loop, address, frames, 4, _WARM_UP_S)
-        peak = max(load(closed_loop, address, frames, c * half, seconds)["goodput"] for c in (2, 8))
-        calm = load(open_loop, address, frames, peak / 2, seconds)
-        flood = load(open_loop, address, frames, 3 * peak, seconds)
+        target = pose_target(address, frames)
+        load(closed_loop, target, 4, _WARM_UP_S)
+        peak = max(load(closed_loop, target, c * half, seconds)["goodput"] for c in (2, 8))
+        calm = load(open_loop, target, peak / 2, seconds)
+        flood = load(open_loop, target, 3 * peak, seconds)
     p50_ms, p99_ms = np.percentile(calm["latencies_ms"], (50, 99))
     return {
         "p50_ms": round(float(p50_ms), 3),
@@ -116,6 +128,38 @@ def limits(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any]:
     }
 
 
+def beside_peers(models: Path, frames: list[bytes], seconds: float) -> dict[str, dict[str, Any]]:
+    """The same load on ours and on each peer, one after the other."""
+    cores = sorted(os.sched_getaffinity(0))
+    with worker(cores) as bare:
+        raw_ms = bare(bare_cpu_ms, models / MODEL, frames, len(cores), seconds)
+    with running_server(models, cores) as (address, pid):
+        figures = {"curio": {"version": version("curio-pose"), **load_on(pose_target(address, frames, pid), seconds)}}
+    for peer in all_peers():
+        python = prepare(peer)
+        with running_peer(peer, python, models / MODEL / "1" / "model.onnx", frames, len(cores)) as target:
+            found = {"version": installed_version(python, peer.package), **load_on(target, seconds)}
+        figures[peer.name] = found
+    for found in figures.values():
+        found["served_over_raw"] = round(raw_ms / found["cpu_ms"], 3)
+    return figures
+
+
+def load_on(target: Target, seconds: float) -> dict[str, Any]:
+    """CPU time a request, answers a second, latency and memory of one server."""
+    with worker(sorted(os.sched_getaffinity(0))) as load:
+        load(closed_loop, target, 4, _WARM_UP_S)
+        alone = load(closed_loop, target, 1, seconds)
+        before_s = sum(map(cpu_s, target.processes))
+        served = load(closed_loop, target, 4, seconds)
+    return {
+        "cpu_ms": round(1000 * (sum(map(cpu_s, target.processes)) - before_s) / served["codes"]["OK"], 3),
+        "per_s": round(served["goodput"], 1),
+        "frame_ms": round(statistics.median(alone["latencies_ms"]), 3),
+        "rss_mb": round(sum(memory_mb(pid)[0] for pid in target.processes), 1),
+    }
+
+
 def start_time_s(models: Path) -> float:
     """Seconds from starting a server until it says that it serves."""
     begun = time.perf_counter()
@@ -124,10 +168,10 @@ def start_time_s(models: Path) -> float:
 
 
 @contextmanager
-def running_server(models: Path, cores: Sequence[int]) -> Iterator[tuple[str, int]]:
+def running_server(models: Path, cores: Sequence[int], *flags: str) -> Iterator[tuple[str, int]]:
     """Address and process id of a server on these cores, once its health service says SERVING."""
     program = "from curio_serve.serve_cli import main; main()"
-    call = [sys.executable, "-c", program, str(models), "--port", "0", "--log-level", "warning"]
+    call = [sys.executable, "-c", program, str(models), "--port", "0", "--log-level", "warning", *flags]
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)  # inherited
     try:

@@ -5,6 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -82,19 +83,50 @@ def bare_folder(model_folder: str, frames: str, num_threads: str) -> None:
             pass
 
 
-def closed_loop(address: str, frames: list[bytes], concurrency: int, seconds: float) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Target:
+    """A server and the calls that are put on it.
+
+    Attributes:
+        address: host:port.
+        method: gRPC's path of the call.
+        requests: Serialised messages, sent in turn.
+        processes: The server's.
+    """
+
+    address: str
+    method: str
+    requests: list[bytes]
+    processes: tuple[int, ...] = ()
+
+
+def pose_target(address: str, frames: list[bytes], *processes: int) -> Target:
+    """``Detect`` calls with these frames."""
+    from curio_proto.v1.detector_pb2 import Camera, DetectRequest, ModelSelector
+
+    camera, models = Camera(camera_matrix=K.ravel()), [ModelSelector(name=MODEL)]
+    requests = [DetectRequest(models=models, camera=camera, encoded=frame).SerializeToString() for frame in frames]
+    return Target(address, _METHOD, requests, processes)
+
+
+def closed_loop(target: Target, concurrency: int, seconds: float) -> dict[str, Any]:
     """That many callers, each of whom sends the next frame when it has the answer to the last."""
-    return asyncio.run(_closed_loop(address, frames, concurrency, seconds))
+    return asyncio.run(_closed_loop(target, concurrency, seconds))
 
 
-def open_loop(address: str, frames: list[bytes], rate: float, seconds: float) -> dict[str, Any]:
+def closed_loop_of(target: Target, concurrency: int, num_calls: int) -> dict[str, int]:
+    """The same for that many calls; how many ended with each code."""
+    return asyncio.run(_closed_loop_of(target, concurrency, num_calls))
+
+
+def open_loop(target: Target, rate: float, seconds: float) -> dict[str, Any]:
     """Frames that come evenly, whether or not earlier ones are answered. Latency counts from when one was due."""
-    return asyncio.run(_open_loop(address, frames, rate, seconds))
+    return asyncio.run(_open_loop(target, rate, seconds))
 
 
-async def _closed_loop(address: str, frames: list[bytes], concurrency: int, seconds: float) -> dict[str, Any]:
-    async with grpc.aio.insecure_channel(address) as channel:
-        record = _Record(channel, frames)
+async def _closed_loop(target: Target, concurrency: int, seconds: float) -> dict[str, Any]:
+    async with grpc.aio.insecure_channel(target.address) as channel:
+        record = _Record(channel, target)
         begun = time.perf_counter()
         end = begun + seconds
 
@@ -106,9 +138,22 @@ async def _closed_loop(address: str, frames: list[bytes], concurrency: int, seco
         return record.summary(time.perf_counter() - begun)
 
 
-async def _open_loop(address: str, frames: list[bytes], rate: float, seconds: float) -> dict[str, Any]:
-    async with grpc.aio.insecure_channel(address) as channel:
-        record = _Record(channel, frames)
+async def _closed_loop_of(target: Target, concurrency: int, num_calls: int) -> dict[str, int]:
+    async with grpc.aio.insecure_channel(target.address) as channel:
+        record = _Record(channel, target)
+        numbers = iter(range(num_calls))
+
+        async def caller() -> None:
+            for _ in numbers:  # shared, so that the callers do them all together
+                await record.call(time.perf_counter())
+
+        await asyncio.gather(*(caller() for _ in range(concurrency)))
+        return dict(record.codes)
+
+
+async def _open_loop(target: Target, rate: float, seconds: float) -> dict[str, Any]:
+    async with grpc.aio.insecure_channel(target.address) as channel:
+        record = _Record(channel, target)
         begun = time.perf_counter()
         calls = set()
         due = begun
@@ -124,35 +169,30 @@ async def _open_loop(address: str, frames: list[bytes], rate: float, seconds: fl
 
 
 class _Record:
-    """Calls on one channel, with serialised requests, and what became of them."""
+    """Calls on one channel, and what became of them."""
 
-    def __init__(self, channel: grpc.aio.Channel, frames: list[bytes]) -> None:
-        from curio_proto.v1.detector_pb2 import Camera, DetectRequest, ModelSelector
-
-        camera, models = Camera(camera_matrix=K.ravel()), [ModelSelector(name=MODEL)]
-        self._requests = [
-            DetectRequest(models=models, camera=camera, encoded=frame).SerializeToString() for frame in frames
-        ]
-        self._call = channel.unary_unary(_METHOD)
-        self._codes: Counter[str] = Counter()
+    def __init__(self, channel: grpc.aio.Channel, target: Target) -> None:
+        self._requests = target.requests
+        self._call = channel.unary_unary(target.method)
+        self.codes: Counter[str] = Counter()
         self._latencies_ms: list[float] = []
 
     async def call(self, due: float) -> None:
-        request = self._requests[self._codes.total() % len(self._requests)]
+        request = self._requests[self.codes.total() % len(self._requests)]
         try:
             await self._call(request, timeout=DEADLINE_S)
         except grpc.aio.AioRpcError as exc:
-            self._codes[exc.code().name] += 1
+            self.codes[exc.code().name] += 1
             return
-        self._codes["OK"] += 1
+        self.codes["OK"] += 1
         self._latencies_ms.append(1000 * (time.perf_counter() - due))
 
     def summary(self, seconds: float) -> dict[str, Any]:
         """Codes, latencies of good answers, and rates a second."""
         good = sum(latency <= 1000 * DEADLINE_S for latency in self._latencies_ms)
         return {
-            "codes": dict(self._codes),
+            "codes": dict(self.codes),
             "latencies_ms": self._latencies_ms,
             "goodput": good / seconds,
-            "offered": self._codes.total() / seconds,
+            "offered": self.codes.total() / seconds,
         }

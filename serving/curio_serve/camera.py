@@ -112,16 +112,14 @@ class PinholeCamera:
 
     def project(self, points: Array) -> Array:
         """Pixels [n, 2] of points [n, 3] in the camera frame, metres; NaN for points not in front of the camera."""
-        in_front = points[:, 2] > 1e-9
-        safe = points if in_front.all() else np.where(in_front[:, None], points, (0.0, 0.0, 1.0))
+        in_front = points[:, 2:] > 1e-9
+        if not in_front.all():
+            return np.where(in_front, self.project(np.where(in_front, points, (0.0, 0.0, 1.0))), np.nan)
         if self.coefficients is None:
-            seen = safe @ self.matrix.T
-            pixels = seen[:, :2] / seen[:, 2:]
-        else:
-            found, _ = cv2.projectPoints(safe, np.zeros(3), np.zeros(3), self.matrix, self.coefficients)
-            pixels = found[:, 0]
-        pixels[~in_front] = np.nan
-        return pixels
+            seen = points @ self.matrix.T
+            return seen[:, :2] / seen[:, 2:]
+        found, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.matrix, self.coefficients)
+        return found[:, 0]
 
 
 def _check_matrix(matrix: Array) -> None:

@@ -21,9 +21,9 @@ from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
 
 from curio_serve.errors import UsageError
 from curio_serve.request import CameraLike, ImageLike, RegionLike, detect_request, selector
-from curio_serve.retries import Attempts, error_from_call
+from curio_serve.retries import Attempts, error_from_answer, error_from_call
 
-__all__ = ["AsyncPoseClient", "PoseClient", "Tls", "detect_request"]
+__all__ = ["AsyncPoseClient", "PoseClient", "Tls", "detect_request", "error_from_answer"]
 
 # Connect again soon after a server was replaced; gRPC's own first pause is a second.
 _CHANNEL_OPTIONS = (("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_reconnect_backoff_ms", 2000))
@@ -150,12 +150,15 @@ class PoseClient(_Client):
     ) -> Iterator[messages.DetectResponse]:
         """Answers in the order of the requests (see :func:`detect_request`), over one connection; never repeated.
 
+        A frame that could not be answered has an answer without results, whose `error` says why
+        (:func:`error_from_answer`); the stream goes on.
+
         Args:
             requests: May be endless; sent as the server takes them.
             timeout_s: Deadline of the whole stream.
 
         Raises:
-            CurioError: What the server raised, or that it is out of reach.
+            CurioError: The stream as a whole failed, or the server is out of reach.
         """
         call = self._stub.DetectStream(iter(requests), timeout=timeout_s, metadata=self._metadata)
         try:

@@ -57,6 +57,8 @@ class ServeConfig:
     """Seconds between looks for new model versions; 0: never."""
     providers: tuple[str, ...] = ("CPUExecutionProvider",)
     """onnxruntime's execution providers, in order of preference."""
+    batch: int = 0
+    """Most images of several calls in one run of a network; 0: 1 on the CPU, where batches gain nothing, else 8."""
     tls_certificate: Path | None = None
     """Server certificate chain, PEM; with --tls-key turns TLS on."""
     tls_key: Path | None = None
@@ -82,7 +84,8 @@ class ServeConfig:
         """
         least = {
             "port": 0, "workers": 0, "queue": 0, "max_streams": 0, "max_calls": 1, "max_message_mb": 1,
-            "max_pixels": 256, "max_regions": 1, "max_models": 1, "versions": 1, "refresh_s": 0, "grace_s": 0,
+            "max_pixels": 256, "max_regions": 1, "max_models": 1, "versions": 1, "refresh_s": 0, "batch": 0,
+            "grace_s": 0,
         }  # fmt: skip
         for name, smallest in least.items():
             if not getattr(self, name) >= smallest:

@@ -75,7 +75,8 @@ class Detector:
     def _answers(self, images: list[Array]) -> Iterator[Outputs]:
         """The network's outputs for each image, computed a few at a time: memory stays flat however many there are."""
         for start in range(0, len(images), _MAX_BATCH):
-            outputs = self.model.run(np.stack(images[start : start + _MAX_BATCH]))
+            batch = images[start : start + _MAX_BATCH]
+            outputs = self.model.run(batch[0][None] if len(batch) == 1 else np.stack(batch))
             for row in range(len(outputs["translation_m"])):
                 yield {name: value[row] for name, value in outputs.items()}
 
@@ -133,24 +134,41 @@ def _fill(
     max_detections: int | None,
 ) -> None:
     """Turn one image's outputs back into the frame's camera; write down the most confident, best first."""
-    translations = view.translation(outputs["translation_m"].astype(float))
-    rotations = view.turn(outputs["rotation"].astype(float)) if "rotation" in outputs else None
     if "light" in outputs:
         result.light.extend(view.turn(outputs["light"].astype(float)[:, None])[:, 0].tolist())
     confidences = outputs["confidence"].clip(0, 1).tolist() if "confidence" in outputs else [1.0] * len(slots)
     confident = [row for row in range(len(slots)) if confidences[row] >= min_confidence]
+    if not confident:
+        result.status = REGION_STATUS_NO_OBJECT
+        return
+    result.status = REGION_STATUS_DETECTED
+    translations = view.translation(outputs["translation_m"].astype(float))
+    rotations = view.turn(outputs["rotation"].astype(float)) if "rotation" in outputs else None
     for row in sorted(confident, key=lambda row: -confidences[row])[:max_detections]:
-        found = result.detections.add(object=slots[row].object, confidence=confidences[row])
-        found.translation_m.extend(translations[row].tolist())
-        if "color" in outputs:
-            found.color.extend(outputs["color"][row].tolist())
-        rotation = np.eye(3)
-        if rotations is not None:
-            rotation = rotations[row]
-            found.rotation.extend(rotation.ravel().tolist())
-            found.rotation_6d.extend(rotation[:, :2].T.ravel().tolist())
-            found.quaternion_xyzw.extend(quaternion_xyzw(rotation))
-        if len(slots[row].box_corners):
-            corners = slots[row].box_corners @ rotation.T + translations[row]
-            found.box_px.extend(view.project(corners).ravel().tolist())
-    result.status = REGION_STATUS_DETECTED if result.detections else REGION_STATUS_NO_OBJECT
+        rotation = None if rotations is None else rotations[row]
+        result.detections.add(
+            object=slots[row].object,
+            confidence=confidences[row],
+            translation_m=translations[row].tolist(),
+            color=outputs["color"][row].tolist() if "color" in outputs else (),
+            box_px=_box_px(view, slots[row], rotation, translations[row]),
+            **({} if rotation is None else _rotation_fields(rotation)),
+        )
+
+
+def _rotation_fields(rotation: Array) -> dict[str, Sequence[float]]:
+    """A matrix [3, 3] as the messages have it: by rows, as its first two columns, as a quaternion."""
+    rows = rotation.ravel().tolist()
+    return {
+        "rotation": rows,
+        "rotation_6d": rows[0::3] + rows[1::3],
+        "quaternion_xyzw": quaternion_xyzw(rows),
+    }
+
+
+def _box_px(view: View, slot: Slot, rotation: Array | None, translation: Array) -> Sequence[float]:
+    """The projected corners, x and y in turn; none where the model tells no box."""
+    if not len(slot.box_corners):
+        return ()
+    corners = slot.box_corners if rotation is None else slot.box_corners @ rotation.T
+    return view.project(corners + translation).ravel().tolist()

@@ -54,6 +54,10 @@ class InferenceService(GRPCInferenceServiceServicer):
     def ModelInfer(self, request: messages.ModelInferRequest, context: Context) -> messages.ModelInferResponse:
         return self._guard.run("ModelInfer", request.id[:128], context, partial(self._infer, request, context))
 
+    def refuse(self, method: str, context: Context) -> None:
+        """Abort a call because the queue is full; its message was not read."""
+        self._guard.run(method, "", context, self._work.refuse)
+
     def _model_ready(self, request: messages.ModelReadyRequest) -> messages.ModelReadyResponse:
         try:
             self._repository.get(request.name, _version(request.version))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import Field, ModelSpec
 
+from curio_serve.batching import Batcher
 from curio_serve.camera import PinholeCamera
 from curio_serve.errors import CameraError, InternalError, ModelError
 from curio_serve.onnx_file import read_spec
@@ -34,6 +35,22 @@ _OUTPUT_SHAPES: dict[str, tuple[tuple[int, ...], bool]] = {
 }
 # What the exporter may derive from another field, so that the spec need not list it.
 _DERIVED = {"rotation", "rotation_6d"}
+
+
+@dataclass(frozen=True)
+class Runtime:
+    """How networks are run.
+
+    Attributes:
+        providers: onnxruntime's execution providers in order of preference.
+        max_batch: Most images of several calls in one run; 1: every call runs on its own.
+    """
+
+    providers: tuple[str, ...] = ("CPUExecutionProvider",)
+    max_batch: int = 1
+
+
+DEFAULT_RUNTIME = Runtime()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +78,21 @@ class Model:
         sha256: Of the file, hexadecimal.
     """
 
-    def __init__(self, session: "onnxruntime.InferenceSession", spec: ModelSpec, name: str, version: int, sha256: str):
+    def __init__(
+        self,
+        session: "onnxruntime.InferenceSession",
+        spec: ModelSpec,
+        name: str,
+        version: int,
+        sha256: str,
+        max_batch: int = 1,
+    ) -> None:
         self.name, self.version, self.spec, self.sha256 = name, version, spec, sha256
         self.camera = canonical_camera(spec, name)
         self.slots = slots(spec, name)
         self.output_names: Sequence[str] = [output.name for output in session.get_outputs()]
         self._session = session
+        self._run_many = Batcher(self._run, max_batch) if max_batch > 1 else self._run
 
     @property
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -90,24 +116,28 @@ class Model:
         Raises:
             InternalError: The network answered with values that are not finite, or the runtime failed.
         """
-        try:
-            values = self._session.run(None, {INPUT: images})
-        except _runtime_errors() as exc:
-            raise InternalError(f"model {self.label}: onnxruntime failed on a batch of {len(images)}: {exc}") from exc
+        values = self._run_many(images)
         for name, value in zip(self.output_names, values, strict=True):
             if not np.isfinite(value).all():
                 raise InternalError(f"model {self.label}: its output {name} is not finite for this image")
         return dict(zip(self.output_names, values, strict=True))
 
+    def _run(self, images: np.ndarray) -> Sequence[np.ndarray]:
+        try:
+            outputs: Sequence[np.ndarray] = self._session.run(None, {INPUT: images})
+        except _runtime_errors() as exc:
+            raise InternalError(f"model {self.label}: onnxruntime failed on a batch of {len(images)}: {exc}") from exc
+        return outputs
 
-def load(path: Path, name: str = "", version: int = 0, providers: Sequence[str] = ("CPUExecutionProvider",)) -> Model:
+
+def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
     """Read, check and open an ONNX file.
 
     Args:
         path: The file.
         name: What clients ask for; empty: the name in its spec.
         version: Of the model folder.
-        providers: onnxruntime's execution providers in order of preference.
+        runtime: How the network is run.
 
     Raises:
         ModelError: Says which promise the file breaks.
@@ -117,8 +147,10 @@ def load(path: Path, name: str = "", version: int = 0, providers: Sequence[str] 
     except OSError as exc:
         raise ModelError(f"model file {path} cannot be read: {exc.strerror}; expected an .onnx file") from exc
     spec = read_spec(data, str(path))
-    session = _open(data, path, providers)
-    model = Model(session, spec, name or spec.name or path.stem, version, hashlib.sha256(data).hexdigest())
+    session = _open(data, path, runtime.providers)
+    model = Model(
+        session, spec, name or spec.name or path.stem, version, hashlib.sha256(data).hexdigest(), runtime.max_batch
+    )
     _check_graph(session, model)
     _check_answer(model)
     return model

@@ -1,19 +1,24 @@
 """A model's folder in Triton's layout: ``<name>/{config.pbtxt, CARD.md, SHA256SUMS, <version>/model.onnx}``.
 
-What it promises beside the ONNX file is checked here: the file's hash, and that Triton would serve the same tensors.
+What it promises beside the ONNX file is checked here: the file's hash, that Triton would serve the same tensors, and,
+where a version has ``golden.npz`` (``image`` uint8 [height, width, 3] and the outputs for it by name, without a batch),
+that the network gives those outputs on this machine.
 """
 
 import re
-from collections.abc import Sequence
+import zipfile
 from pathlib import Path
 
+import numpy as np
 from curio_proto.files.triton_config_pb2 import TritonConfig, TritonType
 from google.protobuf import text_format
 
-from curio_serve.errors import ModelError
-from curio_serve.model import INPUT, Model, load
+from curio_serve.errors import InternalError, ModelError
+from curio_serve.model import DEFAULT_RUNTIME, INPUT, Model, Runtime, load
 
 MODEL_FILE = "model.onnx"
+GOLDEN_FILE = "golden.npz"
+_GOLDEN_TOLERANCE = 1e-3  # metres, image widths, entries of matrices; float16 weights on another processor stay below
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
@@ -34,16 +39,17 @@ def versions(folder: Path) -> list[int]:
         raise ModelError(f"model folder {folder} cannot be read: {exc.strerror}") from exc
 
 
-def load_version(folder: Path, version: int, providers: Sequence[str] = ("CPUExecutionProvider",)) -> Model:
+def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
     """Load one version of a model's folder.
 
     Raises:
         ModelError: Says which promise it breaks.
     """
     path = folder / str(version) / MODEL_FILE
-    model = load(path, folder.name, version, providers)
+    model = load(path, folder.name, version, runtime)
     _check_sum(folder, f"{version}/{MODEL_FILE}", model.sha256)
     _check_config(folder, model)
+    _check_golden(folder / str(version) / GOLDEN_FILE, model)
     return model
 
 
@@ -110,3 +116,31 @@ def _check_config(folder: Path, model: Model) -> None:
     expected = {name: (TritonType.TYPE_FP32, list(shape)) for name, shape in model.output_shapes.items()}
     if outputs != expected:
         raise ModelError(f"{path}: outputs are {outputs}; the graph has {expected}")
+
+
+def _check_golden(path: Path, model: Model) -> None:
+    """Run the golden image, where the version has one, and compare the outputs with those stored beside it."""
+    if not path.is_file():
+        return
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            expected = dict(file)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as exc:
+        raise ModelError(f"{path} is not an archive of arrays: {exc}; export the model again") from exc
+    image, size = expected.pop(INPUT, None), (model.camera.height, model.camera.width, 3)
+    if image is None or image.shape != size or image.dtype != np.uint8 or not expected:
+        found = None if image is None else f"{image.dtype} {image.shape}"
+        raise ModelError(f"{path}: image is {found}, outputs {sorted(expected)}; expected uint8 {size} and an output")
+    try:
+        outputs = model.run(image[None])
+    except InternalError as exc:
+        raise ModelError(f"{path}: the golden image cannot pass the graph: {exc}") from exc
+    for name, value in expected.items():
+        if name not in outputs or outputs[name][0].shape != value.shape:
+            raise ModelError(f"{path}: {name} {value.shape} is no output of the graph, which has {model.output_shapes}")
+        off = float(np.abs(outputs[name][0] - value).max(initial=0))
+        if not off <= _GOLDEN_TOLERANCE:
+            raise ModelError(
+                f"{path}: the network's {name} is {off:.3g} off for the golden image; at most {_GOLDEN_TOLERANCE:g} is "
+                "accepted: this file, or this machine's runtime, does not compute what was exported"
+            )

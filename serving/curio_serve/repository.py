@@ -5,13 +5,13 @@ sees the old or the new state and never something between. A candidate that come
 child process with bounded memory and time; one that fails leaves what serves untouched.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from curio_serve.errors import ModelError, ModelNotFound
-from curio_serve.model import Model
-from curio_serve.model_folder import MODEL_FILE, is_model_name, load_version, versions
+from curio_serve.model import DEFAULT_RUNTIME, Model, Runtime
+from curio_serve.model_folder import GOLDEN_FILE, MODEL_FILE, is_model_name, load_version, versions
 
 Key = tuple[str, int]
 Signature = tuple[tuple[int, int, int], ...]
@@ -37,15 +37,15 @@ class Change:
 class Repository:
     """Models under one folder."""
 
-    def __init__(self, root: Path, num_versions: int = 2, providers: Sequence[str] = ("CPUExecutionProvider",)) -> None:
+    def __init__(self, root: Path, num_versions: int = 2, runtime: Runtime = DEFAULT_RUNTIME) -> None:
         """Nothing is loaded yet: see :meth:`refresh`.
 
         Args:
             root: Folder of models.
             num_versions: Newest versions of each model to keep.
-            providers: onnxruntime's execution providers.
+            runtime: How networks are run.
         """
-        self._root, self._num_versions, self._providers = root, num_versions, providers
+        self._root, self._num_versions, self._runtime = root, num_versions, runtime
         self._models: Mapping[str, Mapping[int, Model]] = {}
         self._seen: dict[Key, Signature] = {}
 
@@ -112,7 +112,7 @@ class Repository:
         try:
             if check is not None:
                 check(folder, version)
-            model = load_version(folder, version, self._providers)
+            model = load_version(folder, version, self._runtime)
         except ModelError as exc:
             changes.append(Change(folder.name, version, "refused", str(exc)))
             return present
@@ -130,7 +130,11 @@ class Repository:
 
 
 def _signature(folder: Path, version: int) -> Signature:
-    files = (folder / str(version) / MODEL_FILE, folder / "SHA256SUMS", folder / "config.pbtxt")
+    files = (
+        *(folder / str(version) / name for name in (MODEL_FILE, GOLDEN_FILE)),
+        folder / "SHA256SUMS",
+        folder / "config.pbtxt",
+    )
     signature = []
     for file in files:
         try:

@@ -5,6 +5,7 @@ import time
 from typing import Any
 
 import grpc
+from curio_proto.v1.detector_pb2 import DetectResponse
 from google.protobuf.message import DecodeError
 from google.rpc import error_details_pb2, status_pb2
 
@@ -62,6 +63,14 @@ def error_from_call(failure: Any, address: str) -> CurioError:
     if isinstance(error, Overloaded) and retry_after_s is not None:
         error.retry_after_s = retry_after_s
     return error
+
+
+def error_from_answer(answer: DetectResponse) -> CurioError | None:
+    """The exception that one frame of a stream was answered with; None where it has results."""
+    if not answer.HasField("error"):
+        return None
+    names = {code.value[0]: code.name for code in grpc.StatusCode}
+    return error_from_status(names.get(answer.error.code, "UNKNOWN"), answer.error.reason, answer.error.message)
 
 
 def _details(failure: Any) -> tuple[str, float | None]:

@@ -1,6 +1,7 @@
 """Rotations as serving needs them: few, small, and without a package that takes half a second to load."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,9 +19,13 @@ def smallest_rotation(source: Array, target: Array) -> Array:
     return np.eye(3) + cross + cross @ cross / (1 + a * p + b * q + c * r)
 
 
-def quaternion_xyzw(rotation: Array) -> tuple[float, float, float, float]:
-    """Unit quaternion of a rotation matrix [3, 3], by its largest component (Shepperd 1978), w not negative."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+def quaternion_xyzw(rows: Sequence[float]) -> tuple[float, float, float, float]:
+    """Unit quaternion of a rotation matrix, by its largest component (Shepperd 1978), w not negative.
+
+    Args:
+        rows: The matrix's 9 values, row after row.
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = rows
     w, x, y, z = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz  # four times their squares
     largest = max(w, x, y, z)
     if largest == w:

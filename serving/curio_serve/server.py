@@ -18,8 +18,9 @@ from curio_serve.admission import WorkQueue, num_cores
 from curio_serve.config import ServeConfig
 from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.inference_protocol import InferenceService
+from curio_serve.model import Runtime
 from curio_serve.model_check import ChildCheck
-from curio_serve.registration import register
+from curio_serve.registration import register, register_behind
 from curio_serve.repository import Change, Repository
 from curio_serve.security import TokenInterceptor, read_tokens, server_credentials
 from curio_serve.service import Limits, PoseService
@@ -32,6 +33,9 @@ _REFLECTION = reflection_pb2.DESCRIPTOR.services_by_name["ServerReflection"]
 _SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
 
 
+_DEVICE_BATCH = 8  # of a GPU provider
+
+
 class PoseServer:
     """One server: :meth:`start`, then :meth:`serve_until_stopped`, which :meth:`stop` ends from anywhere."""
 
@@ -40,8 +44,12 @@ class PoseServer:
         registry = CollectorRegistry()
         self._registry = registry
         self._metrics = Metrics(registry)
-        self._repository = Repository(config.models, config.versions, config.providers)
-        self._work = WorkQueue(config.workers or num_cores(), config.queue, self._metrics)
+        on_cpu = config.providers == ("CPUExecutionProvider",)
+        batch = config.batch or (1 if on_cpu else _DEVICE_BATCH)
+        self._repository = Repository(config.models, config.versions, Runtime(config.providers, batch))
+        # Calls that wait for a batch leave their core to others, which decode meanwhile.
+        workers = config.workers or num_cores() + (batch if batch > 1 else 0)
+        self._work = WorkQueue(workers, config.queue, self._metrics)
         # Watchers of health wait without a thread each.
         watchers = ThreadPoolExecutor(1)
         self._health = health.HealthServicer(experimental_non_blocking=True, experimental_thread_pool=watchers)
@@ -97,8 +105,9 @@ class PoseServer:
             config.min_confidence,
             config.full_decode,
         )
-        register(server, _POSE, PoseService(self._repository, self._work, limits, self._metrics))
-        register(server, _INFERENCE, self._inference)
+        pose = PoseService(self._repository, self._work, limits, self._metrics)
+        register_behind(self._work, server, _POSE, pose, ["Detect"])
+        register_behind(self._work, server, _INFERENCE, self._inference, ["ModelInfer"])
         register(server, _HEALTH, self._health)
         names = [service.full_name for service in (_POSE, _INFERENCE, _HEALTH, _REFLECTION)]
         register(server, _REFLECTION, reflection.ReflectionServicer(names))
@@ -191,7 +200,9 @@ def channel_options(config: ServeConfig) -> list[tuple[str, int]]:
         ("grpc.max_receive_message_length", config.max_message_mb << 20),
         ("grpc.max_send_message_length", 64 << 20),
         ("grpc.max_metadata_size", 16 << 10),
-        ("grpc.max_concurrent_streams", 128),
+        # Well above the queue: a call that is refused early counts until its client has heard of it, and calls beyond
+        # this limit are reset without a word of when to come back.
+        ("grpc.max_concurrent_streams", 512),
         # Half-open connections are found out; idle clients may ping, but not more often than every 10 s.
         ("grpc.keepalive_time_ms", 60_000),
         ("grpc.keepalive_timeout_ms", 20_000),

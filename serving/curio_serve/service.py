@@ -1,12 +1,12 @@
 """The typed API ``curio.v1.PoseDetector``: translates between messages and the detector, and nothing else."""
 
 import logging
+import secrets
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import TypeVar
 
 import grpc
@@ -17,7 +17,7 @@ from curio_serve import image, wire
 from curio_serve.admission import WorkQueue
 from curio_serve.camera import PinholeCamera
 from curio_serve.detector import Detector
-from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, InternalError, Overloaded
+from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, InternalError, Overloaded, status_of
 from curio_serve.repository import Repository
 from curio_serve.telemetry import Metrics, log
 
@@ -42,21 +42,29 @@ class CallGuard:
     """Runs a call's body, turns its exceptions into statuses, counts and logs it."""
 
     def __init__(self, metrics: Metrics) -> None:
-        self._metrics = metrics
+        self._requests = cache(metrics.requests.labels)  # labels() checks and locks each time
 
     def run(self, method: str, request_id: str, context: Context, body: Callable[[], Answer]) -> Answer:
         """Call the body; abort the call with the status of what it raises."""
+        answer = self.attempt(method, request_id, context, body)
+        if isinstance(answer, CurioError):
+            context.abort_with_status(wire.status_from_error(answer))
+        return answer
+
+    def attempt(
+        self, method: str, request_id: str, context: Context, body: Callable[[], Answer]
+    ) -> Answer | CurioError:
+        """Call the body; what it raises is counted, logged and returned."""
         code = "UNKNOWN"
         try:
             answer = body()
             code = "OK"
         except CurioError as exc:
-            status = wire.status_from_error(exc)
-            code = status.code.name
+            code = status_of(exc)
             self._log(exc, method=method, request_id=request_id, code=code, peer=context.peer())
-            context.abort_with_status(status)
+            return exc
         finally:
-            self._metrics.requests.labels(method, code).inc()
+            self._requests(method, code).inc()
         log(logging.DEBUG, "answered", method=method, request_id=request_id)
         return answer
 
@@ -88,14 +96,30 @@ class PoseService(PoseDetectorServicer):
         self._guard.run("DetectStream", "", context, partial(self._open_stream, context))
         # One frame of a stream at a time: the next is read when this one is answered, so the client feels the load.
         for request in request_iterator:
-            body = partial(self._detect, request, context, always=True)
-            yield self._guard.run("DetectStream.frame", request.request_id[:_MAX_ID_LENGTH], context, body)
+            yield self._frame_of_stream(request, context)
+
+    def refuse(self, method: str, context: Context) -> None:
+        """Abort a call because the queue is full; its message was not read."""
+        self._guard.run(method, "", context, self._work.refuse)
 
     def ListModels(self, request: messages.ListModelsRequest, context: Context) -> messages.ListModelsResponse:
         return self._guard.run("ListModels", "", context, self._list)
 
     def GetModel(self, request: messages.GetModelRequest, context: Context) -> messages.GetModelResponse:
         return self._guard.run("GetModel", "", context, partial(self._get, request))
+
+    def _frame_of_stream(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
+        """One frame's answer, or why it has none; only what ends the call ends the stream."""
+        request_id = request.request_id[:_MAX_ID_LENGTH]
+        body = partial(self._detect, request, context, always=True)
+        answer = self._guard.attempt("DetectStream.frame", request_id, context, body)
+        if isinstance(answer, CallEnded):
+            context.abort_with_status(wire.status_from_error(answer))
+        if isinstance(answer, CurioError):
+            return messages.DetectResponse(
+                request_id=request_id or secrets.token_hex(16), error=wire.frame_error(answer)
+            )
+        return answer
 
     def _open_stream(self, context: Context) -> None:
         with self._lock:
@@ -164,7 +188,7 @@ def detect_frame(
     decoded = time.perf_counter()
     regions = [wire.region_from_message(region) for region in request.regions]
     answer = messages.DetectResponse(
-        request_id=request.request_id or uuid.uuid4().hex, width=frame.width, height=frame.height
+        request_id=request.request_id or secrets.token_hex(16), width=frame.width, height=frame.height
     )
     for detector in detectors:
         answer.results.extend(

@@ -1,8 +1,10 @@
 """Errors and requests as they travel: exceptions to gRPC status, messages to the detector's arguments."""
 
+from functools import lru_cache
+
 import grpc
 import numpy as np
-from curio_proto.v1.detector_pb2 import PIXEL_FORMAT_BGR8, PIXEL_FORMAT_GRAY8, PIXEL_FORMAT_RGB8, RawImage
+from curio_proto.v1.detector_pb2 import PIXEL_FORMAT_BGR8, PIXEL_FORMAT_GRAY8, PIXEL_FORMAT_RGB8, FrameError, RawImage
 from curio_proto.v1.detector_pb2 import Camera as CameraMessage
 from curio_proto.v1.detector_pb2 import Region as RegionMessage
 from google.protobuf.any_pb2 import Any as AnyMessage
@@ -36,16 +38,27 @@ def status_from_error(error: CurioError) -> grpc.Status:
     return rpc_status.to_status(status_pb2.Status(code=code_pb2.Code.Value(name), message=message, details=packed))
 
 
+def frame_error(error: CurioError) -> FrameError:
+    """The same for one frame of a stream that goes on."""
+    code = grpc.StatusCode[status_of(error)].value[0]
+    return FrameError(code=code, reason=type(error).__name__, message=str(error)[:MAX_TEXT])
+
+
 def camera_from_message(message: CameraMessage) -> PinholeCamera:
     """Intrinsics of a request.
 
     Raises:
         CameraError: Not nine values, or an impossible camera.
     """
-    values = list(message.camera_matrix)
+    return _camera(tuple(message.camera_matrix), tuple(message.distortion))
+
+
+@lru_cache(256)
+def _camera(values: tuple[float, ...], distortion: tuple[float, ...]) -> PinholeCamera:
+    """One camera sends many frames, so its intrinsics are checked once."""
     if len(values) != 9:
         raise CameraError(f"camera.camera_matrix has {len(values)} values; expected 9: K row after row")
-    return PinholeCamera(np.reshape(values, (3, 3)), tuple(message.distortion))
+    return PinholeCamera(np.reshape(values, (3, 3)), distortion)
 
 
 def region_from_message(message: RegionMessage) -> Region:

@@ -16,7 +16,7 @@ from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer, add_PoseDetectorServicer_to_server
 from curio_serve import errors
 from curio_serve.camera import PinholeCamera
-from curio_serve.client import AsyncPoseClient, PoseClient, Tls, detect_request
+from curio_serve.client import AsyncPoseClient, PoseClient, Tls, detect_request, error_from_answer
 from curio_serve.detector import Detector
 from curio_serve.model_folder import open_model
 from curio_serve.wire import status_from_error
@@ -88,8 +88,9 @@ def test_what_is_loaded(client: PoseClient) -> None:
 def test_a_stream_answers_in_order_with_ids(client: PoseClient, png: Path) -> None:
     requests = (detect_request("flat", png, request_id=str(n)) for n in range(20))
     assert [a.request_id for a in client.detect_stream(requests, timeout_s=30)] == [str(n) for n in range(20)]
-    with pytest.raises(errors.ModelNotFound):
-        list(client.detect_stream([detect_request("none", png)], timeout_s=30))
+    mixed = [detect_request("none", png), detect_request("pinhole", png), detect_request("flat", png)]
+    found = [error_from_answer(answer) for answer in client.detect_stream(mixed, timeout_s=30)]
+    assert [type(error) for error in found] == [errors.ModelNotFound, errors.CameraMissing, type(None)]
     endless = (detect_request("flat", png) for _ in iter(int, 1))
     assert next(client.detect_stream(endless, timeout_s=30)).width == 320
 

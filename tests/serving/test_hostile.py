@@ -101,7 +101,7 @@ def test_a_reader_that_does_not_read(server: Any) -> None:
 def test_messages_nobody_can_read_keep_no_call_open(server: Any, method: str) -> None:
     """More of them than a connection may have streams; the same connection still works after."""
     with grpc.insecure_channel(server.address) as channel:
-        for _ in range(200):
+        for _ in range(600):
             with pytest.raises(grpc.RpcError, match="cannot be read as") as caught:
                 next(channel.stream_stream(f"/{method}")(iter([b"\xff" * 50]), timeout=30))
             assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT

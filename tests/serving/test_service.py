@@ -180,12 +180,17 @@ def test_refusals(stub: PoseDetectorStub, request_: pb.DetectRequest, status: st
     assert stub.Detect(_good(), timeout=10).results[0].model == "pinhole"
 
 
-def test_a_bad_frame_ends_its_stream_with_its_status(stub: PoseDetectorStub) -> None:
-    answers = stub.DetectStream(iter([_good(request_id="1"), _good(encoded=b"x", request_id="2")]), timeout=10)
-    assert next(answers).request_id == "1"
-    with pytest.raises(grpc.RpcError) as caught:
-        next(answers)
-    assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+def test_a_bad_frame_is_answered_so_and_its_stream_goes_on(stub: PoseDetectorStub) -> None:
+    no_model = pb.DetectRequest(models=[pb.ModelSelector(name="none")], encoded=b"x")
+    frames = [_good(request_id="1"), _good(encoded=b"x", request_id="2"), no_model, _good(request_id="4")]
+    answers = list(stub.DetectStream(iter(frames), timeout=10))
+    assert [answer.request_id for answer in answers if answer.results] == ["1", "4"]
+    assert not any(answer.HasField("error") for answer in answers if answer.results)
+    bad, unknown = answers[1:3]
+    assert (bad.request_id, bad.error.code, bad.error.reason) == ("2", 3, "ImageError")
+    assert "not a JPEG, PNG or WebP image" in bad.error.message
+    assert unknown.request_id
+    assert (unknown.error.code, unknown.error.reason) == (5, "ModelNotFound")
 
 
 def test_messages_beyond_the_limit(stub: PoseDetectorStub) -> None:

@@ -110,7 +110,7 @@ def test_the_smallest_rotation_is_one_and_is_smallest(source: np.ndarray, target
 @given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 1e-3))
 def test_quaternions_are_those_of_scipy(values: tuple[float, ...]) -> None:
     matrix = Rotation.from_quat(values).as_matrix()
-    found = np.array(quaternion_xyzw(matrix))
+    found = np.array(quaternion_xyzw(matrix.ravel().tolist()))
     assert np.linalg.norm(found) == pytest.approx(1)
     assert found[3] >= 0
     np.testing.assert_allclose(Rotation.from_quat(found).as_matrix(), matrix, atol=1e-9)
@@ -119,7 +119,7 @@ def test_quaternions_are_those_of_scipy(values: tuple[float, ...]) -> None:
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.6, 0, 0.8), (-0.6, 0, 0.8)])
 def test_half_turns_have_quaternions(axis: tuple[float, ...]) -> None:
     matrix = Rotation.from_rotvec(np.pi * np.array(axis)).as_matrix()
-    np.testing.assert_allclose(np.abs(quaternion_xyzw(matrix)), np.abs([*axis, 0]), atol=1e-7)
+    np.testing.assert_allclose(np.abs(quaternion_xyzw(matrix.ravel().tolist())), np.abs([*axis, 0]), atol=1e-7)
 
 
 def test_views_behind_the_camera_are_refused() -> None:

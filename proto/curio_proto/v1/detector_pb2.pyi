@@ -140,19 +140,31 @@ class Milliseconds(_message.Message):
     inference: float
     def __init__(self, queue: _Optional[float] = ..., decode: _Optional[float] = ..., inference: _Optional[float] = ...) -> None: ...
 
+class FrameError(_message.Message):
+    __slots__ = ("code", "reason", "message")
+    CODE_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    code: int
+    reason: str
+    message: str
+    def __init__(self, code: _Optional[int] = ..., reason: _Optional[str] = ..., message: _Optional[str] = ...) -> None: ...
+
 class DetectResponse(_message.Message):
-    __slots__ = ("request_id", "width", "height", "results", "milliseconds")
+    __slots__ = ("request_id", "width", "height", "results", "milliseconds", "error")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     RESULTS_FIELD_NUMBER: _ClassVar[int]
     MILLISECONDS_FIELD_NUMBER: _ClassVar[int]
+    ERROR_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     width: int
     height: int
     results: _containers.RepeatedCompositeFieldContainer[RegionResult]
     milliseconds: Milliseconds
-    def __init__(self, request_id: _Optional[str] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., results: _Optional[_Iterable[_Union[RegionResult, _Mapping]]] = ..., milliseconds: _Optional[_Union[Milliseconds, _Mapping]] = ...) -> None: ...
+    error: FrameError
+    def __init__(self, request_id: _Optional[str] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., results: _Optional[_Iterable[_Union[RegionResult, _Mapping]]] = ..., milliseconds: _Optional[_Union[Milliseconds, _Mapping]] = ..., error: _Optional[_Union[FrameError, _Mapping]] = ...) -> None: ...
 
 class ListModelsRequest(_message.Message):
     __slots__ = ()

@@ -67,7 +67,8 @@ class PoseDetectorServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def DetectStream(self, request_iterator, context):
-        """The same for a stream of frames; answers come in the order of the requests and carry their ids.
+        """The same for a stream of frames; answers come in the order of the requests and carry their ids. A frame that cannot
+        be answered has its answer's `error` set, and the stream goes on.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -1,0 +1,183 @@
+"""Whether a server stays whole and small: what takes too long for the tests, which run the same with small numbers.
+
+    python benchmarks/endurance.py [--json] [--requests 50000] [--replacements 50] [--connections 10000] [--fuzz 100000]
+
+rss_growth            memory after all requests over memory after a tenth of them, after the same pause; at most 1.05
+failed_calls          calls of clients with retries that failed while a model was replaced so many times; none may
+replaced_answers      answers that came meanwhile, and ``versions_seen`` how many of the versions gave them
+connections_survived  so many connections opened with no, half and wrong beginnings and dropped; the next call is right
+fuzzed                so many strange requests by ``tests/serving/test_fuzz.py``, each with a defined status and a good
+                      answer after it; found failures stay in ``.hypothesis`` and belong into ``tests/serving/corpus``
+
+A part is left out with 0. Exit status 1: one of them does not hold.
+"""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from curio_serve.client import PoseClient
+from curio_serve.errors import CurioError
+from load.generator import MODEL, WIDTH, K, closed_loop_of, make_frames, pose_target
+from load.network import write_model
+
+from serving import memory_mb, running_server, worker
+
+_ROOT = Path(__file__).parents[1]
+_OPENINGS = (b"", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n", bytes(range(64)))
+_NUM_FUZZ_TESTS = 4
+_LARGEST_GROWTH = 1.05
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Measure whether a server stays whole and small."""
+
+    json: bool = False
+    """Print one JSON object on the last line instead of a table."""
+    requests: int = 50_000
+    """Frames sent between the two looks at memory and before them."""
+    replacements: int = 50
+    """Times that a model is replaced under load."""
+    connections: int = 10_000
+    """Connections opened and dropped."""
+    fuzz: int = 100_000
+    """Strange requests."""
+
+
+def main() -> None:
+    """Measures, prints, and leaves nothing behind but what the fuzzing found."""
+    arguments = tyro.cli(Arguments)
+    frames = make_frames(8)
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as name:
+        models = Path(name)
+        write_model(models / MODEL, K, WIDTH)
+        if arguments.requests:
+            figures |= memory(models, frames, arguments.requests)
+        if arguments.connections:
+            figures |= connections(models, frames, arguments.connections)
+        if arguments.replacements:
+            figures |= replacements(models, frames, arguments.replacements)
+    if arguments.fuzz:
+        figures |= fuzzing(arguments.fuzz)
+    print(json.dumps(figures) if arguments.json else "\n".join(f"{k:22} {v}" for k, v in figures.items()))
+    holds = (
+        figures.get("rss_growth", 1.0) <= _LARGEST_GROWTH
+        and not figures.get("failed_calls")
+        and figures.get("fuzz_status", 0) == 0
+    )
+    sys.exit(0 if holds else 1)
+
+
+def memory(models: Path, frames: list[bytes], num_requests: int) -> dict[str, Any]:
+    """Resident memory after a tenth of the requests and after all."""
+    cores = sorted(os.sched_getaffinity(0))
+    with running_server(models, cores) as (address, pid), worker(cores) as load:
+        target = pose_target(address, frames)
+        codes = [load(closed_loop_of, target, 4, num_requests // 10)]
+        time.sleep(1)
+        early_mb, _ = memory_mb(pid)
+        codes.append(load(closed_loop_of, target, 4, num_requests - num_requests // 10))
+        time.sleep(1)
+        late_mb, _ = memory_mb(pid)
+    return {
+        "rss_growth": round(late_mb / early_mb, 4),
+        "rss_early_mb": early_mb,
+        "rss_late_mb": late_mb,
+        "codes": {code: sum(counts.get(code, 0) for counts in codes) for counts in codes for code in counts},
+    }
+
+
+def connections(models: Path, frames: list[bytes], num_connections: int) -> dict[str, Any]:
+    """Open, begin, drop; then a good call."""
+    with running_server(models, sorted(os.sched_getaffinity(0))) as (address, pid):
+        host, port = address.rsplit(":", 1)
+        before_mb, _ = memory_mb(pid)
+        for number in range(num_connections):
+            with socket.create_connection((host, int(port)), timeout=30) as connection:
+                connection.sendall(_OPENINGS[number % len(_OPENINGS)])
+        with PoseClient(address, timeout_s=60) as client:
+            assert client.detect(MODEL, frames[0], K).results
+        after_mb, _ = memory_mb(pid)
+    return {"connections_survived": num_connections, "rss_of_connections_mb": round(after_mb - before_mb, 1)}
+
+
+def replacements(models: Path, frames: list[bytes], num_replacements: int) -> dict[str, Any]:
+    """Clients with retries go on while new versions come, old ones go, and a broken one is refused."""
+    over, seen, failures = threading.Event(), set(), []
+
+    def ask(client: PoseClient) -> int:
+        num_answers = 0
+        while not over.is_set():
+            try:
+                answer = client.detect(MODEL, frames[num_answers % len(frames)], K, timeout_s=30)
+            except CurioError as exc:
+                failures.append(str(exc))
+                continue
+            seen.add(answer.results[0].model_version)
+            num_answers += 1
+        return num_answers
+
+    first = models / MODEL / "1" / "model.onnx"
+    flags = ("--refresh-s", "0.1", "--versions", "1")
+    with (
+        running_server(models, sorted(os.sched_getaffinity(0)), *flags) as (address, _),
+        PoseClient(address, max_attempts=20) as client,
+        ThreadPoolExecutor(2) as pool,
+    ):
+        asking = [pool.submit(ask, client) for _ in range(2)]
+        try:
+            for version in range(2, num_replacements + 2):
+                _put(models / MODEL / str(version), first.read_bytes())
+                _wait_until(lambda wanted=version: wanted in seen)
+            _put(models / MODEL / str(num_replacements + 2), b"broken")
+            time.sleep(2)
+        finally:
+            over.set()
+        num_answers = sum(call.result() for call in asking)
+    if num_replacements + 2 in seen:
+        failures.append("a broken version answered")
+    return {"failed_calls": len(failures), "replaced_answers": num_answers, "versions_seen": len(seen)}
+
+
+def _put(folder: Path, data: bytes) -> None:
+    """A version that appears as a whole."""
+    fresh = folder.with_name(f"coming-{folder.name}")
+    fresh.mkdir()
+    (fresh / "model.onnx").write_bytes(data)
+    fresh.rename(folder)
+    for old in (entry for entry in folder.parent.iterdir() if entry.name.isdecimal()):
+        if 1 < int(old.name) < int(folder.name) - 2:
+            shutil.rmtree(old)
+
+
+def _wait_until(is_so: Any, limit_s: float = 120.0) -> None:
+    end = time.monotonic() + limit_s
+    while not is_so():
+        if time.monotonic() > end:
+            raise RuntimeError(f"a new version did not come to serve within {limit_s:g} s")
+        time.sleep(0.02)
+
+
+def fuzzing(num_requests: int) -> dict[str, Any]:
+    """The fuzz tests with that many examples in all."""
+    environment = {**os.environ, "CURIO_FUZZ_EXAMPLES": str(max(1, num_requests // _NUM_FUZZ_TESTS))}
+    test = [sys.executable, "-m", "pytest", "-q", str(_ROOT / "tests" / "serving" / "test_fuzz.py")]
+    status = subprocess.run(test, cwd=_ROOT, env=environment, check=False, stdout=sys.stderr).returncode
+    return {"fuzzed": num_requests // _NUM_FUZZ_TESTS * _NUM_FUZZ_TESTS, "fuzz_status": status}
+
+
+if __name__ == "__main__":
+    main()
