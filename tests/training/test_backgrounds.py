@@ -1,9 +1,12 @@
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
 import torch
 from curio_train.data.backgrounds import POOL_HEIGHT, POOL_WIDTH, ClutterBackgrounds, PhotographBackgrounds, render_pool
 from curio_train.data.photographs import Photographs
+from curio_train.data.shapes import sphere
 from curio_train.errors import DataError
 
 
@@ -18,6 +21,15 @@ def test_clutter_is_varied_and_repeatable(pool):
     assert pool.reshape(10, -1).std(1).min() > 8
     assert np.array_equal(pool[:3], render_pool(10, seed=5)[:3])
     assert not np.array_equal(pool, render_pool(10, seed=6))
+
+
+def test_other_objects_lie_about():
+    """A mesh of a colour that nothing else has shows up in most pictures."""
+    shape = sphere(0.06)
+    green = dataclasses.replace(shape, vertex_colors_srgb=np.tile([0.0, 1.0, 0.0], (len(shape.vertices_m), 1)))
+    pictures = render_pool(10, seed=5, others=[green] * 3).astype(int)
+    greenest = (pictures[..., 1] - 4 * pictures[..., [0, 2]].max(axis=-1)).reshape(10, -1) > 0
+    assert (greenest.sum(axis=1) > 20).mean() > 0.5
 
 
 def test_draws_are_a_function_of_the_seed(pool):

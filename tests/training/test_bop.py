@@ -102,6 +102,15 @@ def test_models(root: Path) -> None:
     assert data.targets()[0].num_instances == 1
 
 
+def test_meshes_have_a_source_and_a_licence(root: Path) -> None:
+    assert "LineMOD (Hinterstoisser et al. 2012)" in BopDataset(root).attribution
+    assert BopDataset(root).attribution.endswith("CC BY 4.0")
+    for number in (5, 6, 8, 9, 11, 12):
+        (root / "models" / f"obj_{number:06d}.ply").touch()
+    assert BopDataset(root).attribution.startswith("Linemod-Occluded (Brachmann et al. 2014)")
+    assert BopDataset(root).attribution.endswith("CC BY-SA 4.0")
+
+
 def test_symmetries_are_in_metres(root: Path) -> None:
     data = BopDataset(root)
     assert not data.model_info("ape").is_symmetric

@@ -22,7 +22,7 @@ def disturb(images: Float[Tensor, "batch 3 height width"], random: np.random.Gen
     images = _occlude(images, random)
     images = _recolor(images, random)
     images = _blur(images, random)
-    noise = torch.from_numpy(random.standard_normal(tuple(images.shape), np.float32)).to(images)
+    noise = torch.randn(images.shape, generator=torch.Generator().manual_seed(int(random.integers(2**63)))).to(images)
     return (images + noise * _amounts(images, random, 0.0, 0.05)).clamp(0, 1)
 
 
@@ -42,10 +42,13 @@ def _recolor(images: Tensor, random: np.random.Generator) -> Tensor:
 
 def _blur(images: Tensor, random: np.random.Generator) -> Tensor:
     """Mixes each image with its blurred self: from sharp to a Gaussian of about one pixel."""
-    kernel = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0], dtype=images.dtype, device=images.device) / 16
-    weight = (kernel[:, None] * kernel).expand(3, 1, 5, 5)
-    blurred = F.conv2d(F.pad(images, (2, 2, 2, 2), mode="replicate"), weight, groups=3)
-    return torch.lerp(images, blurred, _amounts(images, random, 0.0, 1.0))
+    # Shifted sums along one axis and then the other: several times faster on a CPU than a grouped convolution.
+    wide = F.pad(images, (2, 2, 2, 2), mode="replicate")
+    for axis in (-2, -1):
+        size = wide.shape[axis] - 4
+        taps = [wide.narrow(axis, start, size) for start in range(5)]
+        wide = (taps[0] + taps[4] + 4 * (taps[1] + taps[3]) + 6 * taps[2]) / 16
+    return torch.lerp(images, wide, _amounts(images, random, 0.0, 1.0))
 
 
 def _occlude(images: Tensor, random: np.random.Generator) -> Tensor:

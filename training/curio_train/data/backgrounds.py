@@ -8,6 +8,7 @@ import dataclasses
 import hashlib
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -37,6 +38,10 @@ class Backgrounds(ABC):
     def split(self, train: bool) -> "Backgrounds":
         """Four fifths of the sources for training, or the others for tests."""
 
+    def of_crops(self, least: float, largest: float) -> "Backgrounds":
+        """Views behind crops that span these shares of a frame's width; the same where views are of any scale."""
+        return self
+
     @abstractmethod
     def draw(self, count: int, width: int, height: int, seed: tuple[int, ...]) -> Float[Tensor, "count 3 height width"]:
         """Random views in sRGB [0, 1]; the same seed gives the same ones."""
@@ -64,17 +69,23 @@ class ClutterBackgrounds(Backgrounds):
         self._pool = pool
 
     @classmethod
-    def cached(cls, cache: Path) -> "ClutterBackgrounds":
+    def cached(cls, cache: Path, others: Sequence[Mesh] = ()) -> "ClutterBackgrounds":
         """Render the pool, or find it in the cache.
+
+        Args:
+            cache: Folder.
+            others: Objects that may lie about where the one looked for lies, such as a data set's other ones: what a
+                detector must not take for it.
 
         Raises:
             DataError: The cache folder cannot be written.
         """
-        recipe = json.dumps([POOL_SIZE, POOL_WIDTH, POOL_HEIGHT, HEAPS, NUM_SLOTS, _SEED, "v1"])
+        names = [mesh.sha256 for mesh in others]
+        recipe = json.dumps([POOL_SIZE, POOL_WIDTH, POOL_HEIGHT, HEAPS, NUM_SLOTS, _SEED, "v2", *names])
         path = cache.expanduser() / f"clutter-{hashlib.sha256(recipe.encode()).hexdigest()[:16]}.npy"
         if not path.is_file():
             _make_folder(path.parent)  # before half a minute is spent on the pictures
-            _save(path, render_pool(POOL_SIZE, _SEED))
+            _save(path, render_pool(POOL_SIZE, _SEED, others))
         return cls(np.load(path, mmap_mode="r"))
 
     def split(self, train: bool) -> "ClutterBackgrounds":
@@ -106,15 +117,17 @@ def _share(count: int, train: bool) -> slice:
     return slice(border) if train else slice(min(border, count - 1), None)
 
 
-def render_pool(count: int, seed: int) -> np.ndarray:
-    """Draw uint8 [count, height, width, 3] images of clutter."""
+def render_pool(count: int, seed: int, others: Sequence[Mesh] = ()) -> np.ndarray:
+    """Draw uint8 [count, height, width, 3] images of clutter, with ``others`` spread over its heaps."""
     random = np.random.default_rng(seed)
     meshes = [_patterned(mesh, random) for mesh in _shapes(random) for _ in range(4)]
     images = np.stack([_noise(random) for _ in range(count)])
     pool = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
     for heap in range(HEAPS):
-        kinds = random.choice(len(meshes), NUM_SLOTS)
-        renderer = Renderer([meshes[k] for k in kinds], range(NUM_SLOTS), POOL_WIDTH, POOL_HEIGHT, ambient=0.35)
+        known = list(others[heap::HEAPS])[:NUM_SLOTS]
+        shapes = [meshes[kind] for kind in random.choice(len(meshes), NUM_SLOTS)]
+        kinds = [*known, *shapes[len(known) :]]
+        renderer = Renderer(kinds, range(NUM_SLOTS), POOL_WIDTH, POOL_HEIGHT, ambient=0.35)
         for start in range(0, count, 40):
             part = slice(start, start + 40)
             pool[part] = _heap(renderer, pool[part], random, heap)

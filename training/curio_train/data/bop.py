@@ -44,6 +44,12 @@ LINEMOD_IDS: Mapping[str, int] = {
 LINEMOD_CLASSES = tuple(name for name in LINEMOD_IDS if name not in ("bowl", "cup"))
 """The 13 that papers report: bowl and cup have no usable meshes in the original."""
 
+_OCCLUDED_IDS = {1, 5, 6, 8, 9, 10, 11, 12}
+"""The objects of Linemod-Occluded."""
+
+_LINEMOD = "LineMOD (Hinterstoisser et al. 2012)"
+_BOP = "as published by the BOP benchmark, https://bop.felk.cvut.cz"
+
 _MM = METRES["mm"]
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _HOW_TO_GET = (
@@ -165,6 +171,13 @@ class BopDataset:
     def classes(self) -> tuple[str, ...]:
         """The LineMOD classes whose meshes are in this folder."""
         return tuple(name for name, number in LINEMOD_IDS.items() if self._mesh_path("models", number).exists())
+
+    @property
+    def attribution(self) -> str:
+        """Source and licence of the meshes here: Linemod-Occluded's where its eight objects are all there is."""
+        if {LINEMOD_IDS[name] for name in self.classes} == _OCCLUDED_IDS:
+            return f"Linemod-Occluded (Brachmann et al. 2014) after {_LINEMOD}, {_BOP}, CC BY-SA 4.0"
+        return f"{_LINEMOD}, {_BOP}, CC BY 4.0"
 
     def mesh(self, name: str) -> Mesh:
         """The full mesh of a class, in metres.

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from curio_train.camera import Intrinsics
 from curio_train.errors import DataError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -45,6 +46,24 @@ def read_photograph(path: Path) -> np.ndarray:
     if pixels is None:
         raise DataError(f"{path}: the image cannot be decoded; expected a PNG, JPEG, WebP, BMP or TIFF file")
     return _to_rgb8(path, pixels)
+
+
+def read_frame(path: Path, camera: Intrinsics) -> np.ndarray:
+    """A photograph as a camera of the same K without distortion takes it, [height, width, 3] uint8 sRGB.
+
+    Raises:
+        DataError: It cannot be read, or is not of the camera's size.
+    """
+    pixels = read_photograph(path)
+    height, width = pixels.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise DataError(
+            f"{path}: found {width}x{height} pixels, but the camera file is for {camera.width}x{camera.height}; "
+            "expected photographs as that camera stores them, neither resized nor turned"
+        )
+    if not any(camera.distortion):
+        return pixels
+    return cv2.undistort(pixels, camera.matrix, np.array(camera.distortion))
 
 
 def _check(path: Path) -> None:

@@ -1,0 +1,243 @@
+"""A part of one's own: an STL, a camera file, photographs and a plate become a world that can be learned."""
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from curio_train import cli
+from curio_train.camera import Intrinsics
+from curio_train.config import NetworkConfig
+from curio_train.data import backgrounds
+from curio_train.data.plate import MixedBackgrounds, PlateBackgrounds
+from curio_train.doctor.before_training import refuse_unfit
+from curio_train.errors import CameraError, DataError, MeshError, UsageError
+from curio_train.evaluation.subject import load_subject
+from curio_train.export import export
+from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.learning.checkpoint import RunFolder
+from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION
+from curio_train.worlds import build
+from curio_train.worlds.capture import Capture
+from curio_train.worlds.options import CaptureOptions
+
+WIDTH, HEIGHT = 160, 120
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An unpainted bracket in millimetres, symmetric under half a turn; twelve photographs, a plate, clutter."""
+    root = tmp_path_factory.mktemp("part")
+    base = trimesh.creation.box((80, 40, 20))
+    tower = trimesh.creation.box((20, 20, 50))
+    tower.apply_translation((0, 0, 30))
+    trimesh.util.concatenate([base, tower]).export(root / "bracket.stl")
+    camera = {"camera_matrix": [[180, 0, 79.5], [0, 180, 59.5], [0, 0, 1]], "width": WIDTH, "height": HEIGHT}
+    (root / "camera.json").write_text(json.dumps(camera | {"distortion": [0.1, 0, 0, 0, 0]}))
+    random = np.random.default_rng(0)
+    plate = cv2.resize(random.integers(40, 220, (12, 16, 3), dtype=np.uint8), (WIDTH, HEIGHT))
+    cv2.imwrite(str(root / "plate.png"), plate)
+    (root / "photos").mkdir()
+    for number in range(12):
+        photo = plate.copy()
+        x, y = random.integers(20, (WIDTH - 50, HEIGHT - 50))
+        photo[y : y + 30, x : x + 30] = random.integers(0, 255, (30, 30, 3))
+        cv2.imwrite(str(root / "photos" / f"{number:02d}.png"), photo)
+    return root
+
+
+@pytest.fixture
+def cache(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where ten pictures of clutter are kept, instead of 240, which take half a minute."""
+    monkeypatch.setattr(backgrounds, "POOL_SIZE", 10)
+    return folder / "cache"
+
+
+def options(folder: Path, **changes: object) -> CaptureOptions:
+    usual = {"mesh": folder / "bracket.stl", "camera": folder / "camera.json", "photos": folder / "photos"}
+    return CaptureOptions(**{**usual, "mesh_unit": "mm", "background": folder / "plate.png"} | changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def world(folder: Path) -> Capture:
+    found = build(options(folder))
+    assert isinstance(found, Capture)
+    return found
+
+
+def test_the_part_is_what_its_file_says(world: Capture) -> None:
+    kind = world.object.kind
+    assert (kind.name, world.model_name, world.name) == ("bracket", "bracket", "capture")
+    assert kind.diameter_m == pytest.approx(np.linalg.norm([0.08, 0.04, 0.02]) * 1.0, rel=0.1)
+    (half_turn,) = kind.symmetries
+    assert np.allclose(half_turn[:3, :3], np.diag([-1, -1, 1]), atol=0.02)
+
+
+def test_an_unpainted_part_has_any_colour_and_says_which(world: Capture) -> None:
+    code = world.sample(400, (1,))
+    world.layout.check(code)
+    colors = code[COLOR][:, 0]
+    saturation = 1 - colors.amin(1) / colors.amax(1)
+    assert saturation.min() < 0.05
+    assert saturation.max() > 0.9
+    assert colors.amax(1).min() < 0.2
+    second = world.looks[1]
+    scenes = second.sample(6, (1,))
+    scenes[CONFIDENCE][:] = 1
+    light, dark = (scenes | {COLOR: torch.full((6, 1, 3), value)} for value in (0.9, 0.2))
+    assert (second.render(light) - second.render(dark)).mean() > 0.02
+    read = second.network(NetworkConfig()).eval()(second.render(scenes))
+    assert read[COLOR].shape == (6, 1, 3)
+    wrong = read | {COLOR: 1 - scenes[COLOR].round()}
+    right = read | {COLOR: scenes[COLOR]}
+    assert second.code_loss(wrong, scenes) > second.code_loss(right, scenes)
+
+
+def test_a_painted_part_keeps_its_colours(folder: Path, tmp_path: Path) -> None:
+    shape = trimesh.load_mesh(folder / "bracket.stl")
+    shape.visual.vertex_colors = np.tile([200, 30, 30, 255], (len(shape.vertices), 1))
+    shape.export(tmp_path / "red.ply")
+    painted = build(options(folder, mesh=tmp_path / "red.ply"))
+    assert COLOR not in painted.layout
+    assert COLOR not in painted.sample(2, (0,))
+
+
+def test_it_is_seen_from_all_sides_or_from_above(folder: Path, world: Capture) -> None:
+    def lowest_camera(seen: Capture) -> float:
+        code = seen.sample(300, (2,))
+        turn = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
+        camera = -(turn.transpose(1, 2) @ code[TRANSLATION][:, 0, :, None])
+        return float(camera[:, 2].min())
+
+    assert lowest_camera(world) < -0.3
+    upright = build(options(folder, upright=True))
+    assert isinstance(upright, Capture)
+    assert lowest_camera(upright) > -1e-4
+
+
+def test_backgrounds_are_the_plate_and_clutter(folder: Path, world: Capture, cache: Path) -> None:
+    source = world.looks[0].source("train", 0, with_code=False, cache=cache)
+    frames = source.backgrounds(0, 60)
+    assert frames.shape == (60, 3, HEIGHT // 4, WIDTH // 4)
+    assert torch.equal(frames, source.backgrounds(0, 60))
+    plate = cv2.cvtColor(cv2.imread(str(folder / "plate.png")), cv2.COLOR_BGR2RGB)
+    small = torch.from_numpy(cv2.resize(plate, (WIDTH // 4, HEIGHT // 4), interpolation=cv2.INTER_AREA) / 255)
+    flat = torch.cat([frames.flatten(1), small.permute(2, 0, 1).float().flatten()[None]])
+    alike = torch.corrcoef(flat)[-1, :-1] > 0.7
+    assert 30 <= alike.sum() <= 54, "seven of ten are the plate"
+    crops = world.looks[1].source("train", 0, with_code=False, cache=cache).backgrounds(0, 8)
+    assert crops.shape == (8, 3, 64, 64)
+
+
+def test_crops_of_a_plate_span_what_they_span_in_a_frame() -> None:
+    ramp = np.tile(np.linspace(0, 255, 400).astype(np.uint8)[None, :, None], (300, 1, 3))
+    whole = PlateBackgrounds(ramp).draw(20, 40, 30, (0,))
+    part = PlateBackgrounds(ramp).of_crops(0.2, 0.3).draw(20, 30, 30, (0,))
+    across = [(views[..., -1] - views[..., 0]).mean(dim=(1, 2)) for views in (whole, part)]
+    assert across[0].min() > 0.55
+    assert across[1].max() < 0.45
+    assert across[1].min() > 0.05
+    assert PlateBackgrounds(ramp).of_crops(3.0, 4.0).draw(2, 30, 30, (0,)).shape == (2, 3, 30, 30), "larger than it"
+
+
+def test_a_mixture_draws_from_both() -> None:
+    black, white = (PlateBackgrounds(np.full((30, 40, 3), value, np.uint8)) for value in (0, 255))
+    mixed = MixedBackgrounds(black, white, 0.5).split(True).of_crops(0.5, 1)
+    bright = mixed.draw(40, 8, 6, (3,)).mean(dim=(1, 2, 3)) > 0.5
+    assert 8 < bright.sum() < 32
+    assert torch.equal(mixed.draw(40, 8, 6, (3,)), mixed.draw(40, 8, 6, (3,)))
+
+
+def test_photographs_come_in_the_canonical_size_without_distortion(world: Capture) -> None:
+    found = world.photographs(5)
+    assert found.shape == (5, 3, world.camera.height, world.camera.width)
+    assert world.photographs(100).shape[0] == 12
+    straight = cv2.undistort(
+        cv2.cvtColor(cv2.imread(str(world._images / "00.png")), cv2.COLOR_BGR2RGB),
+        world.object.camera.matrix,
+        np.array(world.object.camera.distortion),
+    )
+    assert torch.equal((found[0] * 255).round().byte(), torch.from_numpy(straight).permute(2, 0, 1))
+
+
+def test_what_contradicts_itself_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--near-m 1"):
+        options(folder, near_m=1.0, far_m=0.5)
+    with pytest.raises(UsageError, match="--background and --backgrounds"):
+        options(folder, backgrounds=folder / "photos")
+    with pytest.raises(UsageError, match="inside it"):
+        build(options(folder, near_m=0.05))
+    with pytest.raises(MeshError, match="--mesh-unit to"):
+        build(options(folder, mesh_unit=None))
+    with pytest.raises(MeshError, match=r"none\.stl"):
+        build(options(folder, mesh=folder / "none.stl"))
+    (tmp_path / "camera.json").write_text("{")
+    with pytest.raises(CameraError, match="not JSON"):
+        build(options(folder, camera=tmp_path / "camera.json"))
+
+
+def test_files_that_do_not_belong_together_are_refused_all_at_once(folder: Path, tmp_path: Path) -> None:
+    assert not any("camera" in doubt for doubt in refuse_unfit(options(folder)))
+    small = cv2.resize(cv2.imread(str(folder / "plate.png")), (80, 60))
+    cv2.imwrite(str(tmp_path / "plate.png"), small)
+    camera = json.loads((folder / "camera.json").read_text()) | {"width": 200, "height": 150}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    with pytest.raises(DataError) as refusal:
+        refuse_unfit(options(folder, camera=tmp_path / "camera.json", background=tmp_path / "plate.png"))
+    text = str(refusal.value)
+    assert "200x150" in text
+    assert "80x60" in text
+    assert len(text.splitlines()) == 2
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "cut.png").write_bytes((folder / "plate.png").read_bytes()[:500])
+    with pytest.raises(DataError, match=r"backgrounds: .*cut\.png"):
+        refuse_unfit(options(folder, background=None, backgrounds=tmp_path / "other"))
+    with pytest.raises(DataError, match="80x60"):
+        PlateBackgrounds.read(tmp_path / "plate.png", Intrinsics(np.eye(3), WIDTH, HEIGHT))
+
+
+def call(*words: object) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        cli.train(["capture", *map(str, words)])
+    return int(exit_.value.code or 0)
+
+
+def test_from_files_to_a_model_by_a_project_file(
+    folder: Path,
+    tmp_path: Path,
+    cache: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The whole way, three steps long; the report shows photographs beside what was found in them."""
+    project = folder / "bracket.toml"
+    project.write_text(
+        'mesh = "bracket.stl"\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "photos"\nbackground = "plate.png"\n'
+        "upright = true\nimages = 1200\nbatch-size = 4\nmicro-batch-size = 4\n"
+    )
+    run = tmp_path / "run"
+    monkeypatch.setattr(sys, "argv", ["curio-train", "capture", "--project", str(project)])
+    assert call("--project", project, "--images", 12, "--cache", cache, "--out", run) == 0
+    assert f"curio-export {run}" in capsys.readouterr().err
+    config = RunFolder.open(run).config
+    assert config.world == options(folder, upright=True)
+    assert (config.images, config.recipe.batch_size) == (12, 4)
+    assert 'id="photographs"' in (run / "report.html").read_text()
+    done = export(run, tmp_path / "models")
+    assert done.path == tmp_path / "models" / "bracket" / "1"
+    assert str(folder) not in (done.path.parent / "CARD.md").read_text()
+    with pytest.raises(UsageError, match="run folder"):
+        load_subject(done.path)
+
+
+def test_project_files_that_cannot_be_used(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "part.toml"
+    for content, expected in ((None, "cannot be read"), ("", "empty"), ("mesh =", "not TOML"), ("a = [1]", "list")):
+        if content is not None:
+            file.write_text(content)
+        assert call("--project", file) == 2
+        assert expected in capsys.readouterr().err

@@ -1,0 +1,296 @@
+"""Faults planted one by one in files that are good: each is found by its name, and nothing is found without it."""
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+import trimesh
+from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec
+from curio_train.data.meshes import load_mesh
+from curio_train.doctor.examine import Subjects, examine_files
+from curio_train.doctor.finding import Finding
+from curio_train.onnx_file import put_spec
+from PIL import Image
+
+WIDTH, HEIGHT, NUM_PHOTOS = 160, 120, 64
+K = [[180.0, 0.0, 81.0], [0.0, 180.0, 58.0], [0.0, 0.0, 1.0]]
+
+
+def plate() -> np.ndarray:
+    """An empty scene in RGB: a warm table of fine grain, a cupboard behind it."""
+    random = np.random.default_rng(0)
+    scene = np.full((HEIGHT, WIDTH, 3), (170, 130, 80), np.float64)
+    scene[:45] = (90, 110, 120)
+    scene[20:45, 30:60] = (200, 190, 170)
+    return (scene + random.normal(0, 10, (HEIGHT, WIDTH, 1))).clip(0, 255).astype(np.uint8)
+
+
+def photo(number: int) -> np.ndarray:
+    """The scene with a box somewhere on it."""
+    random = np.random.default_rng(number + 1)
+    image = plate()
+    left, top = int(random.integers(0, WIDTH - 40)), int(random.integers(0, HEIGHT - 40))
+    image[top : top + 32, left : left + 36] = random.integers(40, 220, (1, 1, 3))
+    return (image + random.normal(0, 2, image.shape)).clip(0, 255).astype(np.uint8)
+
+
+def save(path: Path, image: np.ndarray) -> None:
+    cv2.imwrite(str(path), image[..., ::-1])
+
+
+@dataclass
+class Files:
+    """Good files in a folder, for a test to spoil one of."""
+
+    folder: Path
+
+    @property
+    def mesh(self) -> Path:
+        return self.folder / "part.ply"
+
+    @property
+    def camera(self) -> Path:
+        return self.folder / "camera.json"
+
+    @property
+    def photos(self) -> list[Path]:
+        return sorted((self.folder / "photos").iterdir())
+
+    @property
+    def plate(self) -> Path:
+        return self.folder / "plate.png"
+
+    def subjects(self) -> Subjects:
+        return Subjects(
+            mesh=self.mesh,
+            mesh_unit="mm",
+            camera=self.camera,
+            photos=self.folder / "photos",
+            background=self.plate,
+        )
+
+
+def write_camera(path: Path, matrix: Sequence[Sequence[float]] = K, **other: object) -> None:
+    content = {"camera_matrix": matrix, "width": WIDTH, "height": HEIGHT}
+    path.write_text(json.dumps(content | other))
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Files:
+    (tmp_path / "photos").mkdir()
+    for number in range(NUM_PHOTOS):
+        save(tmp_path / "photos" / f"{number:03}.png", photo(number))
+    found = Files(tmp_path)
+    solid = trimesh.creation.box((40, 60, 90))
+    solid.visual.vertex_colors = np.tile([200, 150, 40, 255], (8, 1)).astype(np.uint8)
+    solid.export(found.mesh)
+    write_camera(found.camera)
+    save(found.plate, plate())
+    return found
+
+
+def alarms(subjects: Subjects) -> list[Finding]:
+    return [finding for finding in examine_files(subjects) if finding.state != "good"]
+
+
+def test_good_files_raise_no_alarm(files: Files) -> None:
+    assert alarms(files.subjects()) == []
+
+
+# Faults of the camera file.
+
+
+@pytest.mark.parametrize(
+    ("matrix", "other", "fault"),
+    [
+        pytest.param([[180, 0, 58], [0, 180, 81], [0, 0, 1]], {}, "swapped centre", id="cx and cy"),
+        pytest.param(np.transpose(K).tolist(), {}, "transposed matrix", id="transposed"),
+        pytest.param([[360, 0, 162], [0, 360, 116], [0, 0, 1]], {}, "other resolution", id="of twice the size"),
+        pytest.param([[90, 0, 40], [0, 90, 29], [0, 0, 1]], {}, "other resolution", id="of half the size"),
+        pytest.param([[180, 0, 81], [0, 240, 58], [0, 0, 1]], {}, "focal length", id="squeezed pixels"),
+        pytest.param([[35, 0, 81], [0, 35, 58], [0, 0, 1]], {}, "focal length", id="in millimetres"),
+        pytest.param(K, {"distortion": [-1.9, 0.3, 0, 0, 0]}, "distortion", id="folding distortion"),
+        pytest.param([[0, 0, 81], [0, 180, 58], [0, 0, 1]], {}, "focal length", id="singular"),
+        pytest.param([[180, 0, 130], [0, 180, 58], [0, 0, 1]], {}, "odd centre", id="of a cut-out"),
+    ],
+)
+def test_faults_of_the_camera_file(
+    files: Files, matrix: list[list[float]], other: dict[str, object], fault: str
+) -> None:
+    write_camera(files.camera, matrix, **other)
+    assert fault in {finding.fault for finding in alarms(Subjects(camera=files.camera))}
+
+
+def test_a_camera_of_other_photographs(files: Files) -> None:
+    write_camera(files.camera, [[360, 0, 162.5], [0, 360, 116.5], [0, 0, 1]], width=2 * WIDTH, height=2 * HEIGHT)
+    (finding,) = alarms(replace(files.subjects(), mesh=None, background=None))
+    assert finding.fault == "other size"
+    assert "Scale K by 0.5" in finding.remedy
+
+
+def test_photographs_turned_by_a_quarter(files: Files) -> None:
+    for path in files.photos:
+        save(path, np.rot90(photo(int(path.stem))).copy())
+    (finding,) = alarms(replace(files.subjects(), mesh=None, background=None))
+    assert finding.fault == "turned"
+
+
+# Faults of photographs.
+
+
+def test_exif_rotation_and_focal_length(files: Files) -> None:
+    for path in files.photos:
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        exif.get_ifd(0x8769)[0xA405] = 85
+        Image.fromarray(photo(int(path.stem))).save(path.with_suffix(".jpg"), exif=exif, quality=95)
+        path.unlink()
+    found = {finding.fault: finding for finding in alarms(replace(files.subjects(), background=None))}
+    assert found.keys() == {"EXIF rotation", "focal length"}
+    assert "85 mm" in found["focal length"].text
+
+
+def test_duplicates(files: Files) -> None:
+    cv2.imwrite(str(files.photos[0].with_name("copy.png")), cv2.imread(str(files.photos[0])))
+    (finding,) = alarms(files.subjects())
+    assert finding.fault == "duplicates"
+    assert "000.png and copy.png" in finding.text
+
+
+def test_blurred(files: Files) -> None:
+    for path in files.photos[:20]:
+        save(path, cv2.GaussianBlur(photo(int(path.stem)), (0, 0), 4))
+    (finding,) = alarms(files.subjects())
+    assert finding.fault == "blurred"
+    assert "20 of 64" in finding.text
+
+
+def test_exposure(files: Files) -> None:
+    for path in files.photos[:20]:
+        save(path, (photo(int(path.stem)).astype(float) * 3).clip(0, 255).astype(np.uint8))
+    assert "exposure" in {finding.fault for finding in alarms(files.subjects())}
+
+
+@pytest.mark.parametrize(("left", "state"), [(30, "warning"), (5, "bad")])
+def test_too_few(files: Files, left: int, state: str) -> None:
+    for path in files.photos[left:]:
+        path.unlink()
+    (finding,) = alarms(files.subjects())
+    assert (finding.fault, finding.state) == ("too few", state)
+
+
+def test_mixed_sizes(files: Files) -> None:
+    save(files.photos[3], photo(3)[:100])
+    assert [finding.fault for finding in alarms(Subjects(photos=files.folder / "photos"))] == ["mixed sizes"]
+
+
+def test_unreadable_photographs(files: Files) -> None:
+    files.photos[5].write_bytes(b"\x89PNG")
+    (finding,) = alarms(files.subjects())
+    assert (finding.fault, finding.state) == ("photographs unreadable", "bad")
+    assert "005.png" in finding.text
+
+
+def test_some_raw_frames_saved_as_bgr(files: Files) -> None:
+    for path in files.photos[::6]:
+        cv2.imwrite(str(path), photo(int(path.stem)))
+    (finding,) = alarms(replace(files.subjects(), background=None))
+    assert finding.fault == "swapped colours"
+    assert "11 of 64" in finding.text
+
+
+# Faults of the background plate.
+
+
+def other_scene() -> np.ndarray:
+    return np.ascontiguousarray(255 - plate()[::-1])
+
+
+def brighter() -> np.ndarray:
+    return (plate() * 1.35).clip(0, 255).astype(np.uint8)
+
+
+def shifted() -> np.ndarray:
+    return np.ascontiguousarray(np.roll(plate(), (20, 25), axis=(0, 1)))
+
+
+def as_bgr() -> np.ndarray:
+    return np.ascontiguousarray(plate()[..., ::-1])
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "fault"),
+    [
+        (other_scene, "other background"),
+        (brighter, "background exposure"),
+        (shifted, "background shifted"),
+        (as_bgr, "swapped colours"),
+        (lambda: plate()[:, :100], "background size"),
+    ],
+)
+def test_faults_of_the_plate(files: Files, spoilt: Callable[[], np.ndarray], fault: str) -> None:
+    save(files.plate, spoilt())
+    (finding,) = alarms(files.subjects())
+    assert finding.fault == fault
+
+
+# Faults of a model beside mesh and camera.
+
+
+def export(path: Path, sha256: str, diameter_m: float) -> None:
+    """An ONNX file that says it was trained for such a mesh, and for the good camera."""
+    node = onnx.helper.make_node("Identity", ["image"], ["translation_m"])
+    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.UINT8, [1]) for name in node.input]
+    outputs = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.UINT8, [1]) for name in node.output]
+    graph = onnx.helper.make_graph([node], "copy", values, outputs)
+    model = onnx.helper.make_model(graph, ir_version=9, opset_imports=[onnx.helper.make_opsetid("", 17)])
+    spec = ModelSpec(schema_version=1, name="part", world="linemod")
+    spec.objects.add(name="part", mesh_sha256=sha256, diameter_m=diameter_m)
+    spec.camera.MergeFrom(CanonicalCamera(width=WIDTH, height=HEIGHT, camera_matrix=np.ravel(K).tolist()))
+    put_spec(model, spec)
+    onnx.save(model, str(path))
+
+
+def test_the_models_own_mesh_and_camera_are_good(files: Files) -> None:
+    mesh = load_mesh(files.mesh, "mm")
+    export(files.folder / "model.onnx", mesh.sha256, mesh.diameter_m)
+    assert alarms(replace(files.subjects(), model=files.folder / "model.onnx")) == []
+
+
+@pytest.mark.parametrize(
+    ("size", "fault", "state"),
+    [(1.0, "other mesh", "warning"), (1.7, "other mesh", "bad"), (1000.0, "mesh unit", "bad")],
+)
+def test_a_model_of_another_mesh(files: Files, size: float, fault: str, state: str) -> None:
+    export(files.folder / "model.onnx", "0" * 64, load_mesh(files.mesh, "mm").diameter_m * size)
+    (finding,) = alarms(replace(files.subjects(), model=files.folder / "model.onnx"))
+    assert (finding.fault, finding.state) == (fault, state)
+
+
+def test_a_model_of_another_camera(files: Files) -> None:
+    mesh = load_mesh(files.mesh, "mm")
+    export(files.folder / "model.onnx", mesh.sha256, mesh.diameter_m)
+    write_camera(files.camera, [[560, 0, 81], [0, 560, 58], [0, 0, 1]])
+    (finding,) = alarms(replace(files.subjects(), model=files.folder / "model.onnx"))
+    assert finding.fault == "other view"
+
+
+@pytest.mark.parametrize("name", ["mesh", "camera", "photos", "background", "model"])
+def test_missing_files(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "missing.ply"
+    (finding,) = alarms(Subjects(**{name: path}))
+    assert finding.state == "bad"
+    assert "missing.ply" in finding.text
+
+
+@pytest.mark.skipif("CURIO_DATA" not in os.environ, reason="CURIO_DATA names no folder with LM-O")
+def test_no_alarm_on_camera_and_frames_of_lmo() -> None:
+    root = Path(os.environ["CURIO_DATA"]) / "lmo"
+    frames = next((root / "test").glob("*/rgb"))
+    assert alarms(Subjects(camera=root / "camera.json", photos=frames)) == []

@@ -1,0 +1,167 @@
+"""A camera's K and distortion from photographs of a flat board (Zhang 2000, by OpenCV)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from curio_train.camera import Intrinsics, check_matrix
+from curio_train.data.photographs import Photographs, read_photograph
+from curio_train.errors import CameraError, DataError
+
+_FEWEST_VIEWS = 6
+_FEWEST_CORNERS = 6  # of a board that is partly seen
+_LARGEST_ERROR_PX = 1.5
+_LEAST_SPREAD_DEG = 10.0
+_LARGEST_UNCERTAINTY = 0.01  # of the focal length, one standard deviation
+
+
+@dataclass(frozen=True)
+class Board:
+    """What was photographed.
+
+    Attributes:
+        columns: Squares along the longer side.
+        rows: Squares along the other.
+        square_m: Side of a square.
+        marker_m: Side of a ChArUco marker; None: a plain chessboard.
+        dictionary: OpenCV's name of the markers' dictionary.
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+    marker_m: float | None = None
+    dictionary: str = "DICT_4X4_50"
+
+    def __post_init__(self) -> None:
+        """Refuse boards that cannot be.
+
+        Raises:
+            CameraError: Too few squares, impossible sizes, or an unknown dictionary.
+        """
+        if min(self.columns, self.rows) < 3:
+            raise CameraError(f"a board of {self.columns}x{self.rows} squares; expected at least 3x3")
+        if self.square_m <= 0 or (self.marker_m is not None and not 0 < self.marker_m < self.square_m):
+            raise CameraError(
+                f"squares of {self.square_m} m with markers of {self.marker_m} m; expected 0 < marker < square"
+            )
+        if not self.dictionary.startswith("DICT_") or not hasattr(cv2.aruco, self.dictionary):
+            raise CameraError(f"{self.dictionary!r} is no dictionary of OpenCV; expected one like DICT_4X4_50")
+
+    def find(self, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """The board's inner corners in an image.
+
+        Args:
+            grey: [height, width] uint8.
+
+        Returns:
+            Points of the board [n, 3], metres, and where they are seen [n, 2], pixels; None where it is not seen.
+        """
+        return self._find_plain(grey) if self.marker_m is None else self._find_charuco(grey, self.marker_m)
+
+    def _find_plain(self, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        inner = (self.columns - 1, self.rows - 1)
+        found, corners = cv2.findChessboardCornersSB(grey, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+        if not found:
+            return None
+        column, row = np.meshgrid(np.arange(inner[0]), np.arange(inner[1]))
+        points = np.stack([column, row, np.zeros_like(row)], axis=-1).reshape(-1, 3) * self.square_m
+        return points.astype(np.float32), corners.reshape(-1, 2)
+
+    def _find_charuco(self, grey: np.ndarray, marker_m: float) -> tuple[np.ndarray, np.ndarray] | None:
+        board = self._charuco(marker_m)
+        corners, numbers, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+        if numbers is None or len(numbers) < _FEWEST_CORNERS:
+            return None
+        points = np.asarray(board.getChessboardCorners())[np.asarray(numbers).ravel()]
+        return points.astype(np.float32), np.asarray(corners).reshape(-1, 2)
+
+    def _charuco(self, marker_m: float) -> cv2.aruco.CharucoBoard:
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, marker_m, dictionary)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera, and how well it is known.
+
+    Attributes:
+        camera: K and distortion.
+        error_px: Root mean square distance of corners from where the camera should see them.
+        focal_uncertainty: Standard deviation of the focal length, as a share of it.
+        num_views: Photographs in which the board was found.
+        unused: Photographs in which it was not.
+    """
+
+    camera: Intrinsics
+    error_px: float
+    focal_uncertainty: float
+    num_views: int
+    unused: tuple[Path, ...]
+
+
+def calibrate(folder: Path, board: Board) -> Calibration:
+    """The camera that took a folder of photographs of the board.
+
+    Raises:
+        DataError: No photographs, broken ones, or of several sizes.
+        CameraError: The board is seen in too few of them, or they do not determine a camera.
+    """
+    views, unused, size = [], [], (0, 0)
+    for path in Photographs(folder).paths:
+        grey = cv2.cvtColor(read_photograph(path), cv2.COLOR_RGB2GRAY)
+        if size not in ((0, 0), grey.shape[::-1]):
+            raise DataError(
+                f"{path} has {grey.shape[1]}x{grey.shape[0]} pixels, others {size[0]}x{size[1]}; expected one size"
+            )
+        size = (grey.shape[1], grey.shape[0])
+        found = board.find(grey)
+        if found is None:
+            unused.append(path)
+        else:
+            views.append(found)
+    if len(views) < _FEWEST_VIEWS:
+        raise CameraError(
+            f"{folder}: found the board of {board.columns}x{board.rows} squares in {len(views)} of "
+            f"{len(views) + len(unused)} photographs, expected {_FEWEST_VIEWS} or more; are the counts of squares "
+            "right, is the board sharp and wholly in the frame?"
+        )
+    return _solve(folder, views, size, tuple(unused))
+
+
+def _solve(
+    folder: Path, views: Sequence[tuple[np.ndarray, np.ndarray]], size: tuple[int, int], unused: tuple[Path, ...]
+) -> Calibration:
+    points, pixels = zip(*views, strict=True)
+    try:
+        error, matrix, distortion, turns, _, deviations, _, _ = cv2.calibrateCameraExtended(
+            points, pixels, size, np.zeros((3, 3)), np.zeros(5)
+        )
+    except cv2.error as exc:
+        raise CameraError(f"{folder}: OpenCV finds no camera that sees the boards so ({exc.err})") from exc
+    uncertainty = float(deviations[0, 0] / matrix[0, 0])
+    if error > _LARGEST_ERROR_PX:
+        raise CameraError(
+            f"{folder}: corners lie {error:.2g} pixels from where the best camera sees them, expected at most "
+            f"{_LARGEST_ERROR_PX:g}; is the board flat, the zoom fixed, and all taken with one camera?"
+        )
+    # Where all boards are parallel the estimate itself is wrong, and its deviation too small.
+    if not uncertainty < _LARGEST_UNCERTAINTY or _spread_deg(turns) < _LEAST_SPREAD_DEG:
+        raise CameraError(
+            f"{folder}: the views are too alike: boards are tilted by {_spread_deg(turns):.0f} degrees to each other, "
+            f"the focal length is uncertain by {uncertainty:.1%}; tilt the board by 30 degrees to all sides"
+        )
+    width, height = size
+    camera = Intrinsics(
+        check_matrix(matrix, width, height, str(folder)), width, height, tuple(distortion.ravel()[:5].tolist())
+    )
+    return Calibration(camera, float(error), uncertainty, len(views), unused)
+
+
+def _spread_deg(turns: Sequence[np.ndarray]) -> float:
+    """Largest angle between the normals of two boards, given as rotation vectors [3, 1]."""
+    normals = np.stack([cv2.Rodrigues(np.asarray(turn))[0][:, 2] for turn in turns])
+    return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))

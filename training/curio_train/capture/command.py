@@ -1,0 +1,72 @@
+"""``curio-train capture --calibrate``: a camera file, and where on request the camera stood, from photographs."""
+
+import json
+import os
+from pathlib import Path
+
+from curio_train.camera import load_intrinsics
+from curio_train.capture.calibration import Board, calibrate
+from curio_train.capture.camera_json import save_intrinsics
+from curio_train.capture.ground import scale_by_distance, to_world
+from curio_train.capture.options import CalibrateCommand
+from curio_train.capture.structure import Structure, every_nth, recover
+from curio_train.data.photographs import Photographs
+from curio_train.errors import DataError, UsageError
+
+
+def run(command: CalibrateCommand) -> str:
+    """Do it, and say in a few lines what was found.
+
+    Raises:
+        UsageError: Flags that contradict each other.
+        DataError: Photographs that cannot be used, or a file that cannot be written.
+        CameraError: They do not determine a camera.
+    """
+    if command.every < 1:
+        raise UsageError(f"--every {command.every}, expected 1 or more")
+    if command.board is None:
+        return _from_scene(command)
+    if command.views_out is not None or command.camera is not None:
+        raise UsageError(
+            "--views-out and --camera are for photographs of a scene; leave them out, or leave out --board"
+        )
+    marker_m = None if command.marker_mm is None else command.marker_mm / 1000
+    found = calibrate(command.images, Board(*command.board, command.square_mm / 1000, marker_m, command.dictionary))
+    save_intrinsics(command.camera_out, found.camera)
+    unused = f", not found in {', '.join(path.name for path in found.unused[:5])}" if found.unused else ""
+    return (
+        f"{command.camera_out}: focal length {found.camera.matrix[0, 0]:.1f} pixels ± {found.focal_uncertainty:.2%}, "
+        f"corners off by {found.error_px:.2f} pixels in {found.num_views} photographs{unused}"
+    )
+
+
+def _from_scene(command: CalibrateCommand) -> str:
+    if command.distance_m is not None and command.views_out is None:
+        raise UsageError(f"--distance-m {command.distance_m} is for poses; name a file for them: --views-out")
+    known = None if command.camera is None else load_intrinsics(command.camera)
+    found = recover(every_nth(Photographs(command.images).paths, command.every), known)
+    lines = [f"placed {len(found.photographs)} photographs, points off by {found.error_px:.2f} pixels"]
+    if known is None:
+        save_intrinsics(command.camera_out, found.camera)
+        lines.append(f"{command.camera_out}: focal length {found.camera.matrix[0, 0]:.1f} pixels")
+    if command.views_out is not None:
+        world = to_world(found)
+        if command.distance_m is not None:
+            world = scale_by_distance(world, 0, len(world.photographs) - 1, command.distance_m)
+        _save_views(command.views_out, world)
+        unit = "metres" if command.distance_m is not None else "no known unit: give --distance-m for metres"
+        lines.append(f"{command.views_out}: cam_from_world of each, in {unit}")
+    return "\n".join(lines)
+
+
+def _save_views(path: Path, structure: Structure) -> None:
+    views = {
+        photo.name: {"cam_from_world": matrix.tolist()}
+        for photo, matrix in zip(structure.photographs, structure.cam_from_world, strict=True)
+    }
+    draft = path.with_name(f"{path.name}.part")
+    try:
+        draft.write_text(json.dumps(views) + "\n", encoding="utf-8")
+        os.replace(draft, path)
+    except OSError as exc:
+        raise DataError(f"{path}: cannot be written ({exc.strerror}); name another file: --views-out") from exc

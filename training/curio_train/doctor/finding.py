@@ -1,0 +1,33 @@
+"""What an examination says: one thing looked at, what was found, how sure that is, and what to do."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+State = Literal["good", "warning", "bad"]
+Sureness = Literal["certain", "likely", "possible"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at.
+
+    Attributes:
+        subject: What was looked at.
+        state: good; warning: works, but worse than it could; bad: will not work.
+        text: What was found.
+        remedy: What to do; empty where nothing is to be done.
+        sure: certain: it follows from the file; likely: other causes are rare; possible: have a look.
+        fault: A short name of the kind of fault, the same in every version; empty where all is well.
+    """
+
+    subject: str
+    state: State
+    text: str
+    remedy: str = ""
+    sure: Sureness = "certain"
+    fault: str = ""
+
+    def __str__(self) -> str:
+        """In one line, without subject and state."""
+        sure = "" if self.state == "good" or self.sure == "certain" else f" ({self.sure})"
+        return f"{self.text}{sure}{self.remedy and f'. {self.remedy}'}"

@@ -1,0 +1,118 @@
+"""A folder of photographs: read each once, and look for what would spoil training on them."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from curio_train.camera import Intrinsics
+from curio_train.data.photographs import Photographs
+from curio_train.doctor.finding import Finding, State
+from curio_train.doctor.photograph import Photograph, look_at
+from curio_train.doctor.picture_content import examine_content
+from curio_train.errors import CurioError
+
+_FEWEST, _FEW = 10, 60
+_SAME_FOCAL = 0.15  # focal lengths in EXIF are nominal, and rounded to whole millimetres
+_FULL_FRAME_WIDTH_MM = 36.0
+
+
+def examine_photographs(folder: Path, camera: Intrinsics | None) -> tuple[list[Photograph], list[Finding]]:
+    """The readable photographs, and what was found about them.
+
+    Args:
+        folder: Where they lie.
+        camera: What they were taken with, where known.
+    """
+    try:
+        paths = Photographs(folder).paths
+    except CurioError as exc:
+        return [], [Finding("photographs", "bad", str(exc), fault="photographs unreadable")]
+    photographs, broken = [], []
+    for path in paths:
+        try:
+            photographs.append(look_at(path))
+        except CurioError as exc:
+            broken.append(str(exc))
+    findings = [*_unreadable(broken, len(paths))]
+    if photographs:
+        findings += [_sizes(folder, photographs), *_count(photographs), *_turned(photographs)]
+        findings += [*_other_camera(photographs, camera), *examine_content(photographs)]
+    return photographs, findings
+
+
+def named(photographs: Sequence[Photograph]) -> str:
+    """How many, and the first of them."""
+    more = f" and {len(photographs) - 1} more" if len(photographs) > 1 else ""
+    return f"{photographs[0].path.name}{more}"
+
+
+def _unreadable(broken: list[str], count: int) -> Iterator[Finding]:
+    if broken:
+        text = f"{len(broken)} of {count} cannot be read, the first: {broken[0]}"
+        yield Finding("photographs", "bad", text, "Copy them again or remove them", fault="photographs unreadable")
+
+
+def _sizes(folder: Path, photographs: Sequence[Photograph]) -> Finding:
+    sizes = Counter((photo.width, photo.height) for photo in photographs)
+    found = ", ".join(f"{count} of {width}x{height}" for (width, height), count in sizes.most_common(3))
+    if len(sizes) == 1:
+        return Finding("photographs", "good", f"{folder}: {found}")
+    text = f"{folder}: they differ in size: {found}"
+    remedy = "One camera file is for one size: keep the photographs of one camera and orientation"
+    return Finding("photograph sizes", "bad", text, remedy, fault="mixed sizes")
+
+
+def _count(photographs: Sequence[Photograph]) -> Iterator[Finding]:
+    count = len(photographs)
+    if count < _FEW:
+        text = f"only {count}; a detector learns from about 200, and below {_FEW} mostly what these show"
+        state: State = "bad" if count < _FEWEST else "warning"
+        yield Finding(
+            "photograph count", state, text, "Take more, from all sides and in the light of later use", fault="too few"
+        )
+
+
+def _turned(photographs: Sequence[Photograph]) -> Iterator[Finding]:
+    turned = [photo for photo in photographs if photo.orientation > 1]
+    if turned:
+        text = f"{len(turned)} have an EXIF rotation ({named(turned)}), which viewers apply and training ignores"
+        remedy = "Make sure that K is of the stored pixels, or store them upright and without the EXIF entry"
+        yield Finding("photograph rotation", "warning", text, remedy, fault="EXIF rotation")
+
+
+def _other_camera(photographs: Sequence[Photograph], camera: Intrinsics | None) -> Iterator[Finding]:
+    """What photographs say about the camera file given beside them."""
+    if camera is None:
+        return
+    (width, height), _ = Counter((photo.width, photo.height) for photo in photographs).most_common(1)[0]
+    expected = f"the camera file is for {camera.width}x{camera.height}, photographs have {width}x{height}"
+    if (width, height) == (camera.height, camera.width):
+        text, fault = f"{expected}: they are turned by a quarter", "turned"
+        yield Finding(
+            "photograph sizes", "bad", text, "Store them as the camera was calibrated, or turn K", fault=fault
+        )
+    elif (width, height) != (camera.width, camera.height):
+        same = abs(width / height / (camera.width / camera.height) - 1) < 0.01
+        remedy = (
+            f"Scale K by {width / camera.width:.4g} (principal point: (c + 0.5) s - 0.5) and set the size"
+            if same
+            else "They are of another camera, or cut: calibrate with photographs of this size"
+        )
+        yield Finding("photograph sizes", "bad", expected, remedy, fault="other size")
+    yield from _other_focal_length(photographs, camera)
+
+
+def _other_focal_length(photographs: Sequence[Photograph], camera: Intrinsics) -> Iterator[Finding]:
+    noted = [photo.focal_35mm for photo in photographs if photo.focal_35mm]
+    if not noted:
+        return
+    if len(set(noted)) > 1:
+        text = f"EXIF notes {len(set(noted))} focal lengths, {min(noted):g} to {max(noted):g} mm: the lens was zoomed"
+        yield Finding("photograph focal length", "bad", text, "One camera file is for one zoom: fix it", fault="zoomed")
+        return
+    longer = max(camera.width, camera.height)
+    focal_px = noted[0] / _FULL_FRAME_WIDTH_MM * longer
+    if abs(camera.matrix[0, 0] / focal_px - 1) > _SAME_FOCAL:
+        text = f"EXIF says {noted[0]:g} mm (35 mm film), about {focal_px:.0f} pixels; K says {camera.matrix[0, 0]:.0f}"
+        remedy = "K seems to be of another camera, zoom or size: calibrate this one"
+        yield Finding("camera focal length", "warning", text, remedy, "likely", fault="focal length")
