@@ -24,8 +24,6 @@ def run(tmp_path_factory: pytest.TempPathFactory, call: Call) -> Path:
     flags = [
         "--class",
         "ape",
-        "--method",
-        "our",
         "--data",
         DATA,
         "--images",
@@ -51,6 +49,12 @@ def result(run: Path, call: Call) -> dict:
     return json.loads(call("curio-eval", run, *flags, "--json").stdout.splitlines()[-1])
 
 
+def test_training_and_evaluation_leave_a_report(run: Path, result: dict) -> None:
+    page = (run / "report.html").read_text()
+    assert page.count('src="data:image/png;base64,') == 3
+    assert f"{result['real']['metrics']['lateral_mm_median']:.4g}</td>" in page
+
+
 def test_every_real_frame_gets_an_answer_and_a_drawing(model: Path, call: Call, tmp_path: Path) -> None:
     out = tmp_path / "found.jsonl"
     flags = ["--camera", DATA / "camera.json", "--out", out, "--overlays", tmp_path / "overlays"]
@@ -72,7 +76,7 @@ def test_evaluation_sees_frames_as_serving_does(run: Path, result: dict, model: 
     """The evaluation's own results file against curio-detect's answers: two implementations of one view."""
     done = call("curio-detect", model, FRAMES, "--camera", DATA / "camera.json")
     served = {int(Path(row["image"]).stem): row["detections"][0] for row in map(json.loads, done.stdout.splitlines())}
-    with (run.parent / "our_lmo-test.csv").open() as file:
+    with (run.parent / "sleep_lmo-test.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == result["real"]["num_targets"] == 89
     for row in rows:
@@ -85,11 +89,21 @@ def test_evaluation_sees_frames_as_serving_does(run: Path, result: dict, model: 
 def test_real_targets_are_counted_by_visibility(result: dict) -> None:
     bins = {(row["from"], row["to"]): row["num_targets"] for row in result["real"]["by_visibility"]}
     assert sum(bins.values()) == 89
-    assert bins[0.8, 1.0] == 58  # as published with the data
+    assert bins[0.8, 1.0] == result["real"]["num_targets_visible_80"] == 58  # as published with the data
+    assert 0 <= result["real"]["metrics"]["add_recall_visible_80"] <= 1
+    assert (result["real"]["split_name"], result["labels_synthetic"]) == ("bop19 targets", True)
     for metrics in (result["metrics"], result["untrained"], result["real"]["metrics"]):
         assert 0 <= metrics["add_recall"] <= 1
         assert 0 <= metrics["rotation_deg_median"] <= 180
         assert metrics["translation_mm_median"] >= metrics["lateral_mm_median"]
+
+
+def test_the_card_names_the_meshes_and_no_folder_of_this_machine(model: Path) -> None:
+    card = (model / "CARD.md").read_text()
+    assert "Linemod-Occluded (Brachmann et al. 2014)" in card
+    assert "CC BY-SA 4.0" in card
+    assert "--data lmo" in card
+    assert str(DATA.parent) not in card
 
 
 def test_a_model_needs_the_data_of_its_world(model: Path, call: Call) -> None:

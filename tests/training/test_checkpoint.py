@@ -79,6 +79,26 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(tmp_path: Path, cach
     assert courses[0] == courses[1]
 
 
+def test_a_run_may_begin_with_the_network_of_another(tmp_path: Path, cache: Path) -> None:
+    train(tmp_path / "first", cache)
+    # A learning rate this small moves no weight: what is left is what the run began with.
+    still = replace(CONFIG, images=8, recipe=replace(CONFIG.recipe, learning_rate=1e-30), init=tmp_path / "first")
+    train(tmp_path / "second", cache, still)
+    first, second = (last_tensors(tmp_path / name) for name in ("first", "second"))
+    weights = [name for name in first if name.startswith("pose.network.") and name.endswith("weight")]
+    assert weights
+    assert all(torch.equal(first[name], second[name]) for name in weights)
+    assert not torch.equal(first["critic.network.layers.0.weight"], second["critic.network.layers.0.weight"])
+    resumed = replace(still, images=16)
+    train(tmp_path / "second", cache, resumed, resume=True)
+
+    others = replace(still, network=replace(CONFIG.network, hidden=16))
+    with pytest.raises(UsageError, match=r"--init .*first: its network does not fit"):
+        train(tmp_path / "third", cache, others)
+    with pytest.raises(CheckpointError, match="no run folder"):
+        train(tmp_path / "fourth", cache, replace(still, init=tmp_path / "nothing"))
+
+
 def test_two_checkpoints_are_kept(tmp_path: Path, cache: Path) -> None:
     learn(CONFIG, tmp_path / "run", Interruption(), resume=False, cache=cache, checkpoint_minutes=0)
     kept = [path.name for path in sorted((tmp_path / "run/checkpoints").iterdir())]

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from curio_train import cli
 from curio_train.config import RunConfig
 from curio_train.data.bop import ModelInfo
 from curio_train.errors import CurioError, DataError, ExportError, UsageError
-from curio_train.evaluation.evaluate import HeldOut, draw, evaluate, score
+from curio_train.evaluation.evaluate import draw, evaluate, score, uses_synthetic_labels
 from curio_train.evaluation.real_frames import evaluate_real_frames, look
 from curio_train.evaluation.scores import pose_scores, rotation_errors_deg
 from curio_train.evaluation.subject import Subject
@@ -23,8 +24,9 @@ from curio_train.geometry import Pose
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds.base import Camera
 from curio_train.worlds.circles import Circles
-from curio_train.worlds.linemod import Linemod
-from curio_train.worlds.options import LinemodOptions
+from curio_train.worlds.linemod import build
+from curio_train.worlds.options import CirclesOptions, LinemodOptions
+from curio_train.worlds.single_object import SingleObjectWorld
 from scipy.spatial.transform import Rotation
 
 WriteRun = Callable[..., Path]
@@ -37,13 +39,12 @@ def turned(axis: str, degrees: float) -> np.ndarray:
 def test_circles_are_scored_in_image_widths_and_pixels() -> None:
     world = Circles()
     code = world.sample(4, (0,))
-    images = torch.zeros(4, 3, 128, 128, dtype=torch.uint8)
     offset = torch.tensor([[0.03, -0.04, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.4, 0.0]])[:, None]
-    found = score(world, lambda _: {TRANSLATION: code[TRANSLATION] + offset}, HeldOut(images, code))
+    found = score(world, {TRANSLATION: code[TRANSLATION] + offset}, code)
     assert found["position_image_widths"] == pytest.approx((0.05 + 0.5) / 4, rel=1e-5)
     assert found["position_px"] == pytest.approx(128 * (0.05 + 0.5) / 4, rel=1e-5)
     assert found["scene_error"] == pytest.approx((0.05 + 0.5) / 4 / 0.8, rel=1e-5)  # Eq. 1 divides by the range
-    perfect = score(world, lambda _: code, HeldOut(images, code))
+    perfect = score(world, code, code)
     assert perfect.keys() == found.keys()
     assert all(value == pytest.approx(0, abs=1e-6) for value in perfect.values())
 
@@ -142,7 +143,7 @@ def data(tmp_path: Path) -> Path:
     return root
 
 
-def always_at(world: Linemod, translation_m: list[float]) -> Subject:
+def always_at(world: SingleObjectWorld, translation_m: list[float]) -> Subject:
     """A reader that sees the object at one place of the canonical camera, whatever it is shown."""
 
     def predict(images: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -158,9 +159,10 @@ def always_at(world: Linemod, translation_m: list[float]) -> Subject:
 
 
 def test_real_frames_are_scored_where_bop_asks(data: Path, tmp_path: Path) -> None:
-    world = Linemod(LinemodOptions("ape", data))
+    world = build(LinemodOptions("ape", data, gaze=False))
     found = evaluate_real_frames(always_at(world, [0.0, 0.0, 0.8]), data, tmp_path / "bop")
     assert (found["dataset"], found["split"], found["num_targets"]) == ("lmx", "test", 2)
+    assert found["split_name"] == "bop19 targets"
     metrics = found["metrics"]
     assert metrics["add_recall"] == 0.5  # right in image 3; in image 4 it is 117 mm off
     assert metrics["add_recall_low"] <= 0.5 <= metrics["add_recall_high"]
@@ -175,6 +177,16 @@ def test_real_frames_are_scored_where_bop_asks(data: Path, tmp_path: Path) -> No
         {"from": 0.8, "to": 1.0, "num_targets": 1, "add_recall": 1.0},
     ]
 
+    assert found["num_targets_visible_80"] == 1
+    names = ("add_recall_visible_80", "add_recall_visible_80_low", "add_recall_visible_80_high")
+    assert [metrics[name] for name in names] == [1.0, 1.0, 1.0]
+    right, wrong = found["targets"]
+    assert (right["image_id"], right["visible_fraction"], right["confidence"]) == (3, 1.0, 1.0)
+    assert right["add_diameters"] < 0.01
+    assert (wrong["image_id"], wrong["visible_fraction"]) == (4, 0.5)
+    assert wrong["translation_mm"] == pytest.approx(np.hypot(60, 100), rel=1e-3)
+    assert wrong["add_diameters"] == pytest.approx(np.hypot(60, 100) / 80 / np.sqrt(3), rel=1e-2)
+
     header, *lines = (tmp_path / "bop" / "wake-sleep_lmx-test.csv").read_text().splitlines()
     assert header == "scene_id,im_id,obj_id,score,R,t,time"
     rows = [line.split(",") for line in lines]
@@ -185,8 +197,25 @@ def test_real_frames_are_scored_where_bop_asks(data: Path, tmp_path: Path) -> No
         assert float(row[6]) > 0
 
 
+def test_visible_targets_are_left_out_where_nothing_is_known_of_them(data: Path) -> None:
+    world = build(LinemodOptions("ape", data, gaze=False))
+    (data / "test/000002/scene_gt_info.json").unlink()
+    found = evaluate_real_frames(always_at(world, [0.0, 0.0, 0.8]), data, None)
+    assert found["num_targets_visible_80"] == 0
+    assert "add_recall_visible_80" not in found["metrics"]
+
+
+def test_what_counts_as_labels_of_renderings(tmp_path: Path, write_run: WriteRun) -> None:
+    own = RunConfig(CirclesOptions(), method="our")
+    assert not uses_synthetic_labels(own)
+    assert all(uses_synthetic_labels(replace(own, method=method)) for method in ("super", "sleep", "wake_sleep"))
+    unlabelled = write_run(tmp_path / "unlabelled")
+    assert not uses_synthetic_labels(replace(own, init=unlabelled))
+    assert uses_synthetic_labels(replace(own, init=tmp_path / "gone"))
+
+
 def test_a_data_set_without_the_object_is_refused(data: Path) -> None:
-    world = Linemod(LinemodOptions("ape", data))
+    world = build(LinemodOptions("ape", data, gaze=False))
     for file in (data / "test").rglob("*.png"):
         file.unlink()
     with pytest.raises(DataError, match="found no images"):
@@ -206,6 +235,7 @@ def test_the_command_prints_one_object_and_keeps_it(
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert json.loads((run / "evaluation.json").read_text()) == result
     assert (result["world"], result["method"], result["seed"], result["num_images"]) == ("circles", "noncur", 3, 40)
+    assert (result["labels_real"], result["labels_synthetic"]) == (False, False)
     assert (result["images_seen"], result["labels"], result["objects"]) == (64, 0.0, ["circle"])
     assert result["metrics"].keys() == result["untrained"].keys()
     assert result["metrics"] != result["untrained"]

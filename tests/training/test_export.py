@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from curio_train.export import Exported, check_images, export, largest_differenc
 from curio_train.learning.checkpoint import RunFolder
 from curio_train.learning.provenance import this_sitting
 from curio_train.learning.state import Course
-from curio_train.model_card import EVALUATION_FILE, Making, card
+from curio_train.model_card import EVALUATION_FILE, Making, card, portable
 from curio_train.model_folder import find_model
 from curio_train.onnx_file import OnnxModel
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout
@@ -86,12 +87,20 @@ def test_half_is_half_as_large_and_its_rounding_is_told(
 
 def test_a_file_stands_alone_and_tells_nothing_of_the_machine(single: Exported, half: Exported) -> None:
     for exported in (single, half):
-        assert files(exported.path) == ["model.onnx"]
+        assert files(exported.path) == ["golden.npz", "model.onnx"]
         content = (exported.path / "model.onnx").read_bytes()
         model = onnx.load_model_from_string(content)
         assert not any(onnx.external_data_helper.uses_external_data(tensor) for tensor in model.graph.initializer)
         assert b"stack_trace" not in content
         assert str(Path(__file__).parents[2]).encode() not in content
+
+
+def test_the_golden_image_comes_with_the_models_own_answers(half: Exported) -> None:
+    with np.load(half.path / "golden.npz") as golden:
+        found = OnnxModel.open(half.path / "model.onnx")(golden["image"][None])
+        assert set(golden.files) == {"image", *found}
+        assert all(np.abs(found[name][0].numpy() - golden[name]).max() < 1e-6 for name in found)
+        assert golden["image"].max() > 100, "a black picture tells nothing"
 
 
 def test_the_spec_describes_world_and_making(single: Exported, run: Path) -> None:
@@ -113,7 +122,8 @@ def test_the_spec_describes_world_and_making(single: Exported, run: Path) -> Non
 def test_versions_stand_beside_each_other(single: Exported, half: Exported, models: Path) -> None:
     assert (single.path, half.path) == (models / "circles" / "1", models / "circles" / "2")
     assert files(models) == [
-        "circles", "circles/1", "circles/1/model.onnx", "circles/2", "circles/2/model.onnx",
+        "circles", "circles/1", "circles/1/golden.npz", "circles/1/model.onnx",
+        "circles/2", "circles/2/golden.npz", "circles/2/model.onnx",
         "circles/CARD.md", "circles/SHA256SUMS", "circles/config.pbtxt",
     ]  # fmt: skip
     sums = dict(line.split("  ")[::-1] for line in (models / "circles" / "SHA256SUMS").read_text().splitlines())
@@ -138,6 +148,14 @@ def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Expor
         text = card(1, spec, {TRANSLATION: (1, 3)}, Circles.objects, made)
         assert ("| position_px | 1.25 | 40 |" in text) == quoted
         assert ("Not evaluated" in text) != quoted
+
+
+def test_commands_on_cards_name_no_folder_of_a_machine() -> None:
+    typed = "curio-train linemod --data /mnt/a b/lmo --out=/data/runs/ape --init ~/ape --class ape --cache ../c"
+    words = ["curio-train", "linemod", "--data", "/mnt/a b/lmo", *typed.split()[5:]]
+    told = "curio-train linemod --data lmo --out=ape --init ape --class ape --cache ../c"
+    assert portable(shlex.join(words)) == told
+    assert portable(told) == told
 
 
 def test_disagreement_is_refused_and_leaves_nothing(tmp_path: Path, write_run: WriteRun) -> None:

@@ -1,4 +1,5 @@
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -6,11 +7,13 @@ import pytest
 import torch
 import trimesh
 from curio_train.errors import DataError, UsageError
+from curio_train.export import export
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
-from curio_train.worlds.linemod import FAR_M, NEAR_M, STRONGEST_LIGHT, WEAKEST_LIGHT
+from curio_train.worlds.linemod import FAR_M, NEAR_M
 from curio_train.worlds.options import LinemodOptions
+from curio_train.worlds.views import STRONGEST_LIGHT, WEAKEST_LIGHT
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +43,7 @@ def photographs(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def world(data, photographs):
-    return build(LinemodOptions("ape", data, photographs))
+    return build(LinemodOptions("ape", data, photographs, gaze=False))
 
 
 def test_poses_come_from_the_published_range(world):
@@ -90,6 +93,27 @@ def test_gradients_reach_every_field(world, tmp_path):
     for name, value in moved.items():
         assert value.grad.isfinite().all(), name
         assert value.grad.abs().sum() > 0, name
+
+
+def test_a_card_names_the_source_of_the_mesh_and_no_folder(data, tmp_path, write_run, monkeypatch):
+    typed = [
+        "/opt/env/bin/curio-train",
+        "linemod",
+        "--class",
+        "ape",
+        "--data",
+        str(data),
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    monkeypatch.setattr(sys, "argv", typed)
+    run = write_run(tmp_path / "run", options=LinemodOptions("ape", data, gaze=False))
+    text = (export(run, tmp_path / "models").path.parent / "CARD.md").read_text()
+    assert f"curio-train linemod --class ape --data {data.name} --out run`" in text
+    assert str(data) not in text
+    assert str(tmp_path) not in text
+    assert "LineMOD (Hinterstoisser et al. 2012)" in text
+    assert "CC BY 4.0" in text
 
 
 def test_unknown_class_and_missing_data_are_named(data, tmp_path):

@@ -47,7 +47,7 @@ def configuration(method: Method = "our", recipe: Recipe = FAST, **others: objec
 
 
 def trainer(config: RunConfig) -> Trainer:
-    return Trainer(config, Circles(), SameBatch(with_code=config.method == "super"), ALONE)
+    return Trainer(config, Circles(), [SameBatch(with_code=config.method == "super")], ALONE)
 
 
 def weights(trainer: Trainer) -> Tensor:
@@ -110,7 +110,7 @@ def test_each_micro_batch_holds_its_own_images(cache: Path) -> None:
             return SameBatch(with_code=False).batch(step, size)
 
     one = Trainer(
-        configuration("noncur", replace(FAST, batch_size=6, micro_batch_size=2)), Circles(), Recording(), ALONE
+        configuration("noncur", replace(FAST, batch_size=6, micro_batch_size=2)), Circles(), [Recording()], ALONE
     )
     one.step(1.0)
     one.step(1.0)

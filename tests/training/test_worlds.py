@@ -142,6 +142,17 @@ def test_every_object_is_whole_in_both_views(world: MeshWorld) -> None:
         assert pixels.max() < 127
 
 
+def test_objects_on_the_ground_throw_shadows(worlds: dict[str, MeshWorld]) -> None:
+    """Where an object is moved out of the picture its shadow goes, too."""
+    world = worlds["chairs"]
+    code = world.sample(4, (0,))
+    with torch.no_grad():
+        image, ground = world.render(code), world.render({**code, TRANSLATION: code[TRANSLATION] + 1000})
+    grey = (image.amax(1) - image.amin(1)) < 1e-3  # the chairs are brown
+    darker = (ground - image).amin(1) > 0.1
+    assert (grey & darker).flatten(1).sum(1).min() > 20
+
+
 def test_hidden_objects_leave_no_trace(worlds: dict[str, MeshWorld]) -> None:
     for name in ("varied", "light"):
         world = worlds[name]
@@ -149,7 +160,7 @@ def test_hidden_objects_leave_no_trace(worlds: dict[str, MeshWorld]) -> None:
         moved = {**code, COLOR: torch.where(code[CONFIDENCE] > 0, code[COLOR], 1 - code[COLOR])}
         assert torch.allclose(world.render(code), world.render(moved), atol=1e-6)
         empty = world.render({**code, CONFIDENCE: torch.zeros_like(code[CONFIDENCE])})
-        assert torch.allclose(empty, world.behind(world.light(code)), atol=1e-6)
+        assert torch.allclose(empty, world.render({**code, TRANSLATION: code[TRANSLATION] + 1000}), atol=1e-6)
 
 
 def test_novel_view_is_from_the_side(worlds: dict[str, MeshWorld]) -> None:
@@ -249,7 +260,7 @@ def test_every_method_learns_a_fixed_batch(worlds: dict[str, MeshWorld], name: s
         code = world.sample(FAST.batch_size, (3,))
         images = (world.render(code) * 255).round().byte()
     source = StoredImages(images, code if method == "super" else None, seed=0, shuffle=False)
-    trainer = Trainer(config, world, source, Ranks(0, 1, torch.device("cpu")))
+    trainer = Trainer(config, world, [source], Ranks(0, 1, torch.device("cpu")))
 
     rows = [trainer.step(1.0) for _ in range(24 if method == "sleep" else 10)]
     assert all(math.isfinite(value) for row in rows for value in row.values())

@@ -152,7 +152,16 @@ def project(points: Float[Tensor, "*#batch n 3"], matrix: Float[Tensor, "*#batch
 def rays(matrix: Float[Tensor, "*batch 3 3"], width: int, height: int) -> Float[Tensor, "*batch {height} {width} 3"]:
     """The point at depth z = 1 that each pixel's centre sees, camera frame."""
     pixels = _pixel_centres(matrix, width, height)
-    return (pixels @ torch.linalg.inv(matrix).transpose(-1, -2)).unflatten(-2, (height, width))
+    return (pixels @ inverse(matrix).transpose(-1, -2)).unflatten(-2, (height, width))
+
+
+def inverse(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """K⁻¹, written out: exact for K's triangle, and without a solver in an exported graph."""
+    fx, skew, cx = matrix[..., 0, :].unbind(-1)
+    _, fy, cy = matrix[..., 1, :].unbind(-1)
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    rows = [1 / fx, -skew / (fx * fy), (skew * cy / fy - cx) / fx, zero, 1 / fy, -cy / fy, zero, zero, one]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
 def _pixel_centres(like: Tensor, width: int, height: int) -> Tensor:
@@ -199,7 +208,7 @@ def gaze_at(
     centre = torch.full_like(focal_px, (size - 1) / 2)
     rows = [focal_px, zero, centre, zero, focal_px, centre, zero, zero, one]
     crop = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
-    return Gaze(rotation, crop, crop @ rotation @ torch.linalg.inv(matrix))
+    return Gaze(rotation, crop, crop @ rotation @ inverse(matrix))
 
 
 def sampling_grid(
@@ -208,7 +217,7 @@ def sampling_grid(
     """Where ``grid_sample(frame, grid, align_corners=False)`` must look for each pixel of the crop.
 
     ``align_corners=False`` puts -1 and 1 at the image's borders, which lie half a pixel outside the pixel centres. The
-    inverse homography K Rᵀ K_crop⁻¹ is written out: no inversion then enters an exported graph but that of a triangle.
+    inverse homography K Rᵀ K_crop⁻¹ is written out: no solver then enters an exported graph.
     """
     seen = rays(gaze.matrix, size, size).flatten(1, 2)
     frame = seen @ gaze.rotation @ matrix.transpose(-1, -2)

@@ -8,16 +8,18 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_type_hints
 
 import tyro
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
-from curio_train.config import PRESETS, RunConfig, WorldOptions
-from curio_train.errors import CurioError
+from curio_train.capture.options import CalibrateCommand
+from curio_train.config import Preset, RunConfig, WorldOptions, preset_recipe
+from curio_train.errors import CurioError, UsageError
 from curio_train.learning.configuration import load_config, refuse_other, world_name
 from curio_train.learning.interruption import Interrupted, Interruption, interruptible
+from curio_train.project_file import with_project
 from curio_train.worlds import WORLDS
 
 
@@ -27,6 +29,7 @@ class Session:
 
     Attributes:
         out: Folder of the new run; runs/WORLD-METHOD-SEED unless given.
+        project: TOML file of flags by their names; those typed beside it win.
         resume: Folder of a run to go on with, with its own configuration; budgets may be given anew.
         cache: Where image sets that a world draws once are kept.
         device: auto takes CUDA where there is one.
@@ -34,6 +37,7 @@ class Session:
     """
 
     out: Path | None = None
+    project: Path | None = None
     resume: Path | None = None
     cache: Path = Path("~/.cache/curio-pose")
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -51,7 +55,17 @@ class TrainCommand:
 def train(arguments: Sequence[str] | None = None) -> None:
     """``curio-train WORLD …``: exit status 0 done, 1 failed, 2 wrong call, 128 + signal when interrupted."""
     given = sys.argv[1:] if arguments is None else list(arguments)
+    if given[:1] == ["capture"] and "--calibrate" in given:
+        calibration = tyro.cli(CalibrateCommand, args=given[1:], prog="curio-train capture")
+        sys.exit(answer(lambda _: _calibrate(calibration)))
     sys.exit(answer(lambda interruption: _train(_parse(given), interruption)))
+
+
+def _calibrate(command: CalibrateCommand) -> int:
+    from curio_train.capture.command import run
+
+    print(run(command))
+    return 0
 
 
 def answer(work: Callable[[Interruption], int]) -> int:
@@ -73,14 +87,15 @@ def answer(work: Callable[[Interruption], int]) -> int:
 
 def _parse(arguments: list[str]) -> TrainCommand:
     """The call as typed; what it leaves out comes from the preset, or from the run it resumes."""
+    arguments = with_project(arguments, _path_flags())
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", nargs="?", default="laptop")
     first.add_argument("--resume", nargs="?", type=Path)
     seen, _ = first.parse_known_args(arguments)
 
-    recipe = PRESETS.get(seen.preset, PRESETS["laptop"])  # an unknown preset is tyro's to refuse
+    preset: Preset = "paper" if seen.preset == "paper" else "laptop"  # an unknown preset is tyro's to refuse
     defaults = {
-        name: RunConfig(_unset(kind), method=kind.default_method, recipe=recipe, network=kind.default_network)
+        name: RunConfig(_unset(kind), method=kind.default_method, recipe=preset_recipe(preset, kind))
         for name, kind in WORLDS.items()
     }
     stored = load_config(seen.resume) if seen.resume else None
@@ -101,6 +116,12 @@ def _parse(arguments: list[str]) -> TrainCommand:
     return command
 
 
+def _path_flags() -> set[str]:
+    """Names of all flags that are files or folders."""
+    hints = [hint for kind in (*WORLDS.values(), RunConfig, Session) for hint in get_type_hints(kind).items()]
+    return {name for name, kind in hints if kind in (Path, Path | None)}
+
+
 def _unset(kind: type[WorldOptions]) -> WorldOptions:
     """Options of a world with those that the user has to give marked as missing."""
     required = [field.name for field in dataclasses.fields(kind) if field.default is field.default_factory]
@@ -110,8 +131,10 @@ def _unset(kind: type[WorldOptions]) -> WorldOptions:
 def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_train.learning.loop import Outcome
     from curio_train.learning.session import learn
+    from curio_train.preparation import prepared
 
-    config, session = command.config, command.session
+    session = command.session
+    config = command.config if session.resume else prepared(command.config, session.cache, _warn)
     path = session.resume or session.out or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
     outcome, course = learn(
         config,
@@ -127,9 +150,26 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         print(f"{path}: {outcome.value} after {course.images:,} images in {course.seconds / 60:.1f} minutes{loss}")
         if outcome is Outcome.INTERRUPTED:
             print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
+        else:
+            _report(path, session.cache)
+            print(f"to serve it: curio-export {path} --out models/, then curio-serve models/", file=sys.stderr)
     if outcome is Outcome.INTERRUPTED and interruption.signum is not None:
         return 128 + interruption.signum
     return 0
+
+
+def _report(run: Path, cache: Path) -> None:
+    """Leave a report in the folder of a finished run, which has succeeded whatever becomes of the report."""
+    from curio_train.evaluation.report import report_training
+
+    try:
+        report_training(run, cache)
+    except CurioError as exc:
+        _warn(str(exc))
+
+
+def _warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
 
 
 @dataclass(frozen=True)
@@ -174,6 +214,7 @@ def _evaluate(command: EvaluateCommand) -> int:
             bop_results=command.bop_results,
             cache=command.cache,
             progress=status.update,
+            warn=_warn,
         )
     print_evaluation(result, Console())
     if command.json:
@@ -218,13 +259,16 @@ def _export(command: ExportCommand) -> int:
 
 @dataclass(frozen=True)
 class DoctorCommand:
-    """Check this machine, and a mesh, a camera file and photographs where they are given, before training on them.
+    """Check this machine, and a mesh, a camera file, photographs and a model where they are given, before using them.
 
     Attributes:
         mesh: Mesh file: PLY, OBJ, STL, glTF or OFF.
         mesh_unit: Unit of its coordinates; the file's own, or metres, unless given.
         camera: Camera JSON, or BOP's camera.json.
         photos: Folder of photographs, taken with that camera where one is given.
+        background: Photograph of the empty scene, taken as the others were.
+        model: Model folder, version folder or .onnx file, made for that mesh and camera where they are given.
+        symmetries: File for the symmetries of the mesh's shape, as an entry of BOP's models_info.json.
         cache: Where image sets that a world draws once will be kept.
     """
 
@@ -232,6 +276,9 @@ class DoctorCommand:
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
     camera: Path | None = None
     photos: Path | None = None
+    background: Path | None = None
+    model: Path | None = None
+    symmetries: Path | None = None
     cache: Path = Session.cache
 
 
@@ -242,12 +289,62 @@ def doctor(arguments: Sequence[str] | None = None) -> None:
 
 
 def _examine(command: DoctorCommand) -> int:
-    from curio_train.doctor import examine
+    from curio_train.doctor.examine import Subjects, examine, save_symmetries
 
+    if command.symmetries is not None and command.mesh is None:
+        raise UsageError(f"--symmetries {command.symmetries}: found no --mesh to find them from")
     colours = {"good": "green", "warning": "yellow", "bad": "bold red"}
     console, status = Console(highlight=False, soft_wrap=True), 0
-    for finding in examine(command.mesh, command.mesh_unit, command.camera, command.photos, command.cache):
+    names = [field.name for field in dataclasses.fields(Subjects)]
+    for finding in examine(Subjects(**{name: getattr(command, name) for name in names}), command.cache):
         console.print(f"[{colours[finding.state]}]{finding.state:>7}[/]  [bold]{finding.subject}[/]: ", end="")
-        console.print(finding.text, markup=False)
+        console.print(str(finding), markup=False)
         status = max(status, finding.state == "bad")
+    if command.symmetries is not None and command.mesh is not None:
+        save_symmetries(command.mesh, command.mesh_unit, command.symmetries)
     return status
+
+
+@dataclass(frozen=True)
+class RenderCommand:
+    """Draw scenes for people: what curio-detect found, or scene codes of generated worlds.
+
+    Attributes:
+        scenes: Lines of curio-detect, or of {"world": NAME, "code": {FIELD: numbers}}; or one such JSON object.
+        out: Folder for the pictures, one PNG a scene.
+        mesh: Mesh file of the objects, or NAME=FILE for each kind of them; a code's world brings its own.
+        mesh_unit: Unit of their coordinates; the file's own, or metres, unless given.
+        world: Generated world that detections are of: its meshes, light and ground.
+        height: Of the pictures in pixels; the scene's own unless given.
+        turn_deg: Carries the camera round the objects, degrees; 90 is the novel view that worlds are scored from.
+        over_photograph: Draw over the photograph that the objects were found in.
+        path_traced: Draw with stock Mitsuba's path tracer, shadows and light between surfaces included.
+        samples: Rays or paths a pixel.
+    """
+
+    scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
+    out: Path
+    mesh: tuple[str, ...] = ()
+    mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
+    world: str | None = None
+    height: int | None = None
+    turn_deg: float = 0.0
+    over_photograph: FlagCreatePairsOff[bool] = False
+    path_traced: FlagCreatePairsOff[bool] = False
+    samples: int = 64
+
+
+def render(arguments: Sequence[str] | None = None) -> None:
+    """``curio-render SCENES --out DIR …``; exit status as of :func:`train`."""
+    command = tyro.cli(RenderCommand, args=arguments, prog="curio-render")
+    sys.exit(answer(lambda _: _render(command)))
+
+
+def _render(command: RenderCommand) -> int:
+    from curio_train.views.album import draw
+    from curio_train.views.pictures import Wish
+
+    wish = Wish(command.height, command.turn_deg, command.over_photograph, command.path_traced, command.samples)
+    for path in draw(command.scenes, command.out, command.mesh, command.mesh_unit, command.world, wish):
+        print(path)
+    return 0

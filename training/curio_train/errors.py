@@ -10,7 +10,8 @@
         ├── RendererError     Mitsuba, Dr.Jit, libLLVM, OptiX
         ├── CheckpointError   a run folder or what is in it
         ├── TrainingError     the optimisation itself
-        └── ExportError       ONNX, parity, the model folder
+        ├── ExportError       ONNX, parity, the model folder
+        └── ReportError       report.html of a run
 
 A text says what was found, what was expected, where (file, field, flag) and what to do.
 """
@@ -62,3 +63,7 @@ class TrainingError(WorkError):
 
 class ExportError(WorkError):
     """The model could not be exported as promised."""
+
+
+class ReportError(WorkError):
+    """A run's report could not be drawn or written; the run itself is whole."""

@@ -1,13 +1,15 @@
 """From a run to a model that any runtime can serve: encoder and heads alone, checked against the trained network."""
 
 import copy
+import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec, ObjectModel, Symmetry
 from curio_proto.v1.model_spec_pb2 import Field as FieldSpec
 from torch import Tensor, nn
@@ -108,8 +110,16 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     version = target.next_version()
     made = Making(run, folder.config, first, state.course, _weights(half, rounding_error))
     text = card(version, spec, shapes, world.objects, made)
-    path = target.add(version, model.SerializeToString(), config, text)
+    path = target.add(version, model.SerializeToString(), config, text, _golden(images, found))
     return Exported(path, spec.parity_max_abs_error, rounding_error, model.ByteSize())
+
+
+def _golden(images: Tensor, outputs: Mapping[str, Tensor]) -> bytes:
+    """The first check image and what onnxruntime made of it, by name, without a batch."""
+    file = io.BytesIO()
+    answers = {name: values[0].numpy() for name, values in outputs.items()}
+    np.savez_compressed(file, allow_pickle=False, image=images[0].numpy(), **answers)
+    return file.getvalue()
 
 
 def _weights(half: bool, rounding_error: float) -> str:
@@ -141,11 +151,17 @@ def _fold(layers: nn.Sequential) -> None:
 
 @torch.no_grad()
 def check_images(world: World) -> Tensor:
-    """Images that torch and onnxruntime have to agree on, uint8 [batch, height, width, 3]: renderings, then noise."""
-    rendered = world.render(world.sample(_NUM_CHECK_IMAGES, _CHECK_SEED)).clamp(0, 1)
-    size = (_NUM_CHECK_IMAGES, world.camera.height, world.camera.width, 3)
-    noise = np.random.default_rng(_CHECK_SEED).integers(0, 256, size, dtype=np.uint8)
-    return torch.cat([(rendered * 255).round().byte().permute(0, 2, 3, 1).cpu(), torch.from_numpy(noise)])
+    """Images that torch and onnxruntime have to agree on, uint8 [batch, height, width, 3]: over black, then over noise.
+
+    The noise is smooth and never without objects: a gaze that moves by the last digit sees something else between white
+    pixels, and where nothing is to be found the last digit decides between places that are equally unlikely.
+    """
+    code = world.sample(_NUM_CHECK_IMAGES, _CHECK_SEED)
+    size = (world.camera.height, world.camera.width)
+    coarse = np.random.default_rng(_CHECK_SEED).random((_NUM_CHECK_IMAGES, 3, *(side // 8 for side in size)))
+    noise = F.interpolate(torch.from_numpy(coarse).float(), size, mode="bilinear")
+    images = torch.cat([world.render(code).cpu(), world.render(code, noise).cpu()]).clamp(0, 1)
+    return (images * 255).round().byte().permute(0, 2, 3, 1).contiguous()
 
 
 def largest_difference(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:

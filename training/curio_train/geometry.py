@@ -52,6 +52,11 @@ def _any_perpendicular(unit: Tensor) -> Tensor:
     return torch.where(use_x, torch.stack([-y, x, zero], dim=-1), torch.stack([zero, -z, y], dim=-1))
 
 
+def _without(vector: Tensor, unit: Tensor) -> Tensor:
+    """What is left of a vector without its part along a unit vector."""
+    return vector - (unit * vector).sum(dim=-1, keepdim=True) * unit
+
+
 def matrix_from_rotation_6d(rotation_6d: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a 6D rotation by Gram–Schmidt, Zhou et al. 2019, section B.
 
@@ -62,7 +67,9 @@ def matrix_from_rotation_6d(rotation_6d: Float[Tensor, "*batch 6"]) -> Float[Ten
     x = _unit(first, torch.eye(3, dtype=first.dtype, device=first.device)[0].expand_as(first))
     # The second column is brought to length 1 first, so that "along the first" means the same at every scale.
     second = _unit(second, _any_perpendicular(x))
-    y = _unit(second - (x * second).sum(dim=-1, keepdim=True) * x, _any_perpendicular(x))
+    y = _unit(_without(second, x), _any_perpendicular(x))
+    # Once more: of nearly parallel columns the first pass leaves little but rounding.
+    y = _unit(_without(y, x), _any_perpendicular(x))
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
 
 

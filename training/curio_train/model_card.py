@@ -1,6 +1,7 @@
 """What a person should know of one version of a model, as a section of CARD.md."""
 
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,7 +80,7 @@ def _origin(spec: ModelSpec, made: Making) -> Iterable[tuple[str, str]]:
     yield "world", spec.world
     yield "method", f"{made.config.method}, preset {made.config.preset}, seed {made.config.seed}"
     yield "supervision", "; ".join(supervision)
-    yield "training", f"`{made.sitting.command}`"
+    yield "training", f"`{portable(made.sitting.command)}`"
     yield "commit", made.sitting.commit or "not from a git checkout"
     yield "images seen", f"{made.course.images:,}"
     yield "training time", f"{made.course.seconds / 60:.1f} minutes"
@@ -87,6 +88,17 @@ def _origin(spec: ModelSpec, made: Making) -> Iterable[tuple[str, str]]:
     yield "input", f"`image`, uint8 RGB [batch, {spec.camera.height}, {spec.camera.width}, 3]"
     yield "weights", made.weights
     yield "torch to onnxruntime", f"differ by at most {spec.parity_max_abs_error:.2g} in any output"
+
+
+def portable(command: str) -> str:
+    """A command as typed, of each folder or file that is named from a machine's root only the last part."""
+    return shlex.join(_last_part(word) for word in shlex.split(command))
+
+
+def _last_part(word: str) -> str:
+    flag, sign, value = word.partition("=") if word.startswith("--") else ("", "", word)
+    from_root = value.startswith(("/", "~"))
+    return f"{flag}{sign}{Path(value).name}" if from_root else word
 
 
 def _outputs(spec: ModelSpec, shapes: Mapping[str, Sequence[int]]) -> Iterable[tuple[str, ...]]:

@@ -20,6 +20,7 @@ from pathlib import Path
 from curio_train.errors import ExportError, UsageError
 
 MODEL_FILE = "model.onnx"
+GOLDEN_FILE = "golden.npz"
 _CONFIG, _CARD, _SUMS = "config.pbtxt", "CARD.md", "SHA256SUMS"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # what a server takes for a model's name
 _MAX_BATCH_SIZE = 64
@@ -77,7 +78,7 @@ class ModelFolder:
                 "agree in them: choose another --name"
             )
 
-    def add(self, version: int, content: bytes, config: str, card: str) -> Path:
+    def add(self, version: int, content: bytes, config: str, card: str, golden: bytes) -> Path:
         """Write a version.
 
         Args:
@@ -85,6 +86,7 @@ class ModelFolder:
             content: Of model.onnx.
             config: From :func:`triton_config`.
             card: Markdown, a section about this version.
+            golden: Of golden.npz: an image and its outputs, which a server asks again before it serves the version.
 
         Returns:
             The version's folder.
@@ -96,17 +98,18 @@ class ModelFolder:
         try:
             with _draft(self.path) as draft:
                 if self.path.exists():
-                    self._add_version(draft, target, content, card)
+                    self._add_version(draft, target, content, card, golden)
                 else:
-                    _fill(draft, self.path.name, version, content, card, config)
+                    _fill(draft, self.path.name, version, content, card, config, golden)
                     draft.rename(self.path)
         except OSError as exc:
             raise ExportError(f"cannot write {target}: {exc.strerror}; name another folder: --out") from exc
         return target
 
-    def _add_version(self, draft: Path, target: Path, content: bytes, card: str) -> None:
+    def _add_version(self, draft: Path, target: Path, content: bytes, card: str, golden: bytes) -> None:
         """Beside earlier versions: first what speaks of it, at last the version itself, by one rename."""
         (draft / MODEL_FILE).write_bytes(content)
+        (draft / GOLDEN_FILE).write_bytes(golden)
         others = [line for line in _lines(self.path / _SUMS) if not line.endswith(f"  {target.name}/{MODEL_FILE}")]
         sums = "".join(f"{line}\n" for line in [*others, _sum_line(target.name, content)])
         title, _, earlier = _text(self.path / _CARD).partition("\n\n")
@@ -162,9 +165,10 @@ def _draft(folder: Path) -> Iterator[Path]:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _fill(folder: Path, name: str, version: int, content: bytes, card: str, config: str) -> None:
+def _fill(folder: Path, name: str, version: int, content: bytes, card: str, config: str, golden: bytes) -> None:
     (folder / str(version)).mkdir()
     (folder / str(version) / MODEL_FILE).write_bytes(content)
+    (folder / str(version) / GOLDEN_FILE).write_bytes(golden)
     (folder / _CONFIG).write_text(config, encoding="utf-8")
     (folder / _SUMS).write_text(_sum_line(str(version), content) + "\n", encoding="utf-8")
     (folder / _CARD).write_text(f"{_title(name)}\n\n{card}", encoding="utf-8")

@@ -11,6 +11,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from curio_train.geometry import Pose, matrix_from_rotation_6d
+
 Activation = Literal["linear", "tanh", "sigmoid", "perspective"]
 SceneCode = Mapping[str, Tensor]
 
@@ -85,13 +87,6 @@ class Field:
         depth = ((log_near + log_far) / 2 + torch.tanh(raw[..., 2:]) * (log_far - log_near) / 2).exp()
         return torch.cat([slope * depth, depth], dim=-1)
 
-    def raw_from_share(self, share: Tensor) -> Tensor:
-        """The raw output that :meth:`activate` brings to a share of the half range: −1 the lower bound, 1 the upper."""
-        if self.activation == "linear":
-            return share
-        bounded = share.clamp(-0.99, 0.99)
-        return torch.atanh(bounded) if self.activation != "sigmoid" else 2 * torch.atanh(bounded)
-
     def relative(self, value: Tensor) -> Tensor:
         """Physical values in units of the range, so that differences are Eq. 1's with w = 1.
 
@@ -153,3 +148,10 @@ def detach(code: SceneCode) -> dict[str, Tensor]:
 def index(code: SceneCode, rows: Tensor | slice) -> dict[str, Tensor]:
     """The code of some images of the batch."""
     return {name: value[rows] for name, value in code.items()}
+
+
+def poses(code: SceneCode) -> list[Pose]:
+    """The poses cam_from_obj of the one object of each image."""
+    rotations = matrix_from_rotation_6d(code[ROTATION_6D][:, 0].double()).numpy()
+    translations = code[TRANSLATION][:, 0].double().numpy()
+    return [Pose(rotation, translation) for rotation, translation in zip(rotations, translations, strict=True)]

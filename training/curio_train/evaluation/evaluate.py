@@ -9,17 +9,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from curio_train.errors import CheckpointError, UsageError
+from curio_train.config import RunConfig
+from curio_train.errors import CheckpointError, ReportError, UsageError
 from curio_train.evaluation.real_frames import evaluate_real_frames
-from curio_train.evaluation.scores import model_info, pose_scores, poses, scene_scores
+from curio_train.evaluation.report import write_report
+from curio_train.evaluation.scores import add_errors, pose_scores, scene_errors, scene_scores
 from curio_train.evaluation.subject import Predict, Subject, load_subject
-from curio_train.learning.configuration import CONFIG_FILE, world_name
+from curio_train.learning.configuration import CONFIG_FILE, load_config, world_name
 from curio_train.learning.provenance import machine
+from curio_train.metrics.certainty import calibration_error, separation
+from curio_train.metrics.poses import ADD_THRESHOLD
 from curio_train.model_card import EVALUATION_FILE
-from curio_train.scene_code import SceneCode
+from curio_train.scene_code import CONFIDENCE, SceneCode, poses
 from curio_train.worlds.base import Split, World
 
 _BATCH_SIZE = 50
+_NUM_EMPTY = 100
 _SEED = 0  # of the images: the same for every run, so that figures can be compared
 
 
@@ -30,10 +35,12 @@ class HeldOut:
     Attributes:
         images: uint8 [num_images, 3, height, width].
         code: Of all images.
+        empty: uint8 [num, 3, height, width], backgrounds without the object, in worlds whose codes have a confidence.
     """
 
     images: Tensor
     code: SceneCode
+    empty: Tensor | None = None
 
 
 def evaluate(
@@ -45,6 +52,7 @@ def evaluate(
     bop_results: Path | None = None,
     cache: Path,
     progress: Callable[[str], None] = lambda text: None,
+    warn: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """Score a run folder or an exported model.
 
@@ -56,10 +64,11 @@ def evaluate(
         bop_results: Folder for a results file of those frames in BOP's format.
         cache: Where worlds keep their image sets.
         progress: Told what is being done.
+        warn: Told why a report could not be written, for which no evaluation is thrown away.
 
     Returns:
         What was evaluated, ``metrics`` by name, the same of the network before its first step as ``untrained``, and
-        ``real`` where real frames were scored. Written into a run folder as well.
+        ``real`` where real frames were scored. A run folder gets it as well, and a report.
 
     Raises:
         CurioError: Any of this package's errors.
@@ -75,14 +84,20 @@ def evaluate(
     held_out = draw(subject.world, split, num_images, cache)
     result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images)}
     progress("the network")
-    result["metrics"] = score(subject.world, subject.predict, held_out)
+    predicted, result["metrics"] = _scored(subject.world, subject.predict, held_out)
     progress("the same network untrained")
-    result["untrained"] = score(subject.world, subject.untrained(), held_out)
+    _, result["untrained"] = _scored(subject.world, subject.untrained(), held_out)
     if data is not None:
         progress(f"real frames in {data}")
         result["real"] = evaluate_real_frames(subject, data, bop_results)
     if (path / CONFIG_FILE).exists():
         _keep(path, result)
+        progress("the report")
+        errors = scene_errors(subject.world, predicted, held_out.code)
+        try:
+            write_report(path, subject, split, cache, errors, result)
+        except ReportError as exc:
+            warn(str(exc))
     return result
 
 
@@ -96,18 +111,62 @@ def draw(world: World, split: Split, num_images: int, cache: Path) -> HeldOut:
     images = torch.cat([(batch.images.clamp(0, 1) * 255).round().byte() for batch in batches])
     codes = [batch.code for batch in batches if batch.code is not None]
     code = {name: torch.cat([one[name] for one in codes])[:num_images] for name in codes[0]}
-    return HeldOut(images[:num_images], code)
+    if world.mesh is None or CONFIDENCE not in world.layout:
+        return HeldOut(images[:num_images], code)
+    behind = source.backgrounds(len(batches), _NUM_EMPTY)  # of steps that have not been drawn
+    return HeldOut(images[:num_images], code, None if behind is None else (behind.clamp(0, 1) * 255).round().byte())
 
 
-def score(world: World, predict: Predict, held_out: HeldOut) -> dict[str, float]:
+def read(predict: Predict, images: Tensor) -> SceneCode:
+    """Scene codes of any number of images."""
+    batches = [predict(batch) for batch in images.split(_BATCH_SIZE)]
+    return {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
+
+
+def score(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, float]:
     """All metrics that mean something in this world."""
-    batches = [predict(images) for images in held_out.images.split(_BATCH_SIZE)]
-    predicted = {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
-    scores = scene_scores(world, predicted, held_out.code)
+    scores = scene_scores(world, predicted, true)
     if world.mesh is not None:
-        info = model_info(world.objects[0])
-        scores |= pose_scores(poses(predicted), poses(held_out.code), world.mesh.vertices_m, info)
+        info = world.objects[0].info
+        scores |= pose_scores(poses(predicted), poses(true), world.mesh.vertices_m, info)
     return scores
+
+
+def certainty(world: World, predicted: SceneCode, true: SceneCode, on_empty: SceneCode) -> dict[str, float]:
+    """What the confidence of one object is worth.
+
+    Once as the probability that ADD(-S) is below a tenth of the diameter, once as a sign that the object is there.
+    """
+    assert world.mesh is not None  # worlds of one object have one
+    errors = add_errors(poses(predicted), poses(true), world.mesh.vertices_m, world.objects[0].info)
+    confidences, without = (code[CONFIDENCE].flatten().tolist() for code in (predicted, on_empty))
+    return {
+        "confidence_ece": calibration_error(confidences, [error < ADD_THRESHOLD for error in errors]),
+        "present_auroc": separation(confidences, without),
+    }
+
+
+def _scored(world: World, predict: Predict, held_out: HeldOut) -> tuple[SceneCode, dict[str, float]]:
+    predicted = read(predict, held_out.images)
+    scores = score(world, predicted, held_out.code)
+    if held_out.empty is not None:
+        scores |= certainty(world, predicted, held_out.code, read(predict, held_out.empty))
+    return predicted, scores
+
+
+def uses_synthetic_labels(config: RunConfig) -> bool:
+    """Whether poses of renderings taught a network, in the sense of the paper's LineMOD table, or the one it began as.
+
+    A network that began as another, of which nothing is known any more, counts as so taught.
+    """
+    if config.terms & {"label", "sleep"}:
+        return True
+    if config.init is None:
+        return False
+    try:
+        return uses_synthetic_labels(load_config(config.init))
+    except CheckpointError:
+        return True
 
 
 def _origin(path: Path, subject: Subject) -> dict[str, Any]:
@@ -118,6 +177,8 @@ def _origin(path: Path, subject: Subject) -> dict[str, Any]:
         "objects": [kind.name for kind in subject.world.objects],
         "method": config.method,
         "labels": config.labels if "label" in config.terms else 0.0,
+        "labels_real": False,  # images with true codes are renderings in every world
+        "labels_synthetic": uses_synthetic_labels(config),
         "preset": config.preset,
         "seed": config.seed,
         "images_seen": subject.images_seen,

@@ -16,16 +16,27 @@ import torch
 
 from curio_train.camera import scale_matrix
 from curio_train.data.bop import Annotation, BopDataset, Frame, ModelInfo
+from curio_train.data.bop_split import SPLIT, scored_frames
 from curio_train.data.photographs import read_photograph
 from curio_train.errors import DataError, UsageError
-from curio_train.evaluation.scores import add_errors, model_info, pose_scores, poses
+from curio_train.evaluation.scores import add_errors, pose_scores, rotation_errors_deg
 from curio_train.evaluation.subject import Subject
 from curio_train.geometry import Pose, rotation_between
-from curio_train.metrics.poses import ADD_THRESHOLD, bootstrap_interval, mspd_px, mssd_m, recall, symmetry_poses
-from curio_train.scene_code import CONFIDENCE
+from curio_train.metrics.poses import (
+    ADD_THRESHOLD,
+    bootstrap_interval,
+    mspd_px,
+    mssd_m,
+    recall,
+    symmetry_poses,
+    translation_error_m,
+)
+from curio_train.scene_code import CONFIDENCE, poses
 from curio_train.worlds.base import Camera
 
-SPLIT = "test"
+VISIBLE = 0.8
+"""Targets of which at least this share is visible are scored once more, by themselves."""
+
 _VISIBILITY_BINS = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0))
 _MSSD_THRESHOLDS = [0.05 * step for step in range(1, 11)]  # of the diameter, BOP Challenge 2020
 _MSPD_THRESHOLDS = [5.0 * step for step in range(1, 11)]  # pixels in an image 640 wide, BOP Challenge 2020
@@ -48,6 +59,9 @@ class Estimate:
     seconds: float
 
 
+Pairs = Sequence[tuple[Estimate, Annotation]]
+
+
 def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None) -> dict[str, Any]:
     """Score on the targets of the object in a data set.
 
@@ -62,55 +76,45 @@ def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None)
     """
     dataset = BopDataset(data)
     kind = subject.world.objects[0]
-    targets = _targets(dataset, kind.name)
-    estimates = _estimates(subject, dataset, targets)
+    frames = scored_frames(dataset, kind.name)
+    estimates = estimate_frames(subject, dataset, frames.targets)
     if bop_results is not None:
         _write_bop(bop_results, subject.config.method, data.resolve().name, dataset.object_id(kind.name), estimates)
-    found = {(e.frame.scene_id, e.frame.image_id): e for e in estimates}
-    pairs = [(found[target.scene_id, target.image_id], target) for target in targets]
+    pairs = list(zip(estimates, frames.targets, strict=True))
     points = dataset.evaluation_mesh(kind.name).vertices_m
-    info = model_info(kind)
+    info = kind.info
+    seen = [pair for pair in pairs if (pair[1].visible_fraction or 0) >= VISIBLE]
     return {
         "dataset": data.resolve().name,
         "split": SPLIT,
-        "num_targets": len(targets),
-        "metrics": _metrics(pairs, points, info),
+        "split_name": frames.split_name,
+        "num_targets": len(pairs),
+        "num_targets_visible_80": len(seen),
+        "metrics": _metrics(pairs, points, info) | _recall_visible(seen, points, info),
         "by_visibility": _by_visibility(pairs, points, info),
+        "targets": [_row(e, target, points, info) for e, target in pairs],
     }
 
 
-def _targets(dataset: BopDataset, name: str) -> list[Annotation]:
-    """One annotation an image: BOP's targets where the data set names them, else every labelled image."""
-    chosen = None
-    if (dataset.root / "test_targets_bop19.json").exists():
-        number = dataset.object_id(name)
-        chosen = {(t.scene_id, t.image_id) for t in dataset.targets() if t.object_id == number}
-    targets = {
-        (a.scene_id, a.image_id): a
-        for a in dataset.annotations(SPLIT, name)
-        if chosen is None or (a.scene_id, a.image_id) in chosen
-    }
-    if not targets:
-        raise DataError(f"{dataset.root / SPLIT}: found no labelled frame of {name}, expected at least one")
-    return list(targets.values())
+def estimate_frames(subject: Subject, dataset: BopDataset, targets: Sequence[Annotation]) -> list[Estimate]:
+    """One estimate for the frame of each target, in their order.
 
-
-def _estimates(subject: Subject, dataset: BopDataset, targets: Sequence[Annotation]) -> list[Estimate]:
-    """One estimate for each frame with a target."""
+    Raises:
+        DataError: A frame is missing or cannot be read.
+    """
     wanted = {(target.scene_id, target.image_id) for target in targets}
-    estimates = []
+    found = {}
     for scene_id in sorted({scene for scene, _ in wanted}):
         for frame in dataset.frames(SPLIT, scene_id):
-            if (frame.scene_id, frame.image_id) in wanted:
-                estimates.append(_estimate(subject, frame))
-    missing = wanted - {(e.frame.scene_id, e.frame.image_id) for e in estimates}
-    if missing:
+            if (key := (frame.scene_id, frame.image_id)) in wanted:
+                found[key] = _estimate(subject, frame)
+    if missing := wanted - found.keys():
         scene, image = min(missing)
         raise DataError(
             f"{dataset.root / SPLIT}: {len(missing)} labelled images are missing, the first is image {image} of scene "
             f"{scene}; download the split again"
         )
-    return estimates
+    return [found[target.scene_id, target.image_id] for target in targets]
 
 
 def _estimate(subject: Subject, frame: Frame) -> Estimate:
@@ -159,27 +163,47 @@ def _central_ray(matrix: np.ndarray, width: int, height: int) -> torch.Tensor:
     return torch.from_numpy(np.linalg.solve(matrix, [(width - 1) / 2, (height - 1) / 2, 1.0]))
 
 
-def _metrics(pairs: Sequence[tuple[Estimate, Annotation]], points: np.ndarray, info: ModelInfo) -> dict[str, float]:
+def _metrics(pairs: Pairs, points: np.ndarray, info: ModelInfo) -> dict[str, float]:
     estimates, truths = [e.pose for e, _ in pairs], [target.pose for _, target in pairs]
     scores = pose_scores(estimates, truths, points, info)
-    hits = np.array(add_errors(estimates, truths, points, info)) < ADD_THRESHOLD
-    low, high = bootstrap_interval(hits.astype(float).tolist())
+    scores.pop("add_recall")
     alike = symmetry_poses(info)
     surface = [mssd_m(e, t, points, alike) / info.diameter_m for e, t in zip(estimates, truths, strict=True)]
     pixels = [mspd_px(e.pose, target.pose, points, alike, e.frame.matrix) * 640 / e.frame.width for e, target in pairs]
     return {
-        "add_recall": scores.pop("add_recall"),
-        "add_recall_low": low,
-        "add_recall_high": high,
+        **_recall("add_recall", pairs, points, info),
         **scores,
         "mssd_recall": float(np.mean([recall(surface, threshold) for threshold in _MSSD_THRESHOLDS])),
         "mspd_recall": float(np.mean([recall(pixels, threshold) for threshold in _MSPD_THRESHOLDS])),
     }
 
 
-def _by_visibility(
-    pairs: Sequence[tuple[Estimate, Annotation]], points: np.ndarray, info: ModelInfo
-) -> list[dict[str, float]]:
+def _recall(name: str, pairs: Pairs, points: np.ndarray, info: ModelInfo) -> dict[str, float]:
+    """Share of poses found, with its interval under the same name."""
+    errors = add_errors([e.pose for e, _ in pairs], [target.pose for _, target in pairs], points, info)
+    low, high = bootstrap_interval([float(error < ADD_THRESHOLD) for error in errors])
+    return {name: recall(errors, ADD_THRESHOLD), f"{name}_low": low, f"{name}_high": high}
+
+
+def _recall_visible(seen: Pairs, points: np.ndarray, info: ModelInfo) -> dict[str, float]:
+    return _recall("add_recall_visible_80", seen, points, info) if seen else {}
+
+
+def _row(estimate: Estimate, target: Annotation, points: np.ndarray, info: ModelInfo) -> dict[str, Any]:
+    """What became of one target; ADD(-S) as a share of the diameter."""
+    found, true = [estimate.pose], [target.pose]
+    return {
+        "scene_id": target.scene_id,
+        "image_id": target.image_id,
+        "visible_fraction": target.visible_fraction,
+        "confidence": round(estimate.confidence, 4),
+        "add_diameters": round(add_errors(found, true, points, info)[0], 4),
+        "rotation_deg": round(float(rotation_errors_deg(found, true, info)[0]), 2),
+        "translation_mm": round(translation_error_m(estimate.pose, target.pose) * 1000, 2),
+    }
+
+
+def _by_visibility(pairs: Pairs, points: np.ndarray, info: ModelInfo) -> list[dict[str, float]]:
     """ADD(-S) recall in bins of the visible share; empty where the data set doesn't say it."""
     rows = []
     for low, high in _VISIBILITY_BINS:

@@ -8,40 +8,50 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.data.bop import ModelInfo
-from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_angle_deg
-from curio_train.metrics.assignment import assign, parameter_errors, scene_error
+from curio_train.geometry import Pose, rotation_angle_deg
+from curio_train.metrics.assignment import each_parameter_error, scene_error
 from curio_train.metrics.images import dssim
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, recall, symmetry_poses
-from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode, index
-from curio_train.worlds.base import ObjectKind, World
+from curio_train.scene_code import TRANSLATION, SceneCode, index
+from curio_train.worlds.base import World
 
 _MM = 1000.0
 _BATCH_SIZE = 50
 
 
 def scene_scores(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, float]:
-    """Errors of scene codes, means over images unless the name says otherwise.
+    """Means of :func:`scene_errors` over images or pairs, and what stands beside them.
 
-    ``scene_error`` is Eq. 1 of the paper, the table's Para, and ``novel_view_dssim`` is its Img; the others are errors
-    of single parameters under the same assignment. Where slots carry a shape that assignment is within the shape, and
-    ``scene_error_any_shape`` is Eq. 1 by position alone.
+    Where slots carry a shape, ``scene_error_any_shape`` is Eq. 1 by position alone.
+    """
+    errors = scene_errors(world, predicted, true)
+    scores = {name: float(values.double().mean()) for name, values in errors.items()}
+    if len(world.objects) > 1:
+        scores["scene_error_any_shape"] = float(scene_error(world.layout, predicted, true).mean())
+    if "position_image_widths" in errors:
+        scores["position_px"] = scores["position_image_widths"] * world.camera.width
+        scores["position_px_median"] = float(errors["position_image_widths"].median()) * world.camera.width
+    return scores
+
+
+def scene_errors(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, Tensor]:
+    """Each single error of scene codes, under a name with its unit.
+
+    ``scene_error`` is Eq. 1 of the paper, the table's Para, and ``novel_view_dssim`` is its Img, one value an image.
+    The others are errors of single parameters under the same assignment, within a shape where slots carry one.
     """
     groups = [kind.slots for kind in world.objects]
-    pairs = assign(world.layout, predicted, true, groups)
-    difference = predicted[TRANSLATION][pairs.image, pairs.predicted] - true[TRANSLATION][pairs.image, pairs.true]
-    distance = difference.norm(dim=-1)
-    scores = {"scene_error": float(scene_error(world.layout, predicted, true, groups).mean())}
-    if len(groups) > 1:
-        scores["scene_error_any_shape"] = float(scene_error(world.layout, predicted, true).mean())
-    scores["novel_view_dssim"] = float(novel_view_dssim(world, predicted, true).mean())
+    errors = {
+        "scene_error": scene_error(world.layout, predicted, true, groups),
+        "novel_view_dssim": novel_view_dssim(world, predicted, true),
+    }
+    parameters = each_parameter_error(world.layout, predicted, true, groups)
+    position = parameters.pop("position")
     if world.layout[TRANSLATION].unit == "image_width":
-        scores["position_image_widths"] = float(distance.mean())
-        scores["position_px"] = float(distance.mean()) * world.camera.width
-        scores["position_px_median"] = float(distance.median()) * world.camera.width
+        errors["position_image_widths"] = position
     else:
-        scores["position_mm"] = float(distance.mean()) * _MM
-    others = parameter_errors(world.layout, predicted, true, groups)
-    return scores | {name: value for name, value in others.items() if name != "position"}
+        errors["position_mm"] = position * _MM
+    return errors | parameters
 
 
 @torch.no_grad()
@@ -50,18 +60,6 @@ def novel_view_dssim(world: World, predicted: SceneCode, true: SceneCode) -> Flo
     starts = range(0, len(true[TRANSLATION]), _BATCH_SIZE)
     batches = [[index(code, slice(start, start + _BATCH_SIZE)) for code in (predicted, true)] for start in starts]
     return torch.cat([dssim(*(world.novel_view(code).clamp(0, 1) for code in pair)) for pair in batches])
-
-
-def poses(code: SceneCode) -> list[Pose]:
-    """The poses of the one object of each image."""
-    rotations = matrix_from_rotation_6d(code[ROTATION_6D][:, 0].double()).numpy()
-    translations = code[TRANSLATION][:, 0].double().numpy()
-    return [Pose(rotation, translation) for rotation, translation in zip(rotations, translations, strict=True)]
-
-
-def model_info(kind: ObjectKind) -> ModelInfo:
-    """What pose metrics need of a kind of object."""
-    return ModelInfo(kind.diameter_m, tuple(kind.symmetries), tuple(kind.symmetry_axes))
 
 
 def add_errors(estimates: Sequence[Pose], truths: Sequence[Pose], points: np.ndarray, info: ModelInfo) -> list[float]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from curio_train.config import RunConfig
 from curio_train.errors import ExportError, UsageError
@@ -17,7 +17,6 @@ from curio_train.learning.configuration import CONFIG_FILE, from_json
 from curio_train.learning.provenance import sittings
 from curio_train.learning.state import TrainState
 from curio_train.model_folder import find_model
-from curio_train.networks.pose import PoseNetwork
 from curio_train.onnx_file import OnnxModel
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World
@@ -81,7 +80,7 @@ def _from_run(path: Path) -> Subject:
     )
 
 
-def _reader(network: PoseNetwork) -> Predict:
+def _reader(network: nn.Module) -> Predict:
     @torch.no_grad()
     def predict(images: Tensor) -> dict[str, Tensor]:
         code: dict[str, Tensor] = network(images.float() / 255)
@@ -115,6 +114,12 @@ def _config_of(model: OnnxModel, file: Path, data: Path | None) -> RunConfig:
 
 
 def _data_option(kind: type[Any], options: Mapping[str, Any], data: Path | None, file: Path) -> dict[str, str]:
+    needed = {field.name for field in dataclasses.fields(kind) if field.default is field.default_factory}
+    if missing := sorted(needed - options.keys()):
+        raise UsageError(
+            f"{file} is a model of world {options['name']}, which does not hold its maker's {', '.join(missing)}; give "
+            "the run folder that it was exported from"
+        )
     if "data" not in {field.name for field in dataclasses.fields(kind)}:
         return {}
     if data is None:

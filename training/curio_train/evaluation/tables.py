@@ -10,6 +10,7 @@ _LABELS: Mapping[str, str] = {
     "scene_error": "scene error, Eq. 1",
     "scene_error_any_shape": "   by position alone, shapes aside",
     "novel_view_dssim": "novel view, DSSIM",
+    "image_dssim": "image and re-rendering, DSSIM",
     "position_image_widths": "position, image widths",
     "position_px": "position, pixels",
     "position_px_median": "position, pixels, median",
@@ -21,13 +22,23 @@ _LABELS: Mapping[str, str] = {
     "add_recall": "ADD(-S) below 0.1 diameters, share",
     "add_recall_low": "   95 % interval from",
     "add_recall_high": "   to",
+    "add_recall_visible_80": "   of targets at least 80 % visible",
+    "add_recall_visible_80_low": "   95 % interval from",
+    "add_recall_visible_80_high": "   to",
     "rotation_deg_median": "rotation, degrees, median",
     "translation_mm_median": "position, mm, median",
     "lateral_mm_median": "   across the view (x, y)",
     "depth_mm_median": "   along it (z)",
+    "confidence_ece": "confidence, expected calibration error",
+    "present_auroc": "object present or absent, AUROC",
     "mssd_recall": "MSSD, average recall",
     "mspd_recall": "MSPD, average recall",
 }
+
+
+def label(metric: str) -> str:
+    """A metric's name for people."""
+    return _LABELS.get(metric, metric)
 
 
 def print_evaluation(result: Mapping[str, Any], console: Console) -> None:
@@ -44,7 +55,7 @@ def print_evaluation(result: Mapping[str, Any], console: Console) -> None:
     table.add_column("this", justify="right")
     table.add_column("untrained", justify="right")
     for name, value in result["metrics"].items():
-        table.add_row(_LABELS.get(name, name), f"{value:.4g}", f"{result['untrained'][name]:.4g}")
+        table.add_row(label(name), f"{value:.4g}", f"{result['untrained'][name]:.4g}")
     console.print(table)
     if "real" in result:
         _print_real(result["real"], console)
@@ -52,13 +63,14 @@ def print_evaluation(result: Mapping[str, Any], console: Console) -> None:
 
 def _print_real(real: Mapping[str, Any], console: Console) -> None:
     table = Table(
-        title=f"{real['num_targets']} real targets of {real['dataset']}, {real['split']}", title_justify="left"
+        title=f"{real['num_targets']} real targets of {real['dataset']}, {real['split']}: {real['split_name']}",
+        title_justify="left",
     )
     table.add_column("metric")
     table.add_column("this", justify="right")
     for name, value in real["metrics"].items():
-        table.add_row(_LABELS.get(name, name), f"{value:.4g}")
+        table.add_row(label(name), f"{value:.4g}")
     for row in real["by_visibility"]:
-        label = f"ADD(-S), {100 * row['from']:.0f}–{100 * row['to']:.0f} % visible, {row['num_targets']} targets"
-        table.add_row(label, f"{row['add_recall']:.4g}")
+        bin_name = f"ADD(-S), {100 * row['from']:.0f}–{100 * row['to']:.0f} % visible, {row['num_targets']} targets"
+        table.add_row(bin_name, f"{row['add_recall']:.4g}")
     console.print(table)

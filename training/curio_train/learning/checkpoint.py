@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
+from torch import Tensor
 
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, UsageError
@@ -26,6 +27,7 @@ from curio_train.learning.state import Course, TrainState
 from curio_train.worlds.base import World
 
 _NUM_KEPT = 2
+_POSE = "pose.network."  # how the tensors of TrainState.pose.network are named
 
 
 class RunFolder:
@@ -118,14 +120,43 @@ class RunFolder:
                 f"checkpoint {last} cannot be read ({exc}); delete this folder to go on from the one before it"
             ) from exc
 
+    def begin_with(self, state: TrainState) -> None:
+        """Give ``state`` this run's network, and nothing else of it.
+
+        Raises:
+            UsageError: The networks are not of one kind.
+            CheckpointError: There is no checkpoint, or it is damaged.
+        """
+        tensors = self._last_tensors()
+        network = {name.removeprefix(_POSE): value for name, value in tensors.items() if name.startswith(_POSE)}
+        try:
+            state.pose.network.load_state_dict(network)
+        except RuntimeError as exc:
+            raise UsageError(
+                f"--init {self.path}: its network does not fit this world ({str(exc).splitlines()[-1].strip()}); "
+                "expected a run of the same world and the same network flags"
+            ) from exc
+
+    def _last(self) -> Path:
+        checkpoints = self.checkpoints()
+        if not checkpoints:
+            raise CheckpointError(f"{self.path} has no checkpoint yet; train it first: --resume {self.path}")
+        return checkpoints[-1]
+
+    def _last_tensors(self) -> dict[str, Tensor]:
+        file = self._last() / "tensors.safetensors"
+        try:
+            return load(file.read_bytes())
+        except (OSError, ValueError, SafetensorError) as exc:
+            raise CheckpointError(f"{file} cannot be read ({exc}); delete its folder to use the one before it") from exc
+
     def trained(self, world: World) -> TrainState:
         """The last checkpoint on the CPU with the network in evaluation mode: what is exported and scored.
 
         Raises:
             CheckpointError: There is no checkpoint yet, or it cannot be read.
         """
-        if not self.checkpoints():
-            raise CheckpointError(f"{self.path} has no checkpoint yet; train it first: --resume {self.path}")
+        self._last()
         state = TrainState(self.config, world, torch.device("cpu"))
         self.restore(state)
         state.pose.network.eval()

@@ -31,6 +31,8 @@ def to_portable(config: RunConfig) -> dict[str, Any]:
     """The same without the folders that the world was given: what a model tells other machines of its making."""
     folders = [field.name for field in fields(config.world) if isinstance(getattr(config.world, field.name), Path)]
     plain = to_json(config)
+    if config.init is not None:
+        plain["init"] = config.init.name
     plain["world"] = {name: value for name, value in plain["world"].items() if name not in folders}
     return plain
 

@@ -7,6 +7,7 @@ that is stopped and resumed goes on as if uninterrupted.
 import math
 import time
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
 
@@ -14,15 +15,17 @@ import torch
 from torch import Tensor
 
 from curio_train.config import Recipe, RunConfig
-from curio_train.errors import TrainingError
+from curio_train.errors import TrainingError, UsageError
 from curio_train.learning.checkpoint import RunFolder
 from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, gradient_penalty
 from curio_train.learning.interruption import Interruption
 from curio_train.learning.losses import image_loss, supervised_loss
 from curio_train.learning.parallel import Ranks
 from curio_train.learning.progress import Reporter
+from curio_train.learning.recoloring import recolored
 from curio_train.learning.sleep import sleep_codes
 from curio_train.learning.state import TrainState
+from curio_train.networks.look import Look
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import Batch, ImageSource, World
 
@@ -50,13 +53,28 @@ class Trainer:
         state: All that changes.
     """
 
-    def __init__(self, config: RunConfig, world: World, source: ImageSource, ranks: Ranks) -> None:
+    def __init__(self, config: RunConfig, world: World, sources: Sequence[ImageSource], ranks: Ranks) -> None:
+        """Build the networks.
+
+        Args:
+            config: What to learn and how.
+            world: What is seen.
+            sources: Images for each of the world's looks.
+            ranks: This process among those that train together.
+
+        Raises:
+            UsageError: A world of several looks can only be learned asleep.
+        """
+        if len(world.looks) > 1 and config.terms != {"sleep"}:
+            raise UsageError(
+                f"--method {config.method} compares images or labels of whole scenes, which the looks of a gaze do not "
+                "see: expected --method sleep (or, with linemod, --no-gaze)"
+            )
         self.config = config
         self.world = world
         self.ranks = ranks
         self.state = TrainState(config, world, ranks.device)
-        self._source = source
-        self._groups = tuple(kind.slots for kind in world.objects)
+        self._sources = sources
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
         self._share = ranks.share(self._num_micro)
 
@@ -79,41 +97,49 @@ class Trainer:
             "sleep": recipe.sleep_weight,
             "label": 1.0,
         }
+        turns = self.world.turns
+        turn = turns[self.state.course.step % len(turns)]
+        world, source = self.world.looks[turn], self._sources[turn]
+        network = self.state.looks[turn]
+        groups = tuple(kind.slots for kind in world.objects)
         sums: Counter[str] = Counter()
         for learner in self.state.learners.values():
             learner.optimizer.zero_grad()
 
         for micro in self._share:
             number = self.state.course.step * self._num_micro + micro
-            batch = self._to_device(self._source.batch(number, recipe.micro_batch_size))
             losses: dict[str, Tensor] = {}
 
             # Awake: read the images, render what was read, compare one by one (image) and as a set (curiosity).
             raw = None
-            if terms != {"sleep"}:
-                raw, code = self._read(batch.images)
+            if terms == {"sleep"}:
+                backgrounds = self._backgrounds(source, number)
+            else:
+                batch = self._to_device(source.batch(number, recipe.micro_batch_size))
+                if recipe.swap_colors and world.colors_interchangeable:
+                    batch = recolored(batch, (self.config.seed, number))
+                raw, code = self._read(network, batch.images)
+                backgrounds = batch.backgrounds
             if terms & {"image", "curiosity"}:
-                rendered = self.world.render(code, batch.backgrounds)
+                rendered = world.render(code, backgrounds)
             if "image" in terms:
                 losses["image"] = image_loss(rendered, batch.images)
             if critic is not None:
                 with frozen(critic.network):
                     losses["curiosity"] = curiosity_loss(self._judge, rendered)
             if "label" in terms and batch.code is not None:
-                losses["label"] = supervised_loss(self.world.layout, code, batch.code, self._groups)
+                losses["label"] = supervised_loss(world.layout, code, batch.code, groups)
 
             # Asleep: render codes of one's own making, read them back.
             if "sleep" in terms:
                 seed = (self.config.seed, number)
                 if raw is None:
-                    dream = self._to_device_code(self.world.sample(recipe.micro_batch_size, (*seed, _ASLEEP)))
+                    dream = self._to_device_code(world.sample(recipe.micro_batch_size, (*seed, _ASLEEP)))
                 else:
-                    dream = sleep_codes(self.world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
+                    dream = sleep_codes(world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
                 with torch.no_grad():
-                    dreamt = self.world.disturb(self.world.render(dream, batch.backgrounds), seed)
-                losses["sleep"] = supervised_loss(
-                    self.world.layout, self._read(dreamt)[1], dream, self._groups, self.world.sleep_weights
-                )
+                    dreamt = world.disturb(world.render(dream, backgrounds), seed)
+                losses["sleep"] = world.code_loss(self._read(network, dreamt)[1], dream)
 
             torch.stack([weights[name] * loss for name, loss in losses.items()]).sum().div(self._num_micro).backward()
 
@@ -126,7 +152,8 @@ class Trainer:
                     critic_total = critic_total + weight * gradient_penalty(self._judge, batch.images)
                 (critic_total / self._num_micro).backward()
 
-            sums.update({name: loss.item() / self._num_micro for name, loss in losses.items()})
+            of_look = f", {world.name}" if len(turns) > 1 else ""
+            sums.update({name + of_look: loss.item() / self._num_micro for name, loss in losses.items()})
 
         means = self._add_up_over_ranks(sums)
         self._move(means, rate)
@@ -135,27 +162,32 @@ class Trainer:
     @torch.no_grad()
     def rehearse(self) -> None:
         """Do what takes most of a step's time, without a trace, so that it can be timed."""
-        side = self.world.camera.width
         self.state.pose.network.eval()
-        self._read(torch.zeros(_NUM_REHEARSED, 3, side, side, device=self.ranks.device))
+        for look, network in zip(self.world.looks, self.state.looks, strict=True):
+            size = (_NUM_REHEARSED, 3, look.camera.height, look.camera.width)
+            self._read(network, torch.zeros(size, device=self.ranks.device))
         self.state.pose.network.train()
 
     @torch.no_grad()
     def pairs(self) -> tuple[Tensor, Tensor]:
-        """A few training images, always the same, and what the network as it will be exported makes of them."""
-        batch = self._to_device(self._source.batch(0, _NUM_PAIRS))
-        self.state.pose.network.eval()
-        rendered = self.world.render(self.state.pose.network(batch.images), batch.backgrounds)
-        self.state.pose.network.train()
+        """A few training images, always the same, and what the (last) look, as it will be exported, makes of them."""
+        look, network = self.world.looks[-1], self.state.looks[-1]
+        batch = self._to_device(self._sources[-1].batch(0, _NUM_PAIRS))
+        network.eval()
+        rendered = look.render({**batch.given, **network(batch.images)}, batch.backgrounds)
+        network.train()
         return batch.images, rendered
 
-    def _read(self, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _backgrounds(self, source: ImageSource, number: int) -> Tensor | None:
+        backgrounds = source.backgrounds(number, self.config.recipe.micro_batch_size)
+        return None if backgrounds is None else backgrounds.to(self.ranks.device)
+
+    def _read(self, network: Look, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The network's raw outputs and scene codes; positions need float32, convolutions do not."""
-        network = self.state.pose.network
         with self._autocast():
-            latent = network.encoder(images)
-        raw = network.heads.raw(latent.float())
-        return raw, self.world.layout.activate(raw)
+            # Channels last: convolutions of small images are a sixth quicker so on CPUs.
+            latent = network.encoder(images.contiguous(memory_format=torch.channels_last))
+        return network.decode(latent.float())
 
     def _judge(self, images: Tensor) -> Tensor:
         """The critic's logits."""
@@ -216,11 +248,17 @@ class Trainer:
 
 
 def train(
-    trainer: Trainer, run: RunFolder, interruption: Interruption, reporter: Reporter | None, checkpoint_minutes: float
+    trainer: Trainer,
+    run: RunFolder,
+    interruption: Interruption,
+    reporter: Reporter | None,
+    checkpoint_minutes: float,
+    finish: Callable[[], None],
 ) -> Outcome:
     """Train until convergence, the end of the budget, or a signal; leaves a checkpoint in each case.
 
-    Only the process with a reporter writes: under torchrun all have the same state.
+    Only the process with a reporter writes: under torchrun all have the same state. ``finish`` is called before the
+    last checkpoint of a run that was not interrupted.
 
     Raises:
         TrainingError: The optimisation broke down; the last checkpoint is the one to go back to.
@@ -234,6 +272,8 @@ def train(
             seconds, signalled = ranks.largest(course.seconds, interruption.signum or 0)
             progress = config.progress(course.images, seconds)
             outcome = _outcome(config, course.image_loss, progress, bool(signalled))
+            if outcome and outcome is not Outcome.INTERRUPTED:
+                finish()
             if reporter and (outcome or seconds - saved_at >= 60 * checkpoint_minutes):
                 run.save(trainer.state)
                 reporter.pictures(trainer.pairs())

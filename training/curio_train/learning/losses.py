@@ -1,7 +1,5 @@
 """What the network is to make small, beside curiosity."""
 
-from collections.abc import Mapping
-
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,15 +17,9 @@ def image_loss(
     return (rendered - images).square().sum((1, 2, 3)).mean()
 
 
-def supervised_loss(
-    layout: Layout,
-    predicted: SceneCode,
-    true: SceneCode,
-    groups: Groups,
-    weights: Mapping[str, float] | None = None,
-) -> Float[Tensor, ""]:
-    """Eq. 1 of the paper, mean over the batch: unless weighted, the very figure that codes are scored by.
+def supervised_loss(layout: Layout, predicted: SceneCode, true: SceneCode, groups: Groups) -> Float[Tensor, ""]:
+    """Eq. 1 of the paper, mean over the batch: the very figure that codes are scored by.
 
     The assignment has no gradient, because it is constant around almost every code.
     """
-    return scene_error(layout, predicted, true, groups, weights).mean()
+    return scene_error(layout, predicted, true, groups).mean()

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import torch
@@ -23,6 +24,7 @@ from torch.utils.tensorboard import SummaryWriter
 from curio_train.errors import CheckpointError
 from curio_train.learning.state import Course
 
+_HISTORY = "history.jsonl"
 _STEPS_A_LINE = 20  # of history and curves
 _SECONDS_A_LINE = 10  # of the log where stderr is no terminal
 
@@ -35,8 +37,9 @@ class Reporter:
         self._course = course
         self._console = console
         self._curves = SummaryWriter(str(run / "tensorboard"), purge_step=course.step)
-        self._history = (run / "history.jsonl").open("a", encoding="utf-8")
+        self._history = (run / _HISTORY).open("a", encoding="utf-8")
         self._sums: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self._since = (course.step, course.images, course.seconds)
         self._logged_at = course.seconds
         self._bar: Progress | None = None
@@ -51,6 +54,7 @@ class Reporter:
     def step(self, losses: dict[str, float], progress: float) -> None:
         """Take note of one step, after which ``progress`` of the budget is spent."""
         self._sums.update(losses)
+        self._counts.update(losses.keys())
         if self._course.step - self._since[0] >= _STEPS_A_LINE:
             with _writing_into(self._run):
                 text = self._note()
@@ -76,8 +80,8 @@ class Reporter:
     def _note(self) -> str:
         """Write down what was gathered since the last line; returns it in words."""
         now = self._course
-        steps, images, seconds = now.step - self._since[0], now.images - self._since[1], now.seconds - self._since[2]
-        means = {name: value / steps for name, value in self._sums.items()}
+        images, seconds = now.images - self._since[1], now.seconds - self._since[2]
+        means = {name: value / self._counts[name] for name, value in self._sums.items()}
         rate = images / max(seconds, 1e-9)
         row = {"step": now.step, "images": now.images, "seconds": round(now.seconds, 3), **means}
         self._history.write(json.dumps(row) + "\n")
@@ -86,6 +90,7 @@ class Reporter:
             self._curves.add_scalar(f"loss/{name}", value, now.step)
         self._curves.add_scalar("images_per_second", rate, now.step)
         self._sums.clear()
+        self._counts.clear()
         self._since = (now.step, now.images, now.seconds)
         losses = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
         return f"{now.images:,} images  {losses}  {rate:.0f} images/s"
@@ -104,7 +109,7 @@ class Reporter:
 def reporting(run: Path, course: Course) -> Iterator[Reporter]:
     """Follow a run from ``course`` on; what was noted after that point, by a session since killed, is dropped."""
     with _writing_into(run):
-        _drop_after(run / "history.jsonl", course.step)
+        _drop_after(run, course.step)
         reporter = Reporter(run, course, Console(stderr=True, highlight=False))
     try:
         yield reporter
@@ -122,12 +127,17 @@ def _writing_into(run: Path) -> Iterator[None]:
         ) from exc
 
 
-def _drop_after(history: Path, step: int) -> None:
-    if not history.exists():
-        return
-    rows = [line for line in history.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
-    kept = [line for line in rows if json.loads(line)["step"] <= step]
-    history.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+def read_history(run: Path) -> list[dict[str, Any]]:
+    """The lines of ``history.jsonl``, without one that was cut off by a kill; none where there is no such file."""
+    file = run / _HISTORY
+    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("}")]
+
+
+def _drop_after(run: Path, step: int) -> None:
+    if (run / _HISTORY).exists():
+        kept = [row for row in read_history(run) if row["step"] <= step]
+        (run / _HISTORY).write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
 
 
 def _clock(seconds: float) -> str:

@@ -46,18 +46,28 @@ def learn(
     with ranks(device) as here:
         # The world comes first: what is wrong with its data shows before a run folder is there.
         world = build(config.world)
-        source = world.source("train", config.seed, with_code="label" in config.terms, cache=cache)
+        labelled = "label" in config.terms
+        sources = [look.source("train", config.seed, with_code=labelled, cache=cache) for look in world.looks]
         if config.labels < 1:
-            source = source.subset(config.labels)
+            sources = [source.subset(config.labels) for source in sources]
         run = RunFolder(path, config)
         if here.leads:
             run.write_config(new=not resume)
             note_sitting(path)
-        trainer = Trainer(config, world, source, here)
+        trainer = Trainer(config, world, sources, here)
         if here.device.type == "cpu":
             choose_threads(trainer.rehearse)
         if resume:
             run.restore(trainer.state)
+        elif config.init is not None:
+            RunFolder.open(config.init).begin_with(trainer.state)
         with reporting(path, trainer.state.course) if here.leads else nullcontext() as reporter:
-            outcome = train(trainer, run, interruption, reporter, checkpoint_minutes)
+            outcome = train(
+                trainer,
+                run,
+                interruption,
+                reporter,
+                checkpoint_minutes,
+                finish=lambda: world.finish(trainer.state.pose.network, cache),
+            )
         return outcome, trainer.state.course

@@ -5,11 +5,11 @@ from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.optim import Adam
+from torch.optim import Adam, Optimizer
 
 from curio_train.config import RunConfig
+from curio_train.learning.muon import Muon
 from curio_train.networks.critic import Critic
-from curio_train.networks.pose import PoseNetwork
 from curio_train.worlds.base import World
 
 N = TypeVar("N", bound=nn.Module)
@@ -21,22 +21,32 @@ class Learner(Generic[N]):
 
     Attributes:
         network: What learns.
-        optimizer: Adam, as in the paper.
-        learning_rate: Before warm-up and decay.
+        optimizer: Adam, as in the paper, or Muon.
     """
 
-    def __init__(self, network: N, learning_rate: float) -> None:
+    def __init__(self, network: N, learning_rate: float, matrix_learning_rate: float = 0.0) -> None:
+        """Start.
+
+        Args:
+            network: What is to learn.
+            learning_rate: Before warm-up and decay.
+            matrix_learning_rate: Of matrices and convolutions by Muon; 0: they move by Adam like the rest.
+        """
         self.network = network
-        self.optimizer = Adam(network.parameters(), learning_rate, betas=_BETAS)
-        self.learning_rate = learning_rate
+        if matrix_learning_rate:
+            self.optimizer: Optimizer = Muon(network.parameters(), matrix_learning_rate, learning_rate)
+        else:
+            self.optimizer = Adam(network.parameters(), learning_rate, betas=_BETAS)
+        self._learning_rates = [group["lr"] for group in self.optimizer.param_groups]
 
     def clip_gradient(self, largest: float) -> bool:
         """Cut the accumulated gradient to this L2 norm; whether it was finite."""
         return bool(nn.utils.clip_grad_norm_(self.network.parameters(), largest).isfinite())
 
     def step(self, rate: float) -> None:
-        """Step along the accumulated gradient with ``rate`` times the learning rate."""
-        self.optimizer.param_groups[0]["lr"] = rate * self.learning_rate
+        """Step along the accumulated gradient with ``rate`` times the learning rates."""
+        for group, learning_rate in zip(self.optimizer.param_groups, self._learning_rates, strict=True):
+            group["lr"] = rate * learning_rate
         self.optimizer.step()
 
     def tensors(self) -> dict[str, Tensor]:
@@ -81,14 +91,21 @@ class Course:
 
 
 class TrainState:
-    """The networks, their optimisers, and the course of the run."""
+    """The networks, their optimisers, and the course of the run.
+
+    Attributes:
+        course: How far it is.
+        looks: The network of each of the world's looks.
+        pose: All looks as one network.
+        critic: Of methods with curiosity.
+    """
 
     def __init__(self, config: RunConfig, world: World, device: torch.device) -> None:
         torch.manual_seed(config.seed)
         self.course = Course()
-        self.pose = Learner(
-            PoseNetwork(world.layout, world.camera.width, config.network).to(device), config.recipe.learning_rate
-        )
+        self.looks = [look.network(config.network) for look in world.looks]
+        recipe = config.recipe
+        self.pose = Learner(world.assemble(self.looks).to(device), recipe.learning_rate, recipe.matrix_learning_rate)
         self.critic: Learner[Critic] | None = None
         if "curiosity" in config.terms:
             critic = Critic(config.network.critic, config.network.critic_normalisation).to(device)

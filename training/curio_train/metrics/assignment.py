@@ -5,7 +5,7 @@ w = 1; objects are paired by the least sum of distances in position alone; a pre
 squared confidence, an object without a prediction costs 1. Every slot is a prediction, however low its confidence.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -81,7 +81,6 @@ def scene_error(
     predicted: SceneCode,
     true: SceneCode,
     groups: Groups | None = None,
-    weights: Mapping[str, float] | None = None,
 ) -> Float[Tensor, " batch"]:
     """Eq. 1 for each image, differentiable in the prediction; 0 where both scenes are the same.
 
@@ -90,16 +89,13 @@ def scene_error(
         predicted: The code to judge. Rotations count as rotations: the length of (i, j) or of a 6D rotation does not.
         true: The scene's own.
         groups: As in :func:`assign`.
-        weights: The equation's w by field name, 1 for fields not named; scores have none.
     """
-    weights = weights or {}
     pairs = assign(layout, predicted, true, groups)
     a, b = canonical(predicted), canonical(true)
     error = pairs.missing.sum(dim=1).to(a[TRANSLATION].dtype)
     error = error + (_confidence(layout, a).square() * pairs.surplus).sum(dim=1)
     for field in layout.fields:
-        weight = weights.get(field.name, 1.0)
-        of_a, of_b = (weight * field.relative(code[field.name]) for code in (a, b))
+        of_a, of_b = (field.relative(code[field.name]) for code in (a, b))
         if field.per_object:
             distance = (of_a[pairs.image, pairs.predicted] - of_b[pairs.image, pairs.true]).norm(dim=-1)
             error = error.index_add(0, pairs.image, distance)
@@ -111,13 +107,20 @@ def scene_error(
 def parameter_errors(
     layout: Layout, predicted: SceneCode, true: SceneCode, groups: Groups | None = None
 ) -> dict[str, float]:
-    """Mean error of each kind of parameter over a test set, for those the layout has; NaN without a single pair.
+    """Means of :func:`each_parameter_error` over a test set; NaN without a single pair."""
+    errors = each_parameter_error(layout, predicted, true, groups)
+    return {name: float(values.double().mean()) for name, values in errors.items()}
+
+
+def each_parameter_error(
+    layout: Layout, predicted: SceneCode, true: SceneCode, groups: Groups | None = None
+) -> dict[str, Tensor]:
+    """Errors of each kind of parameter, for those the layout has; one value a pair unless said otherwise.
 
     Returns:
-        ``position``: mean distance of the pairs, metres (image widths in 2D worlds). ``color_mse``: mean squared
-        difference of the pairs and channels. ``rotation_deg``: mean angle of the pairs. ``confidence_mse``: mean
-        squared difference from 1 of paired predictions and from 0 of the others. ``light_deg``: mean angle of the
-        scenes' light directions.
+        ``position``: distance, metres (image widths in 2D worlds). ``color_mse``: squared difference, a value a channel
+        [pairs, 3]. ``rotation_deg``: angle. ``confidence_mse``: squared difference from 1 of paired predictions and
+        from 0 of the others, [batch, num_predicted]. ``light_deg``: angle of the light directions, [batch].
     """
     pairs = assign(layout, predicted, true, groups)
 
@@ -137,7 +140,7 @@ def parameter_errors(
         errors["confidence_mse"] = (predicted[CONFIDENCE][..., 0] - (~pairs.surplus).float()).square()
     if LIGHT in layout:
         errors["light_deg"] = _angle_deg(_direction(predicted[LIGHT]), _direction(true[LIGHT]))
-    return {name: float(values.double().mean()) for name, values in errors.items()}
+    return errors
 
 
 def canonical(code: SceneCode) -> dict[str, Tensor]:

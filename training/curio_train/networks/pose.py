@@ -1,17 +1,17 @@
 """Encoder and heads together: the network that is trained, exported and served."""
 
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from curio_train.config import NetworkConfig
 from curio_train.errors import UsageError
-from curio_train.networks.attention import LATENT, AttentionEncoder
 from curio_train.networks.encoder import Encoder
 from curio_train.networks.heads import Heads
+from curio_train.networks.look import Look
 from curio_train.scene_code import Layout
 
 
-class PoseNetwork(nn.Module):
+class PoseNetwork(Look):
     """Image to scene code: all that is left of training at test time."""
 
     def __init__(self, layout: Layout, image_side: int = 128, config: NetworkConfig | None = None) -> None:
@@ -22,10 +22,6 @@ class PoseNetwork(nn.Module):
         """
         super().__init__()
         config = config or NetworkConfig()
-        if config.reading == "attention":
-            self.encoder: nn.Module = AttentionEncoder()
-            self.heads = Heads(layout, LATENT, config.row, config.hidden, placed=True)
-            return
         left = config.encoder.output_side(image_side)
         if left != 1:
             raise UsageError(
@@ -35,7 +31,7 @@ class PoseNetwork(nn.Module):
         self.encoder = Encoder(config.encoder)
         self.heads = Heads(layout, config.encoder.widths[-1], config.row, config.hidden)
 
-    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
-        """Scene codes, in physical units, of sRGB images in [0, 1]."""
-        code: dict[str, Tensor] = self.heads(self.encoder(images))
-        return code
+    def decode(self, latent: Float[Tensor, "batch latent"]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The heads' raw outputs of a latent code, and the scene code."""
+        raw = self.heads.raw(latent)
+        return raw, self.heads.layout.activate(raw)

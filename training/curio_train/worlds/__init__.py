@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from curio_train.config import WorldOptions
 from curio_train.worlds.options import (
+    CaptureOptions,
     ChairsOptions,
     CirclesOptions,
     LightOptions,
@@ -31,6 +32,7 @@ WORLDS: dict[str, type[WorldOptions]] = {
     "multi": MultiOptions,
     "light": LightOptions,
     "linemod": LinemodOptions,
+    "capture": CaptureOptions,
 }
 
 

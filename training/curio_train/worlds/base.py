@@ -7,14 +7,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import torch
-from torch import Tensor
+from jaxtyping import Float
+from torch import Tensor, nn
 
+from curio_train.config import NetworkConfig
+from curio_train.data.bop import ModelInfo
 from curio_train.errors import UsageError
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.metrics.assignment import scene_error
+from curio_train.networks.look import Look
+from curio_train.networks.pose import PoseNetwork
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 
 if TYPE_CHECKING:
@@ -47,6 +53,11 @@ class ObjectKind:
     symmetry_axes: Sequence[tuple[np.ndarray, np.ndarray]] = ()
     attribution: str = ""
 
+    @property
+    def info(self) -> ModelInfo:
+        """What pose metrics need of it."""
+        return ModelInfo(self.diameter_m, tuple(self.symmetries), tuple(self.symmetry_axes))
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -56,11 +67,13 @@ class Batch:
         images: [batch, 3, height, width], float sRGB in [0, 1].
         backgrounds: What the re-rendering is composited over, same shape; None: the world's own background.
         code: The true scene code, for supervision and scoring alone; None where nobody may know it.
+        given: What is known of each image beside its code, such as how far away a crop takes its object to be.
     """
 
     images: Tensor
     backgrounds: Tensor | None = None
     code: SceneCode | None = None
+    given: SceneCode = field(default_factory=dict)
 
 
 class ImageSource(ABC):
@@ -72,6 +85,10 @@ class ImageSource(ABC):
     @abstractmethod
     def batch(self, step: int, size: int) -> Batch:
         """The images of one step."""
+
+    def backgrounds(self, step: int, size: int) -> Tensor | None:
+        """The backgrounds of one step's batch alone: all that is taken of it to render codes of one's own making."""
+        return self.batch(step, size).backgrounds
 
     def subset(self, share: float) -> "ImageSource":
         """The first ``share`` of a finite set of images.
@@ -115,9 +132,44 @@ class World(ABC):
     layout: Layout
     camera: Camera
     objects: tuple[ObjectKind, ...]
-    sleep_weights: Mapping[str, float] = {}
-    """Weights of Eq. 1 by field in the sleep loss; fields not named weigh 1."""
     mesh: "Mesh | None" = None
+    colors_interchangeable: ClassVar[bool] = False
+    """Whether scenes with their colours' channels exchanged are as likely, and look like their images so changed."""
+
+    @property
+    def looks(self) -> tuple["World", ...]:
+        """What is looked at, one after the other, to read one image: worlds with images and codes of their own.
+
+        All but gazes read an image at one look, and are that look themselves.
+        """
+        return (self,)
+
+    @property
+    def turns(self) -> tuple[int, ...]:
+        """Which look each training step teaches, over and over."""
+        return (0,)
+
+    def network(self, config: NetworkConfig) -> Look:
+        """What reads this world's images at one look.
+
+        Raises:
+            UsageError: The sizes do not fit the images.
+        """
+        return PoseNetwork(self.layout, self.camera.width, config)
+
+    def assemble(self, networks: Sequence[Look]) -> nn.Module:
+        """The networks of all looks as one, from image to scene code: what is exported."""
+        (network,) = networks
+        return network
+
+    def finish(self, network: nn.Module, cache: Path) -> None:
+        """What is left to do for the assembled network when training is done: nothing, in most worlds."""
+        return
+
+    def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
+        """What sleep makes small: the paper's Eq. 1, mean over the batch."""
+        groups = tuple(kind.slots for kind in self.objects)
+        return scene_error(self.layout, predicted, true, groups).mean()
 
     @property
     def model_name(self) -> str:
@@ -162,6 +214,16 @@ class World(ABC):
     def disturb(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
         """What lies between renderings and the data, done to renderings that the network learns to read (sleep)."""
         return images
+
+    def photographs(self, count: int) -> Tensor | None:
+        """Photographs that nobody labelled, as this world's camera would take them, where there are some.
+
+        At most ``count``, [num, 3, height, width] in [0, 1], to judge by eye what is found in them.
+
+        Raises:
+            DataError: One cannot be read, or is not of the camera's size.
+        """
+        return None
 
     def novel_view(self, code: SceneCode) -> Tensor:
         """Scenes as scored by the paper's image error: from 90° round their centre, where a world has such a view."""

@@ -9,7 +9,9 @@ The paper gives no numbers. Ours were fixed before any training:
   128x128 images (field of view 40°) every object is whole in the frame, and so it is in the novel view from 90° round
   the vertical axis; the horizon is above the frame;
 * the ground is a grey of 0.5 (sRGB); ambient radiance 0.3, sun of strength 0.7. Where the sun does not change it is 50°
-  high, to the left of the camera.
+  high, to the left of the camera;
+* objects throw shadows, on the ground and on each other; as rendering/shadows.py says, all that moves them has
+  gradients but the border of a shadow on another object.
 
 Codes are in the world frame. An exported model answers in the camera frame, which never moves.
 """
@@ -21,12 +23,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.data.meshes import Mesh
 from curio_train.geometry import Pose, camera_looking_at, matrix_from_yaw, rotation_6d_from_matrix
-from curio_train.rendering.renderer import linear_from_srgb
+from curio_train.rendering.ground import Ground
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW, Field, Layout, SceneCode
 from curio_train.worlds.base import Camera
 from curio_train.worlds.mesh_world import Kind, MeshWorld, Stage
@@ -72,21 +73,26 @@ def footprint_radius_m(mesh: Mesh) -> float:
 class GroundWorld(MeshWorld):
     """Objects that stand on the ground before the camera of :func:`stage`."""
 
+    outline_samples = 256
+    """Objects of 15 to 40 pixels: measured, half the usual number costs 0.001 of the gradients' cosine."""
+
+    object_shadows = True
+
     def __init__(self, fields: Sequence[Field], kinds: Sequence[Kind]) -> None:
         layout = Layout((POSITION, TURN, *fields), sum(kind.num_slots for kind in kinds))
         super().__init__(layout, kinds, stage())
         self.radii_m = [footprint_radius_m(kind.mesh) for kind in kinds for _ in range(kind.num_slots)]
 
-    def behind(self, light: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 height width"]:
-        """The ground, lit as its height in the sun says, all over the frame."""
-        linear = linear_from_srgb(light.new_tensor(GROUND_SRGB)) * (AMBIENT + light[:, 1].clamp(min=0))
-        srgb = 1.055 * linear.clamp(0.0031308, 1) ** (1 / 2.4) - 0.055
-        return srgb.view(-1, 1, 1, 1).expand(-1, 3, self.camera.height, self.camera.width)
+    def ground(self, cam_from_world: Pose) -> Ground:
+        """The plane y = 0."""
+        turn, shift = cam_from_world
+        up = np.asarray(turn)[:, 1]
+        return Ground(up, -float(up @ np.asarray(shift)), GROUND_SRGB)
 
     @property
     def recipe(self) -> dict[str, Any]:
         """All that the images depend on."""
-        return super().recipe | {"ground": GROUND_SRGB}
+        return super().recipe | {"ground": GROUND_SRGB, "shadows": "ground and objects"}
 
     @property
     def exported_fields(self) -> tuple[Field, ...]:

@@ -34,6 +34,7 @@ class Light(GroundWorld):
     """The world of many shapes under a moving sun."""
 
     name = "light"
+    colors_interchangeable = True
 
     def __init__(self) -> None:
         kinds = [

@@ -10,194 +10,62 @@ Constants fixed before any training:
 * light from the camera's half space, of strength 0.2 to 1.1 over an ambient radiance of 0.4.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
-from curio_train.camera import scale_matrix
-from curio_train.data.augmentation import disturb
 from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
 from curio_train.data.bop import BopDataset
 from curio_train.data.photographs import Photographs
-from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_between
-from curio_train.rendering.renderer import Renderer
-from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
-from curio_train.worlds.base import Batch, Camera, ImageSource, ObjectKind, Split, World, jitter_seed
+from curio_train.errors import UsageError
+from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.gaze import GazeWorld
 from curio_train.worlds.options import LinemodOptions
+from curio_train.worlds.single_object import Object, SingleObjectWorld, pose_layout, position_field, squeezed
 
 SIDE_PX = 128
 NEAR_M, FAR_M = 0.5, 1.5
-LARGEST_ROLL_DEG = 45.0
-AMBIENT = 0.4
-WEAKEST_LIGHT, STRONGEST_LIGHT = 0.2, 1.1
-_SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 
 
-class Linemod(World):
-    """One LineMOD object, seen by a camera whose whole frame is squeezed into 128x128 pixels.
-
-    Attributes:
-        mesh: The object, metres.
-    """
+class Linemod(SingleObjectWorld):
+    """One LineMOD object in the whole frame, squeezed into 128x128 pixels and read at one look as in the paper."""
 
     name = "linemod"
-    # Where the object is comes first: until it is found, what its light and rotation would teach is noise.
-    sleep_weights: Mapping[str, float] = {TRANSLATION: 4.0, ROTATION_6D: 0.4, LIGHT: 0.2}
 
-    def __init__(self, options: LinemodOptions) -> None:
-        """Read mesh, camera and symmetries.
+    def __init__(self, thing: Object) -> None:
+        super().__init__(thing, squeezed(thing.camera, SIDE_PX), pose_layout(position_field(thing), confidence=False))
 
-        Raises:
-            UsageError: Unknown class.
-            DataError: The folder is not a BOP data set, or lacks the class.
-            MeshError: The mesh is broken.
-        """
-        dataset = BopDataset(options.data)
-        self._options = options
-        self.mesh = dataset.mesh(options.class_name)
-        info = dataset.model_info(options.class_name)
-        self.objects = (
-            ObjectKind(
-                options.class_name,
-                (0,),
-                info.diameter_m,
-                self.mesh.box_corners_m,
-                self.mesh.sha256,
-                info.symmetries,
-                info.symmetry_axes,
-            ),
+
+def build(options: LinemodOptions) -> SingleObjectWorld:
+    """The world of one LineMOD class, to be read at two looks or at one.
+
+    Raises:
+        UsageError: Unknown class, or no data.
+        DataError: The folder is not a BOP data set, or lacks the class.
+        MeshError: The mesh is broken.
+    """
+    if options.data is None:
+        raise UsageError(
+            "linemod needs meshes and cameras, found neither --data nor --download: --data DIR names a folder in BOP's "
+            "layout (lm or lmo), --download fetches LineMOD from BOP's repository"
         )
-        camera = dataset.camera
-        matrix = _squeezed(camera.matrix, camera.width, camera.height)
-        self.camera = Camera(SIDE_PX, SIDE_PX, matrix)
-        self._matrix = matrix
-        center = camera.matrix[[0, 1], 2]
-        focal = camera.matrix[[0, 1], [0, 1]]
-        first, last = (
-            (np.array(corner) - center) / focal for corner in ((0, 0), (camera.width - 1, camera.height - 1))
-        )
-        self.layout = Layout(
-            (
-                Field(
-                    TRANSLATION,
-                    3,
-                    unit="m",
-                    frame="camera",
-                    activation="perspective",
-                    lower=(*first.tolist(), NEAR_M),
-                    upper=(*last.tolist(), FAR_M),
-                ),
-                Field(ROTATION_6D, 6, frame="camera", lower=(-1.0,) * 6, upper=(1.0,) * 6),
-                Field(
-                    LIGHT,
-                    3,
-                    per_object=False,
-                    frame="camera",
-                    lower=(-STRONGEST_LIGHT,) * 3,
-                    upper=(STRONGEST_LIGHT,) * 3,
-                ),
-            )
-        )
-        self._renderer = Renderer([self.mesh], [0], SIDE_PX, SIDE_PX, ambient=AMBIENT)
+    dataset = BopDataset(options.data)
+    name = options.class_name
+    mesh, info = dataset.mesh(name), dataset.model_info(name)
+    kind = ObjectKind(
+        name,
+        (0,),
+        info.diameter_m,
+        mesh.box_corners_m,
+        mesh.sha256,
+        info.symmetries,
+        info.symmetry_axes,
+        dataset.attribution,
+    )
 
-    @property
-    def model_name(self) -> str:
-        """The class's own name."""
-        return self._options.class_name
+    def backgrounds(cache: Path) -> Backgrounds:
+        if options.backgrounds:
+            return PhotographBackgrounds(Photographs(options.backgrounds))
+        others = [dataset.mesh(other) for other in dataset.classes if other != name]
+        return ClutterBackgrounds.cached(cache, others)
 
-    def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:
-        """Poses from the published range, light from the camera's side."""
-        random = np.random.default_rng(seed)
-        field = self.layout[TRANSLATION]
-        position = random.uniform(field.lower, field.upper, (count, 3))
-        position[:, :2] *= position[:, 2:]
-        translation = torch.from_numpy(position).float()
-        rotation = _turned_towards(translation, _views(count, random))
-        return {
-            TRANSLATION: translation[:, None],
-            ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None],
-            LIGHT: torch.from_numpy(_lights(count, random)).float(),
-        }
-
-    def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
-        """The object over ``backgrounds``, or over black."""
-        count = len(code[TRANSLATION])
-        behind = torch.zeros(count, 3, SIDE_PX, SIDE_PX) if backgrounds is None else backgrounds
-        return self._renderer(
-            matrix_from_rotation_6d(code[ROTATION_6D].float()),
-            code[TRANSLATION].float(),
-            camera_matrix=self._matrix,
-            backgrounds=behind,
-            light=code[LIGHT].float(),
-            seed=jitter_seed(code),
-        )
-
-    def disturb(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
-        """What real cameras and scenes do to a picture, see :func:`~curio_train.data.augmentation.disturb`."""
-        return disturb(images, np.random.default_rng(seed))
-
-    def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> "RenderedStream":
-        """An endless stream of renderings; the splits differ in poses and in backgrounds."""
-        folder = self._options.backgrounds
-        backgrounds = PhotographBackgrounds(Photographs(folder)) if folder else ClutterBackgrounds.cached(cache)
-        return RenderedStream(self, backgrounds.split(split == "train"), (_SPLITS.index(split), seed), with_code)
-
-
-class RenderedStream(ImageSource):
-    """Images of a world over random backgrounds, rendered as they are asked for and never stored."""
-
-    def __init__(self, world: Linemod, backgrounds: Backgrounds, seed: tuple[int, ...], with_code: bool) -> None:
-        self._world, self._backgrounds, self._seed, self._with_code = world, backgrounds, seed, with_code
-
-    @torch.no_grad()
-    def batch(self, step: int, size: int) -> Batch:
-        """The images of one step, a function of seed and step alone."""
-        seed = (*self._seed, step)
-        code = self._world.sample(size, seed)
-        backgrounds = self._backgrounds.draw(size, SIDE_PX, SIDE_PX, seed)
-        images = self._world.render(code, backgrounds)
-        return Batch(images, backgrounds, code if self._with_code else None)
-
-
-def build(options: LinemodOptions) -> Linemod:
-    """The world of one LineMOD class."""
-    return Linemod(options)
-
-
-def _squeezed(matrix: np.ndarray, width: int, height: int) -> np.ndarray:
-    """K of the whole frame in a square image: one scale for both axes, the frame in the middle."""
-    longer = max(width, height)
-    square = np.array(matrix, dtype=np.float64)
-    square[0, 2] += (longer - width) / 2
-    square[1, 2] += (longer - height) / 2
-    return scale_matrix(square, (longer, longer), (SIDE_PX, SIDE_PX))
-
-
-def _views(count: int, random: np.random.Generator) -> Float[Tensor, "count 3 3"]:
-    """Rotations cam_from_obj of cameras on the upper hemisphere (object z up) that look at the object, rolled."""
-    azimuth = random.uniform(0, 2 * np.pi, count)
-    height = random.uniform(0, 1, count)  # of the camera on the unit sphere: uniform there is uniform in area
-    level = np.sqrt(1 - height**2)
-    forward = -np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], axis=1)
-    right = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(count)], axis=1)
-    down = np.cross(forward, right)
-    roll = np.radians(random.uniform(-LARGEST_ROLL_DEG, LARGEST_ROLL_DEG, count))[:, None]
-    rows = [np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right, forward]
-    return torch.from_numpy(np.stack(rows, axis=1)).float()
-
-
-def _turned_towards(translation: Float[Tensor, "count 3"], rotation: Float[Tensor, "count 3 3"]) -> Tensor:
-    """Rotations of objects seen along the optical axis, carried to where they are in the frame."""
-    axis = translation.new_tensor([0.0, 0.0, 1.0]).expand_as(translation)
-    return rotation_between(axis, translation) @ rotation
-
-
-def _lights(count: int, random: np.random.Generator) -> np.ndarray:
-    direction = random.normal(size=(count, 3))
-    direction[:, 2] = -np.abs(direction[:, 2])
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return direction * random.uniform(WEAKEST_LIGHT, STRONGEST_LIGHT, (count, 1))
+    thing = Object(kind, mesh, dataset.camera, NEAR_M, FAR_M, backgrounds)
+    return GazeWorld(Linemod.name, thing) if options.gaze else Linemod(thing)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from curio_train.data.meshes import Mesh
 from curio_train.geometry import Pose, direction_from_hemisphere, matrix_from_yaw
+from curio_train.rendering.ground import Ground
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, YAW, Layout, SceneCode
 from curio_train.worlds.base import Camera, ObjectKind, Split, World, jitter_seed
@@ -75,7 +76,12 @@ class MeshWorld(World):
     Attributes:
         stage: Camera, light, and where the novel view is taken from.
         kinds: The objects.
+        outline_samples: Points on each object's outline, for the gradient.
+        object_shadows: Whether objects stand in each other's light.
     """
+
+    outline_samples = 512
+    object_shadows = False
 
     def __init__(self, layout: Layout, kinds: Sequence[Kind], stage: Stage) -> None:
         """Build the renderer.
@@ -102,6 +108,8 @@ class MeshWorld(World):
             stage.camera.width,
             stage.camera.height,
             ambient=stage.ambient,
+            outline_samples=self.outline_samples,
+            object_shadows=self.object_shadows,
         )
 
     @property
@@ -141,23 +149,32 @@ class MeshWorld(World):
             return direction_from_hemisphere(code[LIGHT].float()) * sun.norm()
         return sun.expand(len(code[TRANSLATION]), 3)
 
-    def behind(self, light: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 height width"]:
-        """What is seen past the objects: black."""
-        return light.new_zeros(len(light), 3, self.camera.height, self.camera.width)
+    def ground(self, cam_from_world: Pose) -> Ground | None:
+        """What the objects stand on, as a camera there sees it; None: they float before black."""
+        return None
 
     def _view(self, code: SceneCode, cam_from_world: Pose, backgrounds: Tensor | None) -> Tensor:
         place = code[TRANSLATION].float()
-        turn, shift = (torch.as_tensor(part, dtype=torch.float32) for part in cam_from_world)
-        own = matrix_from_yaw(code[YAW].float()) if YAW in self.layout else torch.eye(3).expand(*place.shape[:2], 3, 3)
-        light = self.light(code)
+        turn, shift = (torch.as_tensor(part).to(place) for part in cam_from_world)
+        upright = torch.eye(3).to(place).expand(*place.shape[:2], 3, 3)
+        own = matrix_from_yaw(code[YAW].float()) if YAW in self.layout else upright
+        light = self.light(code) @ turn.T
         assert self.camera.matrix is not None  # every stage has a pinhole camera
-        return self._renderer(
-            turn @ own,
-            place @ turn.T + shift,
-            camera_matrix=self.camera.matrix,
-            backgrounds=self.behind(light) if backgrounds is None else backgrounds,
-            light=light @ turn.T,
-            color=code[COLOR].float() if COLOR in self.layout else None,
-            confidence=code[CONFIDENCE][..., 0].float() if CONFIDENCE in self.layout else None,
-            seed=jitter_seed(code),
-        )
+        scene: dict[str, Any] = {
+            "rotation": turn @ own,
+            "translation_m": place @ turn.T + shift,
+            "camera_matrix": self.camera.matrix,
+            "light": light,
+            "confidence": code[CONFIDENCE][..., 0].float() if CONFIDENCE in self.layout else None,
+            "seed": jitter_seed(code),
+        }
+        color = code[COLOR].float() if COLOR in self.layout else None
+        behind = self._behind(self.ground(cam_from_world), scene) if backgrounds is None else backgrounds
+        return self._renderer(**scene, color=color, backgrounds=behind)
+
+    def _behind(self, ground: Ground | None, scene: Mapping[str, Any]) -> Float[Tensor, "batch 3 height width"]:
+        """What is seen past the objects: black, or the ground with their shadows."""
+        light: Tensor = scene["light"]
+        if ground is None:
+            return light.new_zeros(len(light), 3, self.camera.height, self.camera.width)
+        return ground.image(self.stage.ambient, light, self._renderer.shadows(**scene, ground=ground))

@@ -29,6 +29,7 @@ class Multi(GroundWorld):
     """The world of eight letters."""
 
     name = "multi"
+    colors_interchangeable = True
 
     def __init__(self) -> None:
         meshes = {name: painted(standing(letter(name, HEIGHT_M, DEPTH_M)), DARKEST) for name in LETTERS}

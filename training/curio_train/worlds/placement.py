@@ -36,11 +36,17 @@ def places(
     return torch.from_numpy(found).float()
 
 
-def colors(count: int, num_objects: int, random: np.random.Generator) -> Tensor:
+def colors(
+    count: int,
+    num_objects: int,
+    random: np.random.Generator,
+    least_saturation: float = LEAST_SATURATION,
+    least_value: float = LEAST_VALUE,
+) -> Tensor:
     """Colours [count, num_objects, 3] in sRGB, uniform in hue, saturation and value."""
     hue = random.uniform(0, 6, (count, num_objects, 1))
-    saturation = random.uniform(LEAST_SATURATION, 1, hue.shape)
-    value = random.uniform(LEAST_VALUE, 1, hue.shape)
+    saturation = random.uniform(least_saturation, 1, hue.shape)
+    value = random.uniform(least_value, 1, hue.shape)
     # Each channel is full over a third of the colour circle, absent over another, and ramps in between.
     ramp = (np.abs((hue - np.array([0, 2, 4]) + 3) % 6 - 3) - 1).clip(0, 1)
     return torch.from_numpy(value * (1 - saturation * ramp)).float()

@@ -62,6 +62,7 @@ class Spheres(MeshWorld):
     """The world of three spheres."""
 
     name = "spheres"
+    colors_interchangeable = True
 
     def __init__(self) -> None:
         super().__init__(

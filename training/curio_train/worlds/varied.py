@@ -26,6 +26,7 @@ class Varied(MeshWorld):
     """The world of two to five spheres."""
 
     name = "varied"
+    colors_interchangeable = True
 
     def __init__(self) -> None:
         layout = Layout((*FIELDS, CONFIDENCE_FIELD), NUM_SLOTS)

@@ -1,0 +1,115 @@
+"""Calibration from rendered photographs of boards, whose camera is known."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from curio_train.camera import load_intrinsics
+from curio_train.capture.calibration import Board, calibrate
+from curio_train.capture.camera_json import save_intrinsics
+from curio_train.errors import CameraError, DataError
+from scipy.spatial.transform import Rotation
+
+WIDTH, HEIGHT = 640, 480
+MATRIX = np.array([[610.0, 0, 326.0], [0, 606.0, 233.0], [0, 0, 1]])
+DISTORTION = np.array([-0.12, 0.05, 0.001, -0.0005, 0.0])
+SQUARE_M = 0.03
+PX_PER_SQUARE = 60
+PLAIN = Board(9, 6, SQUARE_M)
+CHARUCO = Board(9, 6, SQUARE_M, 0.022)
+
+
+def picture(board: Board) -> np.ndarray:
+    """The board as it is printed, half a square of white round it."""
+    size = (board.columns * PX_PER_SQUARE, board.rows * PX_PER_SQUARE)
+    if board.marker_m is None:
+        column, row = np.meshgrid(np.arange(size[0]) // PX_PER_SQUARE, np.arange(size[1]) // PX_PER_SQUARE)
+        image = np.where((column + row) % 2, 255, 0).astype(np.uint8)
+    else:
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        printed = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, board.marker_m, dictionary)
+        image = printed.generateImage(size)
+    return cv2.copyMakeBorder(image, *(PX_PER_SQUARE // 2,) * 4, cv2.BORDER_CONSTANT, value=255)
+
+
+def photograph(image: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """What a distorting camera sees of it: each pixel's ray, undistorted, meets the board's plane."""
+    u, v = np.meshgrid(np.arange(WIDTH, dtype=np.float64), np.arange(HEIGHT, dtype=np.float64))
+    rays = cv2.undistortPoints(np.stack([u, v], axis=-1).reshape(-1, 1, 2), MATRIX, DISTORTION).reshape(-1, 2)
+    step = SQUARE_M / PX_PER_SQUARE
+    middle = (np.array(image.shape[::-1]) - 1) / 2
+    on_board = np.stack([turn[:, 0] * step, turn[:, 1] * step, shift - turn[:, :2] @ middle * step], axis=1)
+    back = np.linalg.inv(on_board)
+    seen = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) @ back.T
+    places = (seen[:, :2] / seen[:, 2:]).reshape(HEIGHT, WIDTH, 2).astype(np.float32)
+    smooth = cv2.GaussianBlur(image, (0, 0), 0.8)
+    return cv2.remap(smooth, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderValue=140)
+
+
+def write(folder: Path, board: Board, count: int, largest_tilt_deg: float = 35.0) -> Path:
+    random, image = np.random.default_rng(1), picture(board)
+    for number in range(count):
+        tilt = random.uniform(-largest_tilt_deg, largest_tilt_deg, 2)
+        turn = Rotation.from_euler("xyz", [*tilt, random.uniform(-20, 20)], degrees=True).as_matrix()
+        shift = np.array([*random.uniform(-0.06, 0.06, 2), random.uniform(0.38, 0.55)])
+        noise = random.normal(0, 2, (HEIGHT, WIDTH))
+        photo = (photograph(image, turn, shift) + noise).clip(0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{number:02}.png"), photo)
+    return folder
+
+
+@pytest.mark.parametrize("board", [PLAIN, CHARUCO], ids=["chessboard", "ChArUco"])
+def test_the_camera_is_found(tmp_path: Path, board: Board) -> None:
+    found = calibrate(write(tmp_path, board, 16), board)
+    assert found.num_views >= 12
+    assert found.error_px < 0.3
+    assert found.camera.matrix == pytest.approx(MATRIX, rel=0.01, abs=4)
+    seen = [
+        cv2.projectPoints(np.array([[0.35, 0.25, 1.0]]), np.zeros(3), np.zeros(3), matrix, np.array(distortion))[0]
+        for matrix, distortion in ((MATRIX, DISTORTION), (found.camera.matrix, found.camera.distortion))
+    ]
+    assert np.abs(seen[0] - seen[1]).max() < 2, "towards the corner, where distortion counts"
+
+
+def test_views_that_are_too_alike(tmp_path: Path) -> None:
+    with pytest.raises(CameraError, match="tilt the board"):
+        calibrate(write(tmp_path, PLAIN, 8, largest_tilt_deg=0.2), PLAIN)
+
+
+def test_another_board_is_not_found(tmp_path: Path) -> None:
+    write(tmp_path, PLAIN, 6)
+    with pytest.raises(CameraError, match="in 0 of 6 photographs"):
+        calibrate(tmp_path, Board(8, 5, SQUARE_M, 0.02))
+
+
+def test_photographs_of_two_sizes(tmp_path: Path) -> None:
+    write(tmp_path, PLAIN, 2)
+    cv2.imwrite(str(tmp_path / "99.png"), np.zeros((100, 100), np.uint8))
+    with pytest.raises(DataError, match="expected one size"):
+        calibrate(tmp_path, PLAIN)
+
+
+@pytest.mark.parametrize(
+    "values", [(2, 6, 0.03), (9, 6, -1.0), (9, 6, 0.03, 0.05), (9, 6, 0.03, 0.02, "DICT_OF_MINE")], ids=str
+)
+def test_boards_that_cannot_be(values: tuple[int, int, float]) -> None:
+    with pytest.raises(CameraError, match="expected"):
+        Board(*values)
+
+
+def test_the_camera_file_is_read_as_written(tmp_path: Path) -> None:
+    camera = load_intrinsics(_written(tmp_path, {"distortion": DISTORTION.tolist()}))
+    save_intrinsics(tmp_path / "again.json", camera)
+    again = load_intrinsics(tmp_path / "again.json")
+    assert (again.matrix == camera.matrix).all()
+    assert (again.width, again.height, again.distortion) == (WIDTH, HEIGHT, tuple(DISTORTION))
+    with pytest.raises(CameraError, match="cannot be written"):
+        save_intrinsics(tmp_path / "none" / "camera.json", camera)
+
+
+def _written(folder: Path, other: dict[str, object]) -> Path:
+    path = folder / "camera.json"
+    path.write_text(json.dumps({"camera_matrix": MATRIX.tolist(), "width": WIDTH, "height": HEIGHT} | other))
+    return path

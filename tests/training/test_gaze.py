@@ -1,0 +1,271 @@
+"""The gaze: crops are what a turned camera would see, and what is read in them is turned back."""
+
+import numpy as np
+import pytest
+import torch
+from curio_train.camera import Intrinsics, project
+from curio_train.config import NetworkConfig
+from curio_train.data.backgrounds import ClutterBackgrounds
+from curio_train.data.shapes import box
+from curio_train.geometry import (
+    matrix_from_rotation_6d,
+    rotation_6d_from_matrix,
+    rotation_angle_deg,
+    rotation_between,
+)
+from curio_train.networks.crop import SURFACE
+from curio_train.networks.look import Look
+from curio_train.networks.places import CANDIDATES, LOG_WEIGHTS, NUM_CANDIDATES, PLACES
+from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, index
+from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.gaze import ASSUMED_M, CROP_PX, FirstLook, GazeWorld, gaze_camera
+from curio_train.worlds.single_object import Object
+from curio_train.worlds.surface import SurfaceMap
+from torch import Tensor, nn
+
+K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
+MESH = box((0.09, 0.06, 0.12))
+
+
+@pytest.fixture(scope="module")
+def thing() -> Object:
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    kind = ObjectKind("brick", (0,), MESH.diameter_m, MESH.box_corners_m, MESH.sha256, symmetries=(half_turn,))
+    pool = np.full((5, 240, 320, 3), 128, np.uint8)
+    return Object(kind, MESH, Intrinsics(K, 640, 480), 0.5, 1.5, lambda _: ClutterBackgrounds(pool))
+
+
+@pytest.fixture(scope="module")
+def world(thing: Object) -> GazeWorld:
+    return GazeWorld("linemod", thing)
+
+
+class Told(Look):
+    """A look that answers what it was told, and keeps what it was shown."""
+
+    def __init__(self, code: dict[str, Tensor]) -> None:
+        super().__init__()
+        self.encoder, self.code, self.shown = nn.Identity(), code, []
+
+    def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        self.shown.append(features)
+        return {}, self.code
+
+
+def test_the_canonical_camera_is_the_frames_own_at_most_640_pixels_long() -> None:
+    camera = gaze_camera(Intrinsics(K, 640, 480))
+    assert (camera.width, camera.height) == (640, 480)
+    assert np.array_equal(camera.matrix, K)
+    large = gaze_camera(Intrinsics(np.array([[1600.0, 0, 960], [0, 1600, 540], [0, 0, 1]]), 1920, 1080))
+    assert (large.width, large.height) == (640, 360)
+    assert large.matrix[0, 0] == pytest.approx(1600 / 3)
+
+
+def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(world: GazeWorld) -> None:
+    """A frame is rendered, looked at where the object is, and the crop compared with one rendered as a crop.
+
+    Told the truth about the crop, the gaze must answer the truth about the frame.
+    """
+    code = world.sample(6, (5,))
+    code[TRANSLATION][..., 2] = code[TRANSLATION][..., 2].clamp(max=0.8)
+    code[TRANSLATION][..., :2] *= 0.4  # whole in the frame
+    images = world.render(code)
+    place = code[TRANSLATION][:, 0]
+    distance = place.norm(dim=1, keepdim=True)
+    second = world.looks[1]
+    turn = rotation_between(place, torch.tensor([0.0, 0, 1]).expand_as(place))
+    relative = {
+        TRANSLATION: torch.tensor([0.0, 0, 1]).expand(6, 1, 3),
+        ROTATION_6D: rotation_6d_from_matrix(turn @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0]))[:, None],
+        CONFIDENCE: torch.full((6, 1, 1), 0.7),
+        LIGHT: (turn @ code[LIGHT][..., None])[..., 0],
+    }
+    glance = Told(relative)
+    network = world.assemble([Told({CANDIDATES: code[TRANSLATION]}), glance])
+    found = network(images)
+    assert torch.allclose(found[TRANSLATION], code[TRANSLATION], atol=1e-5)
+    turned = rotation_angle_deg(*(matrix_from_rotation_6d(c[ROTATION_6D][:, 0]) for c in (found, code)))
+    assert turned.max() < 0.05
+    assert torch.allclose(found[LIGHT], code[LIGHT], atol=1e-5)
+    assert torch.allclose(found[CONFIDENCE], relative[CONFIDENCE])
+    rendered = second.render(relative | {ASSUMED_M: distance, CONFIDENCE: torch.ones(6, 1, 1)})
+    assert glance.shown[0].shape == (6, 3, CROP_PX, CROP_PX)
+    missed = (glance.shown[0] - rendered).abs().mean()
+    assert missed < 0.5 * (rendered - rendered.roll(1, dims=-1)).abs().mean(), "further off than half a pixel"
+
+
+def test_objects_of_the_second_look_lie_where_its_code_says(world: GazeWorld) -> None:
+    second = world.looks[1]
+    code = second.sample(40, (1,))
+    assert 0 < (code[CONFIDENCE] == 0).sum() < 15
+    code[CONFIDENCE][:] = 1
+    second.layout.check({name: value for name, value in code.items() if name != ASSUMED_M})
+    drawn = second.render(code).amax(dim=1) > 0.02
+    place = code[TRANSLATION][:, 0]
+    pixels = project(place[:, None], torch.from_numpy(second.camera.matrix).float()[None])[:, 0]
+    rows, columns = torch.meshgrid(torch.arange(CROP_PX), torch.arange(CROP_PX), indexing="ij")
+    for mask, pixel in zip(drawn, pixels, strict=True):
+        middle = torch.stack([columns[mask].float().mean(), rows[mask].float().mean()])
+        assert (middle - pixel).norm() < 6
+
+
+def test_second_look_loss_is_least_at_the_truth_and_knows_what_looks_alike(world: GazeWorld) -> None:
+    second = world.looks[1]
+    true = second.sample(5, (2,))
+    true[CONFIDENCE][:] = 1
+    side = CROP_PX // 4
+    points, seen = second._surface(
+        matrix_from_rotation_6d(true[ROTATION_6D][:, 0]),
+        second._metres(true[TRANSLATION][:, 0], true[ASSUMED_M]),
+        second._matrices(true, side),
+    )
+    surface = torch.cat([points, 20 * seen[:, None].float() - 10], dim=1)
+    perfect = float(second.code_loss({**true, SURFACE: surface}, true))
+    assert perfect < 1e-3
+    turned = dict(true)
+    rotation = matrix_from_rotation_6d(true[ROTATION_6D][:, 0]) @ torch.diag(torch.tensor([-1.0, -1, 1]))
+    turned[ROTATION_6D] = rotation[:, None, :, :2].transpose(-1, -2).flatten(-2)
+    assert float(second.code_loss({**turned, SURFACE: surface}, true)) < 1e-3
+    mirrored = surface * torch.tensor([-1.0, -1, 1, 1])[:, None, None]
+    assert float(second.code_loss({**true, SURFACE: mirrored}, true)) < 1e-3
+    for name, change in ((TRANSLATION, 0.05), (ROTATION_6D, 0.3), (LIGHT, 0.3), (SURFACE, 0.3), (CONFIDENCE, -0.5)):
+        worse = {**true, SURFACE: surface}
+        worse[name] = worse[name] + change
+        assert float(second.code_loss(worse, true)) > perfect + 5e-3, name
+
+
+def test_confidence_is_to_foretell_whether_the_pose_is_right(world: GazeWorld) -> None:
+    """Certainty pays where ADD is below a tenth of the diameter, doubt where it is not or where nothing is there."""
+    second = world.looks[1]
+    true = second.sample(6, (2,))
+    surface = torch.zeros(6, 4, 16, 16)
+
+    def doubt_pays(there: float, shift: float) -> bool:
+        scene = true | {CONFIDENCE: torch.full((6, 1, 1), there)}
+        read = scene | {TRANSLATION: true[TRANSLATION] + torch.tensor([shift, 0, 0]), SURFACE: surface}
+        sure, unsure = (read | {CONFIDENCE: torch.full((6, 1, 1), value)} for value in (0.9, 0.1))
+        return bool(second.code_loss(unsure, scene) < second.code_loss(sure, scene))
+
+    assert not doubt_pays(1.0, 0.08)
+    assert doubt_pays(1.0, 0.12)
+    assert doubt_pays(0.0, 0.0)
+
+
+def test_surface_points_project_to_the_patches_that_see_them(world: GazeWorld) -> None:
+    second = world.looks[1]
+    code = second.sample(8, (3,))
+    surface_map = SurfaceMap(MESH, 32)
+    rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
+    place = second._metres(code[TRANSLATION][:, 0], code[ASSUMED_M])
+    matrices = second._matrices(code, 32)
+    points, seen = surface_map(rotation, place, matrices)
+    inside = -torch.nn.functional.max_pool2d(-seen[:, None].float(), 3, 1, 1)[:, 0] > 0  # edges mix with the void
+    assert inside.sum() > 400
+    for image in range(8):
+        v, u = torch.nonzero(inside[image], as_tuple=True)
+        metres = points[image][:, v, u].T * surface_map.half_extent_m + torch.from_numpy(surface_map.center_m).float()
+        camera = metres @ rotation[image].T + place[image]
+        pixels = project(camera[None], torch.from_numpy(matrices[image]).float()[None])[0]
+        assert (pixels - torch.stack([u, v], dim=1)).abs().mean() < 0.3
+
+
+def test_first_look_reads_the_likeliest_place(world: GazeWorld) -> None:
+    """A network that scores brightness must answer with the bright spot's place, between the depth bounds."""
+    first = world.looks[0]
+    network = first.network(NetworkConfig()).eval()
+    spot = torch.zeros(1, 3, 120, 160)
+    spot[:, :, 60:68, 100:108] = 1.0
+    with torch.no_grad():
+        for module in network.encoder.modules():
+            if isinstance(module, nn.Conv2d):
+                module.weight.zero_()
+                module.bias.zero_()
+                middle = module.kernel_size[0] // 2
+                module.weight[0, 0, middle, middle] = 1.0
+        network.score.weight.zero_()
+        network.score.weight[0, 0] = 50.0
+        found = network(spot)
+    assert found[PLACES].shape == (1, 20 * 15, 3)
+    assert found[LOG_WEIGHTS].exp().sum().item() == pytest.approx(1, abs=1e-5)
+    pixel = project(found[TRANSLATION][0], torch.from_numpy(first.camera.matrix).float())[0]
+    assert (pixel - torch.tensor([104.0, 64.0])).abs().max() < 8.1
+    assert 0.5 <= found[TRANSLATION][0, 0, 2] <= 1.5
+
+
+def test_first_look_loss_rewards_one_right_hypothesis(world: GazeWorld) -> None:
+    first: FirstLook = world.looks[0]
+    true = first.sample(3, (1,))
+    places = torch.tensor([0.5, 0.4, 1.2]).expand(3, 10, 3).clone()
+    places[:, 4] = true[TRANSLATION][:, 0]
+    even = torch.full((3, 10), 0.1).log()
+    certain = even.clone()
+    certain[:, 4] = 2.0
+    losses = [
+        float(first.code_loss({PLACES: places, LOG_WEIGHTS: weights.log_softmax(-1)}, true))
+        for weights in (even, certain)
+    ]
+    assert losses[1] < losses[0] < 2.4  # log 10 where one of ten is right
+    places[:, 4] += 0.3
+    assert float(first.code_loss({PLACES: places, LOG_WEIGHTS: even}, true)) > losses[0] + 1
+
+
+def test_gradients_reach_every_weight_of_both_looks(world: GazeWorld, tmp_path) -> None:
+    for look in world.looks:
+        network = look.network(NetworkConfig())
+        code = look.sample(4, (1,))
+        look.code_loss(network(look.render(code)), code).backward()
+        assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
+
+
+def test_batches_of_crops_give_what_rendering_needs_and_no_label(world: GazeWorld, tmp_path) -> None:
+    batch = world.looks[1].source("train", 0, with_code=False, cache=tmp_path).batch(3, 4)
+    assert batch.code is None
+    assert set(batch.given) == {ASSUMED_M}
+    labelled = world.looks[1].source("train", 0, with_code=True, cache=tmp_path).batch(3, 4)
+    assert torch.equal(world.looks[1].render(index(labelled.code, slice(None)), labelled.backgrounds), batch.images)
+
+
+class Bright(Look):
+    """A look at crops that is as sure as its crop is bright, and says what it sees is in the middle."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = nn.Identity()
+
+    def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        count = len(features)
+        return {}, {
+            TRANSLATION: torch.tensor([0.0, 0, 1]).expand(count, 1, 3),
+            ROTATION_6D: torch.tensor([1.0, 0, 0, 0, 1, 0]).expand(count, 1, 6),
+            CONFIDENCE: features.mean((1, 2, 3)).view(count, 1, 1),
+            LIGHT: torch.zeros(count, 3),
+        }
+
+
+def test_of_several_candidates_the_surest_is_answered(world: GazeWorld) -> None:
+    """Two frames, each bright at another of three candidates."""
+    candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8], [0.0, 0.2, 1.2]]).expand(2, 3, 3)
+    pixels = project(candidates, torch.from_numpy(K).float()[None]).round().int()
+    frames = torch.zeros(2, 3, 480, 640)
+    for image, chosen in enumerate((2, 0)):
+        u, v = pixels[image, chosen].tolist()
+        frames[image, :, v - 30 : v + 31, u - 30 : u + 31] = 1.0
+    found = world.assemble([Told({CANDIDATES: candidates}), Bright()])(frames)
+    assert torch.allclose(found[TRANSLATION][:, 0], candidates[0, [2, 0]], atol=1e-5)
+    assert found[CONFIDENCE].min() > 0.1
+
+
+def test_candidates_are_apart_and_the_likeliest_comes_first(world: GazeWorld) -> None:
+    first = world.looks[0]
+    network = first.network(NetworkConfig())
+    weights = torch.full((1, 20 * 15), 1e-6)
+    chosen = torch.tensor([5 * 20 + 5, 5 * 20 + 6, 10 * 20 + 12, 2 * 20 + 17])
+    weights[0, chosen] = torch.tensor([0.5, 0.3, 0.15, 0.05])
+    places = torch.cat([network.cells, torch.ones(300, 1)], dim=1)[None]
+    found = network._candidates(places, weights)
+    assert found.shape == (1, NUM_CANDIDATES, 3)
+    assert torch.equal(found[0, :3], places[0, chosen[[0, 2, 3]]])
+    # Cells far from each other that mean one place are one candidate.
+    places[0, chosen[2]] = places[0, chosen[0]] + 0.01
+    found = network._candidates(places, weights)
+    assert torch.equal(found[0, :2], places[0, chosen[[0, 3]]])

@@ -1,0 +1,166 @@
+"""The tables of the paper: rows from evaluations, ratios, what is kept, and the command that fills them."""
+
+import fcntl
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from curio_train.cli import _parse
+from curio_train.errors import DataError
+from curio_train.evaluation.results import collect, load_results, merge, save_results
+from curio_train.evaluation.results_tables import markdown, plot
+from curio_train.learning.configuration import to_json
+
+ROOT = Path(__file__).parents[2]
+
+
+def evaluation(method: str, seed: int = 0, **found: Any) -> dict[str, Any]:
+    metrics = {"scene_error": 2.0, "novel_view_dssim": 0.1, "position_mm": 300.0, "color_mse": 0.05}
+    return {
+        "world": "spheres",
+        "method": method,
+        "labels": 1.0 if method == "super" else 0.0,
+        "seed": seed,
+        "images_seen": 640,
+        "training_seconds": 9.0,
+        "commit": "c0ffee" * 6,
+        "machine": "a machine",
+        **found,
+        "metrics": metrics | found.get("metrics", {}),
+    }
+
+
+def test_a_row_is_the_mean_of_its_seeds_and_its_ratio_to_full_supervision() -> None:
+    half = evaluation("super", labels=0.5)
+    runs = [evaluation("our", seed, metrics={"scene_error": 3.0 + seed}) for seed in (1, 0)]
+    rows = merge({}, collect([*runs, evaluation("super"), half]))["spheres"]
+    assert list(rows) == ["super_1.0", "our"]  # 0.5 is no row of the table
+    our = rows["our"]
+    assert (our["seeds"], our["para"], our["para_ratio"], our["img_ratio"]) == ([0, 1], 3.5, 1.75, 1.0)
+    assert our["by_seed"]["para"] == [3.0, 4.0]
+    assert our["per_parameter"] == {"position_m": pytest.approx(0.3), "color_mse": 0.05}
+    assert our["per_parameter_ratio"] == {"position_m": 1.0, "color_mse": 1.0}
+    assert (our["label_free"], our["synthetic_labels"]) == (True, False)
+    assert (rows["super_1.0"]["label_free"], rows["super_1.0"]["para_ratio"]) == (False, 1.0)
+
+
+def test_shares_of_labels_are_rows_of_their_own() -> None:
+    rows = merge({}, collect([evaluation("super", labels=share) for share in (1.0, 0.1, 0.05)]))["spheres"]
+    assert list(rows) == ["super_1.0", "super_0.1", "super_0.05"]
+
+
+def test_without_the_reference_there_is_no_ratio_yet() -> None:
+    rows = merge({}, collect([evaluation("sleep")]))["spheres"]
+    assert (rows["sleep"]["para"], rows["sleep"]["para_ratio"]) == (2.0, None)
+    assert rows["sleep"]["synthetic_labels"]
+    assert rows["sleep"]["per_parameter_ratio"] == {"position_m": None, "color_mse": None}
+
+
+def test_rows_of_another_budget_are_of_another_table() -> None:
+    old = merge({}, collect([evaluation("super"), evaluation("our")]))
+    same = merge(old, collect([evaluation("noncur", metrics={"scene_error": 4.0})]))["spheres"]
+    assert list(same) == ["super_1.0", "noncur", "our"]
+    assert same["noncur"]["para_ratio"] == 2.0
+    other = merge(old, collect([evaluation("noncur", images_seen=1280)]))["spheres"]
+    assert list(other) == ["noncur"]
+    with pytest.raises(DataError, match=r"our saw \[640, 1280\] images; a row needs one budget"):
+        collect([evaluation("our"), evaluation("our", 1, images_seen=1280)])
+
+
+def test_a_row_of_fewer_seeds_does_not_replace_one_of_more() -> None:
+    old = merge({}, collect([evaluation("our", seed) for seed in range(3)]))
+    assert merge(old, collect([evaluation("our")]))["spheres"]["our"]["seeds"] == [0, 1, 2]
+    new = collect([evaluation("our", seed, metrics={"scene_error": 9.0}) for seed in range(3)])
+    assert merge(old, new)["spheres"]["our"]["para"] == 9.0
+
+
+def test_tables_show_ours_beside_the_papers(tmp_path: Path) -> None:
+    runs = [evaluation("super"), evaluation("our", metrics={"scene_error": 3.0}), evaluation("wake_sleep")]
+    results = merge({}, collect(runs))
+    text = markdown(results, "make results")
+    para = text.partition("## Table 2: Para")[2].partition("##")[0]
+    assert "| world | `our` | `wake_sleep` |" in para
+    assert "| spheres | 1.5 (1.87) | 1 |" in para
+    assert "### Position" in text
+    assert "### Rotation" not in text
+    plot(results, tmp_path / "worlds.png")
+    assert (tmp_path / "worlds.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("content", ["", "[1]", '{"spheres": {"our": {"img": 1}}}', '{"spheres": 3}'])
+def test_a_damaged_file_of_results_is_refused(tmp_path: Path, content: str) -> None:
+    file = tmp_path / "worlds.json"
+    assert load_results(file) == {}
+    file.write_text(content)
+    with pytest.raises(DataError, match="holds no results of worlds"):
+        load_results(file)
+
+
+def test_results_are_kept_whole(tmp_path: Path) -> None:
+    results = merge({}, collect([evaluation("super")]))
+    save_results(tmp_path / "docs" / "worlds.json", results)
+    assert load_results(tmp_path / "docs" / "worlds.json") == results
+
+
+def command(folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+    places = ["--runs", str(folder / "runs"), "--results", str(folder / "worlds.json")]
+    line = [sys.executable, str(ROOT / "benchmarks" / "results.py"), *places, *flags]
+    return subprocess.run(line, capture_output=True, text=True, timeout=600, check=False)
+
+
+def test_the_command_fills_the_table_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    flags = ["--only", "circles", "--methods", "super_1.0", "noncur", "--images", "64", "--seeds", "1"]
+    busy = tmp_path / "runs" / "circles-laptop-64" / "noncur-0.log"
+    busy.parent.mkdir(parents=True)
+    with busy.open("wb") as log:
+        fcntl.flock(log, fcntl.LOCK_EX)
+        first = command(tmp_path, *flags)
+    assert first.returncode == 1
+    assert "circles noncur seed 0, 64 images: another process is at work on it" in first.stderr
+    assert list(json.loads((tmp_path / "worlds.json").read_text())["circles"]) == ["super_1.0"]
+    second = command(tmp_path, *flags)
+    assert second.returncode == 0, second.stderr
+    assert "1 of 2 runs are done" in second.stderr
+    rows = json.loads((tmp_path / "worlds.json").read_text())["circles"]
+    assert list(rows) == ["super_1.0", "noncur"]
+    assert rows["noncur"]["images_seen"] == 64
+    assert rows["noncur"]["para_ratio"] == pytest.approx(rows["noncur"]["para"] / rows["super_1.0"]["para"])
+    assert "| circles |" in (tmp_path / "worlds.md").read_text()
+    assert (busy.parent / "noncur-0" / "report.html").exists()
+
+
+def test_an_unknown_row_is_refused(tmp_path: Path) -> None:
+    done = command(tmp_path, "--methods", "ours")
+    assert done.returncode == 2
+    assert "--methods ours: there is no such row" in done.stderr
+
+
+def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("curiosity", ROOT / "benchmarks" / "curiosity.py")
+    assert spec is not None
+    assert spec.loader is not None
+    sweep = importlib.util.module_from_spec(spec)
+    sys.modules["curiosity"] = sweep  # where its dataclass looks itself up
+    spec.loader.exec_module(sweep)
+    runs = sweep.plan(sweep.Settings(world="circles", images=640, runs=tmp_path))
+    assert len({run.folder for run in runs}) == len(runs) == len(sweep.VARIANTS)
+    configs = {run.name: to_json(_parse(["circles", "--images", str(run.images), *run.flags]).config) for run in runs}
+    plain = flat(configs["noncur"])
+    changes = {
+        name: {key for key, value in flat(config).items() if value != plain[key]}
+        for name, config in configs.items()
+        if config["method"] == "noncur" and name != "noncur"
+    }
+    assert changes.pop("noncur, small batches") == {"recipe.batch_size", "recipe.micro_batch_size"}
+    assert all(len(changed) == 1 for changed in changes.values()), changes
+    ours, instance = flat(configs["our"]), flat(configs["our, instance norm"])
+    assert {key for key in ours if ours[key] != instance[key]} == {"network.critic_normalisation"}
+
+
+def flat(config: dict[str, Any]) -> dict[str, Any]:
+    nested = {f"{key}.{name}": value for key in ("recipe", "network") for name, value in config[key].items()}
+    return {key: value for key, value in config.items() if key not in ("recipe", "network")} | nested

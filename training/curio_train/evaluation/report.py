@@ -1,0 +1,149 @@
+"""``report.html`` of a run: one file with its pictures inside, which opens without a server.
+
+After training it shows training images and how far their re-renderings are from them, for which no label is needed;
+``curio-eval`` writes it again with the images it scored and every error it found.
+"""
+
+import importlib.metadata
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from jinja2 import Environment, PackageLoader, TemplateError
+from torch import Tensor
+
+from curio_train.errors import ReportError
+from curio_train.evaluation import report_figures as figures
+from curio_train.evaluation.subject import Subject, load_subject
+from curio_train.evaluation.tables import label
+from curio_train.learning.checkpoint import CONFIG_FILE
+from curio_train.learning.configuration import world_name
+from curio_train.learning.progress import read_history
+from curio_train.learning.provenance import Sitting, sittings
+from curio_train.metrics.images import dssim
+from curio_train.scene_code import CONFIDENCE
+from curio_train.worlds.base import Split
+
+REPORT_FILE = "report.html"
+_NUM_SAMPLES = 6
+_NUM_PHOTOGRAPHS = 24
+_NUM_COMPARED = 48  # training images whose re-renderings are compared with them
+_LIBRARIES = ("curio-pose", "torch", "mitsuba", "drjit", "numpy")
+
+
+def report_training(run: Path, cache: Path) -> None:
+    """The report of a run that has just ended. Opens no label file.
+
+    Raises:
+        CurioError: The report could not be made. The run is none the worse.
+    """
+    write_report(run, load_subject(run), "train", cache)
+
+
+def write_report(
+    run: Path,
+    subject: Subject,
+    split: Split,
+    cache: Path,
+    errors: Mapping[str, Tensor] | None = None,
+    evaluation: Mapping[str, Any] | None = None,
+) -> None:
+    """Draw and write the report.
+
+    Args:
+        run: The run folder.
+        subject: Its network.
+        split: Where the sample images are from.
+        cache: Where worlds keep their image sets.
+        errors: Each single error by metric, see :func:`~curio_train.evaluation.scores.scene_errors`; without them the
+            differences of images and re-renderings are shown.
+        evaluation: What ``curio-eval`` found, if it did.
+
+    Raises:
+        ReportError: Something about it failed.
+    """
+    try:
+        html = _page(run, subject, split, cache, errors, evaluation)
+        draft = run / (REPORT_FILE + ".tmp")
+        draft.write_text(html, encoding="utf-8")
+        draft.replace(run / REPORT_FILE)
+    except (OSError, LookupError, RuntimeError, TemplateError, TypeError, ValueError, MemoryError) as exc:
+        raise ReportError(
+            f"{run / REPORT_FILE} could not be written ({type(exc).__name__}: {exc}); the run itself is whole, and "
+            f"curio-eval {run} writes its report anew"
+        ) from exc
+
+
+@torch.no_grad()
+def _page(
+    run: Path,
+    subject: Subject,
+    split: Split,
+    cache: Path,
+    errors: Mapping[str, Tensor] | None,
+    evaluation: Mapping[str, Any] | None,
+) -> str:
+    world, config = subject.world, subject.config
+    source = world.source(split, config.seed, with_code=False, cache=cache)
+    batch = source.batch(0, _NUM_SAMPLES if errors else _NUM_COMPARED)
+    code = subject.predict((batch.images.clamp(0, 1) * 255).round().byte())
+    rendered = world.render(code, batch.backgrounds).clamp(0, 1)
+    columns = (batch.images, rendered, world.novel_view(code).clamp(0, 1))
+    shown = errors or {"image_dssim": dssim(rendered, batch.images)}
+    made = sittings(run)
+    pages = Environment(loader=PackageLoader("curio_train.evaluation", ""), autoescape=True)
+    return pages.get_template("report.html.jinja").render(
+        title=f"{world_name(config)}, {config.method}, seed {config.seed}",
+        facts=_facts(subject, made),
+        sittings=made,
+        split=split,
+        num_images=evaluation["num_images"] if evaluation else len(batch.images),
+        samples=figures.samples([column[:_NUM_SAMPLES] for column in columns]),
+        photographs=_photographs(subject),
+        curves=figures.curves(read_history(run)),
+        histograms=figures.histograms({label(name): values for name, values in shown.items()}),
+        scores=_scores(evaluation or {}),
+        configuration=(run / CONFIG_FILE).read_text(encoding="utf-8"),
+    )
+
+
+def _photographs(subject: Subject) -> str:
+    """Photographs beside what was found in them, the least certain first; empty where the world has none."""
+    images = subject.world.photographs(_NUM_PHOTOGRAPHS)
+    if images is None:
+        return ""
+    code = subject.predict((images * 255).round().byte())
+    order = code[CONFIDENCE].flatten().argsort() if CONFIDENCE in code else torch.arange(len(images))
+    drawn = subject.world.render(code | {CONFIDENCE: torch.ones(len(images), 1, 1)}, images).clamp(0, 1)
+    return figures.samples((images[order], drawn[order]), ("photograph", "what was found, drawn over it"))
+
+
+def _facts(subject: Subject, made: list[Sitting]) -> dict[str, str]:
+    """What was done, when, where and with what."""
+    minutes = subject.training_seconds / 60
+    rate = subject.images_seen / max(subject.training_seconds, 1e-9)
+    versions = {name: importlib.metadata.version(name) for name in _LIBRARIES}
+    return {
+        "images seen": f"{subject.images_seen:,}",
+        "training time": f"{minutes:.1f} minutes, {rate:.0f} images/s",
+        "started": made[0].started,
+        "last sitting": made[-1].started,
+        "machine": made[-1].machine,
+        "system": f"{platform.system()} {platform.release()}, Python {platform.python_version()}",
+        "libraries": ", ".join(f"{name} {number}" for name, number in versions.items()),
+    }
+
+
+def _scores(evaluation: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Rows of metric, this network's figure, the untrained one's; real frames have only the first."""
+    untrained = evaluation.get("untrained", {})
+    rows = [(label(name), f"{value:.4g}", f"{untrained[name]:.4g}") for name, value in _metrics(evaluation).items()]
+    real = evaluation.get("real", {})
+    return rows + [(f"real frames: {label(name).strip()}", f"{v:.4g}", "") for name, v in _metrics(real).items()]
+
+
+def _metrics(scored: Mapping[str, Any]) -> Mapping[str, float]:
+    found: Mapping[str, float] = scored.get("metrics", {})
+    return found

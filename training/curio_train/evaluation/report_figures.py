@@ -1,0 +1,85 @@
+"""The pictures of a report, each as a data URI that an ``<img>`` can hold."""
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from torch import Tensor
+
+_DPI = 90
+_PANELS_A_ROW = 3
+HEADINGS = ("input", "prediction", "novel view")
+_NOT_LOSSES = ("step", "images", "seconds")
+
+
+def samples(columns: Sequence[Tensor], headings: Sequence[str] = HEADINGS) -> str:
+    """A grid with a row an image, such as input, re-rendering, the predicted scene from the novel view.
+
+    Args:
+        columns: Each [num, 3, height, width] in [0, 1].
+        headings: One a column.
+    """
+    num = len(columns[0])
+    figure = Figure(figsize=(6, 2 * num), layout="constrained")
+    panels = figure.subplots(num, len(columns), squeeze=False)
+    for number, (heading, column) in enumerate(zip(headings, columns, strict=True)):
+        panels[0, number].set_title(heading)
+        for panel, image in zip(panels[:, number], column, strict=True):
+            panel.imshow(image.permute(1, 2, 0).cpu().numpy(), interpolation="nearest")
+            panel.set_axis_off()
+    return _uri(figure)
+
+
+def curves(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Each loss over the images seen.
+
+    Args:
+        rows: Of ``history.jsonl``; may be none, of a run too short for a line.
+    """
+    names = sorted({name for row in rows for name in row} - {*_NOT_LOSSES})
+    figure, panels = _panels(max(1, len(names)))
+    for panel, name in zip(panels, names, strict=False):
+        seen = [(row["images"], row[name]) for row in rows if name in row]
+        panel.plot(*np.array(seen).T, color="#4285f4", linewidth=1.2, marker="." if len(seen) < 3 else None)
+        panel.set(title=f"loss: {name}", xlabel="images seen")
+        if min(value for _, value in seen) > 0:
+            panel.set_yscale("log")
+    if not names:
+        panels[0].text(0.5, 0.5, "too few steps for a curve", ha="center", va="center")
+        panels[0].set_axis_off()
+    return _uri(figure)
+
+
+def histograms(errors: Mapping[str, Tensor]) -> str:
+    """How each error is distributed; the dashed line is the median."""
+    figure, panels = _panels(len(errors))
+    for panel, (name, values) in zip(panels, errors.items(), strict=True):
+        found = values.detach().double().flatten().cpu().numpy()
+        found = found[np.isfinite(found)]
+        panel.set(title=name.strip(), ylabel="count")
+        if not len(found):
+            continue
+        panel.hist(found, bins=40, range=(min(0.0, found.min()), max(np.quantile(found, 0.99), 1e-9)), color="#34a853")
+        panel.axvline(float(np.median(found)), color="black", linestyle="--", linewidth=1)
+    return _uri(figure)
+
+
+def _panels(count: int) -> tuple[Figure, list[Any]]:
+    """A figure with that many axes, the rest of its grid empty."""
+    across = min(count, _PANELS_A_ROW)
+    down = -(-count // across)
+    figure = Figure(figsize=(4 * across, 2.6 * down), layout="constrained")
+    axes = figure.subplots(down, across, squeeze=False).ravel().tolist()
+    for spare in axes[count:]:
+        spare.set_axis_off()
+    return figure, axes[:count]
+
+
+def _uri(figure: Figure) -> str:
+    """As PNG; a figure of its own class needs no window and no global state."""
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=_DPI)
+    return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode()

@@ -1,0 +1,103 @@
+"""Two looks as one network: a place from the whole frame, then pose and light from a crop around it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from curio_train.camera import gaze_at, sampling_grid
+from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.networks.look import Look
+from curio_train.networks.places import CANDIDATES
+from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
+
+_OVERSAMPLING = 2  # a crop is sampled at so many points a pixel and side, then averaged: no aliasing of near objects
+
+
+@dataclass(frozen=True, eq=False)
+class Optics:
+    """How a frame becomes a crop.
+
+    Attributes:
+        matrix: K of the frames, [3, 3].
+        diameter_m: Of the object.
+        near_m: Nearest distance that a place is taken for.
+        first_look_share: Frame pixels a pixel of the first look, each way.
+        crop_px: Side of the crop.
+        fill: Share of it that the diameter spans at the assumed depth.
+    """
+
+    matrix: np.ndarray
+    diameter_m: float
+    near_m: float
+    first_look_share: int
+    crop_px: int
+    fill: float
+
+
+class GazeNetwork(nn.Module):
+    """Whole frame to scene code, all in one graph.
+
+    A glance at each of the likeliest places; where the second look is surest of what it reads, it looks once more, at
+    a crop placed by its own answer.
+
+    Attributes:
+        first: Reads places from frames at low resolution.
+        second: Reads poses and light from crops.
+        calibration: Slope and offset of the confidence's logit, set when training is done.
+    """
+
+    def __init__(self, first: Look, second: Look, optics: Optics) -> None:
+        super().__init__()
+        self.first, self.second = first, second
+        self._optics = optics
+        self._matrix: Tensor
+        self.calibration: Tensor
+        self.register_buffer("calibration", torch.tensor([1.0, 0.0]))
+        self.register_buffer("_matrix", torch.from_numpy(optics.matrix).float()[None], persistent=False)
+
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
+        """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
+        candidates = self.first(F.avg_pool2d(images, self._optics.first_look_share))[CANDIDATES]
+        surest = _surest(self._glance(images, candidates), candidates.shape[1])
+        code = self._glance(images, surest[TRANSLATION])
+        slope, offset = self.calibration
+        return code | {CONFIDENCE: torch.sigmoid(slope * torch.logit(code[CONFIDENCE], 1e-6) + offset)}
+
+    def _glance(self, images: Tensor, places: Float[Tensor, "batch num 3"]) -> dict[str, Tensor]:
+        """Look at crops around places, and turn what is read there back into the frame's camera.
+
+        Returns:
+            Codes of all crops, those of one image after the other.
+        """
+        optics, place = self._optics, places.flatten(0, 1)
+        depth = place.norm(dim=1, keepdim=True).clamp(min=optics.near_m)  # along the crop camera's axis
+        matrix = self._matrix.expand(place.shape[0], 3, 3)
+        side = _OVERSAMPLING * optics.crop_px
+        gaze = gaze_at(place, optics.fill * side * depth[:, 0] / optics.diameter_m, side, matrix)
+        grid = sampling_grid(gaze, matrix, side, images.shape[3], images.shape[2])
+        # The crops of an image in one tall grid: no frame is copied.
+        tall = grid.view(-1, places.shape[1] * side, side, 2)
+        fine = F.grid_sample(images, tall, padding_mode="border", align_corners=False)
+        crops = fine.unflatten(2, (places.shape[1], side)).transpose(1, 2).flatten(0, 1)
+        code = self.second(F.avg_pool2d(crops, _OVERSAMPLING))
+        relative = code[TRANSLATION][:, 0]
+        seen = torch.cat([relative[:, :2] * optics.diameter_m, relative[:, 2:] * depth], dim=-1)
+        back = gaze.rotation.transpose(1, 2)
+        rotation = back @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
+        return {name: code[name] for name in (COLOR,) if name in code} | {
+            TRANSLATION: (back @ seen[..., None])[:, None, :, 0],
+            ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None],
+            CONFIDENCE: code[CONFIDENCE],
+            LIGHT: (back @ code[LIGHT][..., None])[..., 0],
+        }
+
+
+def _surest(code: dict[str, Tensor], num: int) -> dict[str, Tensor]:
+    """Of ``num`` codes an image the one with the highest confidence."""
+    best = code[CONFIDENCE].reshape(-1, num).argmax(dim=1, keepdim=True)
+    rows = (torch.arange(best.shape[0], device=best.device)[:, None] * num + best)[:, 0]
+    return {name: value[rows] for name, value in code.items()}

@@ -1,0 +1,104 @@
+"""A part of one's own: one mesh, one camera, six degrees of freedom, no labels.
+
+Images are rendered without end, as for LineMOD; what a data set's authors publish there is asked for or found out here:
+
+* distances are given (0.3 to 1 m unless said otherwise), the part's origin is anywhere in the frame;
+* it is seen from all sides alike, or from above alone;
+* its symmetries are found from its shape; poses that differ by one count as equal, whatever is painted on it;
+* a mesh without colours has another colour in each image, of any saturation, which is read with the pose;
+* light is that of LineMOD: from the camera's half space, over an ambient radiance of 0.4.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from curio_train.camera import Intrinsics, load_intrinsics
+from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
+from curio_train.data.meshes import Mesh, load_mesh
+from curio_train.data.photographs import Photographs, read_frame
+from curio_train.data.plate import PLATE_SHARE, MixedBackgrounds, PlateBackgrounds
+from curio_train.data.symmetries import find_symmetries
+from curio_train.errors import UsageError
+from curio_train.geometry import random_rotations
+from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.gaze import LARGEST_LOG_SCALE, GazeWorld
+from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.single_object import Object
+from curio_train.worlds.views import upper_views
+
+
+class Capture(GazeWorld):
+    """One part before the camera that took a folder of photographs."""
+
+    def __init__(self, thing: Object, images: Path) -> None:
+        """Nothing of the photographs is read before they are asked for."""
+        super().__init__("capture", thing)
+        self._images = images
+
+    def photographs(self, count: int) -> Tensor:
+        """Spread over the folder, without the lens's distortion, in the canonical size."""
+        paths = Photographs(self._images).paths
+        chosen = [paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))]
+        size = (self.camera.width, self.camera.height)
+        frames = (read_frame(path, self.object.camera) for path in chosen)
+        resized = [cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames]
+        return torch.from_numpy(np.stack(resized)).permute(0, 3, 1, 2).float() / 255
+
+
+def build(options: CaptureOptions) -> Capture:
+    """The world of one part.
+
+    Raises:
+        UsageError: The part would reach into the camera.
+        MeshError: The mesh is missing or broken.
+        CameraError: The camera file is missing or describes no camera.
+    """
+    mesh, camera = load_mesh(options.mesh, options.mesh_unit), load_intrinsics(options.camera)
+    _refuse_collision(options, mesh)
+    found = find_symmetries(mesh)
+    kind = ObjectKind(
+        options.mesh.stem, (0,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous
+    )
+    thing = Object(
+        kind,
+        mesh,
+        camera,
+        options.near_m,
+        options.far_m,
+        partial(_backgrounds, options, camera),
+        upper_views if options.upright else random_rotations,
+        painted=mesh.texture is None and mesh.vertex_colors_srgb is None,
+    )
+    return Capture(thing, options.photos)
+
+
+def _refuse_collision(options: CaptureOptions, mesh: Mesh) -> None:
+    """The nearest that a crop may have to be thought at is nearer than the nearest place by the first look's error."""
+    reach = float(np.linalg.norm(mesh.vertices_m, axis=1).max())
+    least = reach * float(np.exp(LARGEST_LOG_SCALE))
+    if options.near_m > least:
+        return
+    raise UsageError(
+        f"--near-m {options.near_m:g}: {options.mesh} reaches {reach:.3g} m from its origin, so the camera would be "
+        f"inside it; expected more than {least:.3g} m. If the part is smaller than that, check --mesh-unit, and that "
+        "the origin lies within the part (curio-doctor --mesh)"
+    )
+
+
+def _backgrounds(options: CaptureOptions, camera: Intrinsics, cache: Path) -> Backgrounds:
+    """The plate mixed with clutter, photographs, or clutter alone.
+
+    Raises:
+        DataError: A photograph is missing, broken or of another size, or the cache cannot be written.
+    """
+    if options.backgrounds is not None:
+        return PhotographBackgrounds(Photographs(options.backgrounds))
+    if options.background is None:
+        return ClutterBackgrounds.cached(cache)
+    plate = PlateBackgrounds.read(options.background, camera)  # before half a minute is spent on clutter
+    return MixedBackgrounds(plate, ClutterBackgrounds.cached(cache), PLATE_SHARE)

@@ -1,0 +1,265 @@
+"""A gaze at one object: a first look at the whole frame says where it is, a second at a crop says the rest.
+
+On whole frames a full rotation is slow to learn even with labels; on crops it takes minutes. So each look is a world of
+its own, with its own images and code, and both are learned by the same loop in turns. What the second look sees is
+rendered as a camera that is turned to the object would see it: no frame is ever cropped while learning.
+
+Constants fixed before any training:
+
+* the first look sees a quarter of the frame's resolution;
+* a crop of 64 pixels in which the object's diameter spans 0.6 of the side, if it is as far as the first look says;
+* the first look may be off by a quarter of the diameter to each side, and by a quarter (as e^±0.25) in distance;
+* in one crop of seven there is no object.
+
+Confidence is the probability that ADD is below a tenth of the diameter: the second look learns to foretell whether its
+own answers are right. Where there is no object none is.
+"""
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from curio_train.camera import Intrinsics
+from curio_train.config import NetworkConfig
+from curio_train.data.backgrounds import Backgrounds
+from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.metrics.poses import ADD_THRESHOLD, symmetry_poses
+from curio_train.networks.crop import SURFACE, SURFACE_SHARE, CropNetwork
+from curio_train.networks.gaze import GazeNetwork, Optics
+from curio_train.networks.look import Look
+from curio_train.networks.places import LOG_WEIGHTS, PLACES, PlaceNetwork
+from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
+from curio_train.worlds.base import Camera, World
+from curio_train.worlds.calibration import calibrate
+from curio_train.worlds.single_object import (
+    Object,
+    SingleObjectWorld,
+    paint,
+    pose_layout,
+    position_field,
+    resized,
+    scene,
+)
+from curio_train.worlds.surface import SurfaceMap
+from curio_train.worlds.views import lights, turned_towards
+
+ASSUMED_M = "assumed_depth_m"
+"""How far the first look says the object is [batch, 1]: known beside the code, never predicted."""
+
+LONGEST_SIDE_PX = 640
+FIRST_LOOK_SHARE = 4
+CROP_PX, FILL = 64, 0.6
+LARGEST_OFFSET, LARGEST_LOG_SCALE = 0.25, 0.25
+ABSENT_SHARE = 1 / 7
+TURNS = (0, 1, 1)
+"""Which look each step teaches: rotation takes longer than place."""
+
+_PLACE_SCALE_PX = 2.0  # of the first look's pixels: what counts as near
+_DEPTH_SCALE = 0.1  # of the logarithm
+_NUM_POINTS = 128
+_DEPTH_WEIGHT = 3.0  # a share of the distance is several diameters: what ADD fails on first
+_LIGHT_WEIGHT = 0.05
+_COLOR_WEIGHT = 0.1  # light and exposure leave it uncertain
+_CONFIDENCE_WEIGHT = 0.2
+_SYMMETRY_STEP = 0.1  # continuous symmetries count as one in so many parts of a turn: 31
+
+
+def gaze_camera(frame: Intrinsics) -> Camera:
+    """The canonical camera of a gaze: the frame's own, at most 640 pixels long, in whole pixels of the first look."""
+    scale = min(1.0, LONGEST_SIDE_PX / max(frame.width, frame.height))
+    step = 2 * FIRST_LOOK_SHARE
+    return resized(frame, step * round(frame.width * scale / step), step * round(frame.height * scale / step))
+
+
+class GazeWorld(SingleObjectWorld):
+    """One object anywhere in a frame that is read at two looks."""
+
+    def __init__(self, name: str, thing: Object) -> None:
+        """Name it as it is called on the command line."""
+        self.name = name
+        camera = gaze_camera(thing.camera)
+        super().__init__(thing, camera, pose_layout(position_field(thing), confidence=True, color=thing.painted))
+        self._looks = FirstLook(thing, camera), SecondLook(thing)
+
+    @property
+    def looks(self) -> tuple[World, ...]:
+        """The whole frame and the crop."""
+        return self._looks
+
+    @property
+    def turns(self) -> tuple[int, ...]:
+        """Two steps for the crop after each for the frame."""
+        return TURNS
+
+    def finish(self, network: nn.Module, cache: Path) -> None:
+        """The confidence is calibrated."""
+        calibrate(network, self, cache)
+
+    def assemble(self, networks: Sequence[Look]) -> nn.Module:
+        """Both looks in one."""
+        first, second = networks
+        assert self.camera.matrix is not None
+        optics = Optics(
+            self.camera.matrix, self.object.kind.diameter_m, self.object.near_m, FIRST_LOOK_SHARE, CROP_PX, FILL
+        )
+        return GazeNetwork(first, second, optics)
+
+
+class FirstLook(SingleObjectWorld):
+    """Whole frames at low resolution, of which only the place is read."""
+
+    name = "first look"
+
+    def __init__(self, thing: Object, frame: Camera) -> None:
+        camera = resized(thing.camera, frame.width // FIRST_LOOK_SHARE, frame.height // FIRST_LOOK_SHARE)
+        super().__init__(thing, camera, Layout((position_field(thing),)))
+
+    def network(self, config: NetworkConfig) -> PlaceNetwork:
+        """Hypotheses on a grid."""
+        assert self.camera.matrix is not None
+        return PlaceNetwork(self.layout[TRANSLATION], self.camera.matrix, self.camera.width, self.camera.height)
+
+    def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
+        """Negative log likelihood of the true place among the weighted hypotheses (a mixture density, Bishop 1994).
+
+        A hypothesis that is near is made nearer and more certain; those far away only lose weight. So no cell has to be
+        named as the right one, and a second red thing in the picture gets a hypothesis of its own instead of pulling a
+        mean between the two.
+        """
+        places, place = predicted[PLACES], true[TRANSLATION]
+        slope = places[..., :2] / places[..., 2:] - place[..., :2] / place[..., 2:]
+        depth = places[..., 2].log() - place[..., 2].log()
+        distance = slope.norm(dim=-1) / self._slope_scale + depth.abs() / _DEPTH_SCALE
+        return -(predicted[LOG_WEIGHTS] - distance).logsumexp(dim=-1).mean()
+
+    @property
+    def _slope_scale(self) -> float:
+        assert self.camera.matrix is not None
+        return _PLACE_SCALE_PX / float(self.camera.matrix[0, 0])
+
+
+class SecondLook(SingleObjectWorld):
+    """Crops around the object, read as position relative to the crop, rotation and light in the crop's camera.
+
+    The position is (x, y) in diameters and z in assumed depths, so that the crop's K is the same for all: focal
+    length FILL · CROP_PX, centre in the middle. The real crop camera has FILL · CROP_PX · assumed depth / diameter.
+    """
+
+    name = "second look"
+    given = (ASSUMED_M,)
+
+    def __init__(self, thing: Object) -> None:
+        middle = (CROP_PX - 1) / 2
+        focal = FILL * CROP_PX
+        camera = Camera(CROP_PX, CROP_PX, np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]]))
+        reach = 1.5 * LARGEST_OFFSET, float(np.exp(1.5 * LARGEST_LOG_SCALE))
+        position = Field(
+            TRANSLATION,
+            3,
+            unit="1",
+            frame="crop",
+            activation="perspective",
+            lower=(-reach[0], -reach[0], 1 / reach[1]),
+            upper=(reach[0], reach[0], reach[1]),
+        )
+        super().__init__(thing, camera, pose_layout(position, confidence=True, color=thing.painted))
+
+    def network(self, config: NetworkConfig) -> CropNetwork:
+        """A small residual network."""
+        return CropNetwork(self.layout, CROP_PX)
+
+    def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:
+        """Objects near the middle of crops, as a first look that errs leaves them."""
+        random = np.random.default_rng(seed)
+        offset = random.uniform(-LARGEST_OFFSET, LARGEST_OFFSET, (count, 2))
+        scale = np.exp(random.uniform(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE, (count, 1)))
+        assumed = torch.from_numpy(random.uniform(self.object.near_m, self.object.far_m, (count, 1))).float()
+        place = torch.from_numpy(np.concatenate([offset * scale, scale], axis=1)).float()
+        rotation = turned_towards(self._metres(place, assumed), self.object.views(count, random))
+        code = scene(place, rotation, lights(count, random)) | {ASSUMED_M: assumed}
+        code |= paint(self.object, count, random)
+        code[CONFIDENCE] = torch.from_numpy(random.random((count, 1, 1)) >= ABSENT_SHARE).float()
+        return code
+
+    def backgrounds(self, cache: Path) -> Backgrounds:
+        """Such parts of them as crops show."""
+        focal_per_width = self.object.camera.matrix[0, 0] / self.object.camera.width
+        side_m = self.object.kind.diameter_m / FILL
+        largest, least = (focal_per_width * side_m / z for z in (self.object.near_m, self.object.far_m))
+        return self.object.backgrounds(cache).of_crops(least, largest)
+
+    def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
+        """The object as the camera of each crop sees it; ``assumed_depth_m`` must stand in the code."""
+        place = self._metres(code[TRANSLATION][:, 0].float(), code[ASSUMED_M].float())
+        return self._image(code, place[:, None], self._matrices(code, CROP_PX), backgrounds)
+
+    def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
+        """How far the model's points are displaced by the rotation, in diameters, beside offset, scale and light.
+
+        Of poses that look alike the one nearest to the prediction is the true one. Where there is no object only
+        confidence and the surface count.
+        """
+        there = true[CONFIDENCE][:, 0, 0]
+        found, wanted = (matrix_from_rotation_6d(code[ROTATION_6D][:, 0]) for code in (predicted, true))
+        alike = (wanted[:, None] @ self._turns)[:, :, None]  # [batch, symmetries, 1, 3, 3]
+        points = self._points[..., None]
+        between = ((found[:, None, None] @ points) - (alike @ points)).squeeze(-1)
+        displaced = between.norm(dim=-1).mean(dim=-1).amin(dim=1)
+        place, true_place = predicted[TRANSLATION][:, 0], true[TRANSLATION][:, 0]
+        offset = (place[:, :2] / place[:, 2:] - true_place[:, :2] / true_place[:, 2:]).norm(dim=-1)
+        scale = (place[:, 2].log() - true_place[:, 2].log()).abs()
+        light = (predicted[LIGHT] - true[LIGHT]).norm(dim=-1)
+        pose = displaced + offset + _DEPTH_WEIGHT * scale + _LIGHT_WEIGHT * light
+        if COLOR in self.layout:
+            pose = pose + _COLOR_WEIGHT * (predicted[COLOR] - true[COLOR])[:, 0].abs().mean(dim=-1)
+        shift = self._metres(place, true[ASSUMED_M]) - self._metres(true_place, true[ASSUMED_M])
+        add = (between + shift[:, None, None] / self.object.kind.diameter_m).norm(dim=-1).mean(dim=-1).amin(dim=1)
+        right = (add < ADD_THRESHOLD).to(there) * there
+        sure = F.binary_cross_entropy(predicted[CONFIDENCE][:, 0, 0].clamp(1e-6, 1 - 1e-6), right)
+        pose_loss = (pose * there).sum() / there.sum().clamp(min=1)
+        return pose_loss + _CONFIDENCE_WEIGHT * sure + self._surface_loss(predicted[SURFACE], true)
+
+    def _surface_loss(self, surface: Float[Tensor, "batch 4 side side"], true: SceneCode) -> Float[Tensor, ""]:
+        """Whether each patch sees the object, and where it does, which point of it (mean absolute coordinate error)."""
+        place = self._metres(true[TRANSLATION][:, 0], true[ASSUMED_M])
+        rotation = matrix_from_rotation_6d(true[ROTATION_6D][:, 0])
+        points, seen = self._surface(rotation, place, self._matrices(true, surface.shape[-1]))
+        mask = seen[:, None, None].to(surface) * true[CONFIDENCE][:, :, :, None, None]
+        turned = torch.einsum("sij,bjvu->bsivu", self._turns.transpose(1, 2), points)
+        errors = ((surface[:, None, :3] - turned).abs() * mask).sum((2, 3, 4)) / mask.sum((2, 3, 4)).clamp(min=1)
+        return errors.amin(dim=1).mean() + F.binary_cross_entropy_with_logits(surface[:, 3], mask[:, 0, 0])
+
+    def _matrices(self, code: SceneCode, side: int) -> np.ndarray:
+        """K of each crop, drawn at ``side`` pixels."""
+        focal = FILL * side * code[ASSUMED_M][:, 0].cpu().numpy() / self.object.kind.diameter_m
+        matrices = np.zeros((len(focal), 3, 3))
+        matrices[:, 0, 0] = matrices[:, 1, 1] = focal
+        matrices[:, [0, 1], 2] = (side - 1) / 2
+        matrices[:, 2, 2] = 1
+        return matrices
+
+    def _metres(self, place: Tensor, assumed: Tensor) -> Tensor:
+        return torch.cat([place[:, :2] * self.object.kind.diameter_m, place[:, 2:] * assumed], dim=-1)
+
+    @cached_property
+    def _surface(self) -> SurfaceMap:
+        return SurfaceMap(self.object.mesh, CROP_PX // SURFACE_SHARE)
+
+    @cached_property
+    def _points(self) -> Tensor:
+        """Vertices, in diameters."""
+        vertices = self.object.mesh.vertices_m
+        chosen = np.random.default_rng(0).choice(len(vertices), min(_NUM_POINTS, len(vertices)), replace=False)
+        return torch.from_numpy(vertices[chosen] / self.object.kind.diameter_m).float()
+
+    @cached_property
+    def _turns(self) -> Tensor:
+        """Rotations onto itself, the identity first; their shifts are a few millimetres and left out."""
+        info = self.object.kind.info
+        return torch.from_numpy(np.stack([pose.rotation for pose in symmetry_poses(info, _SYMMETRY_STEP)])).float()
