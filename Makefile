@@ -1,4 +1,4 @@
-# setup · demo · test · check · bench · proto: each brings the environment up to date first, which costs nothing when it is.
+# setup · demo · test · check · bench · results · proto: each brings the environment up to date first, which costs nothing when it is.
 
 PYTHON ?= python3
 # Any pip requirement, also with options: TORCH="torch==2.13.0 --index-url …" for a build without CUDA.
@@ -8,13 +8,13 @@ BIN := .venv/bin
 READY := .venv/.ready
 PROTOS := $(shell cd proto && find curio_proto -name '*.proto' | sort)
 PROTOC := $(BIN)/python -m grpc_tools.protoc -Iproto
-BENCHMARKS := $(filter-out benchmarks/demo.py,$(wildcard benchmarks/*.py))
+BENCHMARKS := $(filter-out benchmarks/demo.py benchmarks/endurance.py benchmarks/results.py benchmarks/curiosity.py benchmarks/linemod.py benchmarks/samples.py,$(wildcard benchmarks/*.py))
 
 # Every recipe is one bash script that stops at the first failure.
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
-.PHONY: setup demo test check bench proto
+.PHONY: setup demo test check bench results proto
 
 setup: $(READY)
 
@@ -38,7 +38,7 @@ $(READY): pyproject.toml
 	# torch first and then held fast: an open requirement would pull the newest CUDA build.
 	$(BIN)/pip install --quiet $(TORCH)
 	$(BIN)/pip freeze --quiet | grep -E '^torch[ =]' > .venv/torch.txt
-	$(BIN)/pip install --quiet --constraint .venv/torch.txt --editable '.[train,dev]'
+	$(BIN)/pip install --quiet --constraint .venv/torch.txt --editable '.[train,capture,dev]'
 	touch $@
 
 demo: $(READY)
@@ -68,3 +68,7 @@ bench: $(READY)
 		echo "bench: $$name" >&2
 		$(BIN)/python "$$script" --json | tee /dev/stderr | tail -n 1 > "docs/results/$$name.json"
 	done
+
+# Tables 2 and 3, hours in all; goes on where it stopped. One world: make results ONLY=circles; other flags in FLAGS.
+results: $(READY)
+	@$(BIN)/python benchmarks/results.py $(if $(ONLY),--only $(ONLY)) $(FLAGS)

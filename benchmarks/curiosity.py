@@ -1,0 +1,129 @@
+"""Can anything stand in for curiosity? The paper says that no weight, learning rate, randomisation or patience can.
+
+    python benchmarks/curiosity.py [--world spheres] [--images 32000] [--only longer]
+
+Runs of image loss alone with each of these changed, beside the paper's method with batch and with instance norm in the
+critic, and full supervision, in one world. Each run is trained and scored in a folder of its own under
+``runs/curiosity``; after each, docs/results/curiosity.json and curiosity.md are written anew. Stop it at any time: the
+same command goes on where it stopped.
+
+para, img   Eq. 1 and DSSIM from the novel view
+"""
+
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from curio_train.cli import answer
+from curio_train.config import PRESETS
+from curio_train.errors import UsageError
+from curio_train.evaluation.run_queue import QueuedRun, carry_out
+
+_RECIPE = PRESETS["laptop"]
+_LONGER = 4
+
+
+def _changed(name: str, value: float, factor: float) -> Sequence[str]:
+    return ("--method", "noncur", f"--{name}", f"{value * factor:g}")
+
+
+VARIANTS: Mapping[str, Sequence[str]] = {
+    "super": ("--method", "super"),
+    "our": ("--method", "our"),
+    "our, instance norm": ("--method", "our", "--critic-normalisation", "instance"),
+    "noncur": ("--method", "noncur"),
+    "noncur, image weight / 10": _changed("image-weight", _RECIPE.image_weight, 0.1),
+    "noncur, image weight x 10": _changed("image-weight", _RECIPE.image_weight, 10),
+    "noncur, learning rate / 4": _changed("learning-rate", _RECIPE.learning_rate, 0.25),
+    "noncur, learning rate x 4": _changed("learning-rate", _RECIPE.learning_rate, 4),
+    "noncur, other start": ("--method", "noncur", "--seed", "1"),
+    "noncur, small batches": ("--method", "noncur", "--batch-size", "16", "--micro-batch-size", "16"),
+    "noncur, longer": ("--method", "noncur"),
+}
+"""Flags by what is changed; small batches are the randomisation of every step, another start is that of the whole."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to run.
+
+    Attributes:
+        world: In which.
+        images: Of every run; "longer" sees four times as many.
+        only: Variants by name; all unless given.
+        jobs: Runs at once, each with its share of the cores.
+        runs: Where run folders lie.
+        results: The file of results; the table lies beside it.
+    """
+
+    world: Literal["circles", "spheres", "chairs", "varied", "multi", "light"] = "spheres"
+    images: int = 32_000
+    only: tuple[str, ...] = tuple(VARIANTS)
+    jobs: int = min(2, os.cpu_count() or 1)
+    runs: Path = Path("runs/curiosity")
+    results: Path = Path("docs/results/curiosity.json")
+
+
+def plan(settings: Settings) -> list[QueuedRun]:
+    """A run a variant."""
+    if unknown := [name for name in settings.only if name not in VARIANTS]:
+        raise UsageError(f"--only {unknown[0]!r}: there is no such variant, expected some of {list(VARIANTS)}")
+    runs = []
+    for name in settings.only:
+        images = settings.images * (_LONGER if name.endswith("longer") else 1)
+        slug = name.replace(", ", "-").replace(" / ", "-by-").replace(" x ", "-times-").replace(" ", "-")
+        folder = settings.runs / f"{settings.world}-{settings.images}" / slug
+        runs.append(QueuedRun(name, folder, settings.world, images, VARIANTS[name]))
+    return runs
+
+
+def write(settings: Settings, runs: list[QueuedRun]) -> None:
+    """Results and table of the runs that are done."""
+    rows = {run.name: _row(run) for run in runs if run.done}
+    if not rows:
+        return
+    settings.results.parent.mkdir(parents=True, exist_ok=True)
+    settings.results.write_text(json.dumps({"world": settings.world, "runs": rows}, indent=1) + "\n", encoding="utf-8")
+    lines = [
+        f"# In place of curiosity: {settings.world}",
+        "",
+        "Written by `python benchmarks/curiosity.py`; one seed each.",
+        "",
+        "| run | Para | Img | images seen | minutes |",
+        "| --- | --- | --- | --- | --- |",
+        *(
+            f"| {name} | {row['para']:.3g} | {row['img']:.3g} | {row['images_seen']:,} | {row['seconds'] / 60:.1f} |"
+            for name, row in rows.items()
+        ),
+    ]
+    settings.results.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _row(run: QueuedRun) -> dict[str, object]:
+    found = run.evaluation
+    return {
+        "para": found["metrics"]["scene_error"],
+        "img": found["metrics"]["novel_view_dssim"],
+        "flags": list(run.flags),
+        "images_seen": found["images_seen"],
+        "seconds": found["training_seconds"],
+        "machine": found["machine"],
+        "commit": found["commit"],
+    }
+
+
+def main(settings: Settings) -> int:
+    """Carry out what is left."""
+    runs = plan(settings)
+    write(settings, runs)
+    return carry_out(runs, settings.jobs, lambda: write(settings, runs))
+
+
+if __name__ == "__main__":
+    chosen = tyro.cli(Settings, description=__doc__)
+    sys.exit(answer(lambda _: main(chosen)))

@@ -1,0 +1,109 @@
+"""The paper's Tables 2 and 3: every method in every world, run by run, as far as they are not there yet.
+
+    python benchmarks/results.py [--only circles spheres] [--methods our noncur] [--images N] [--jobs 2] [--dry-run]
+
+Each run is trained and scored in a folder of its own under ``runs/results``; after each, docs/results/worlds.json,
+worlds.md and worlds.png are written anew. Stop it at any time: the same command goes on where it stopped, in the middle
+of a run, too. Every method of a world sees as many images.
+"""
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from curio_train.cli import answer
+from curio_train.config import PRESETS
+from curio_train.errors import UsageError
+from curio_train.evaluation.results import ORDER, WORLDS, collect, load_results, merge, save_results
+from curio_train.evaluation.run_queue import QueuedRun, carry_out
+
+World = Literal["circles", "spheres", "chairs", "varied", "multi", "light"]
+
+# Images that every method of a world sees with preset laptop; together the table takes two cores up to six hours.
+BUDGETS = {"circles": 48_000, "spheres": 96_000, "chairs": 96_000, "varied": 96_000, "multi": 96_000, "light": 96_000}
+SEVERAL_SEEDS = {"circles", "spheres"}
+_SEEDED = {"super_1.0", "noncur", "our"}
+# Quick ones first, so that a reference is there early.
+_METHODS = ("super_1.0", "noncur", "our", "sleep", "super_0.1", "super_0.05", "wake_sleep", "wake_sleep_critic")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to run.
+
+    Attributes:
+        only: Worlds; all unless given.
+        methods: Rows; all unless given.
+        images: Every run's budget; each world's own unless given, with preset paper the paper's.
+        seeds: Of super_1.0, noncur and our in Circles and Spheres; all else is run with seed 0.
+        preset: Of hyperparameters.
+        jobs: Runs at once, each with its share of the cores.
+        runs: Where run folders lie.
+        results: The file of results; tables and plot lie beside it.
+        dry_run: Say what would be run, and write the tables of what is there.
+    """
+
+    only: tuple[World, ...] = WORLDS
+    methods: tuple[str, ...] = _METHODS
+    images: int | None = None
+    seeds: int = 3
+    preset: Literal["laptop", "paper"] = "laptop"
+    jobs: int = min(2, os.cpu_count() or 1)
+    runs: Path = Path("runs/results")
+    results: Path = Path("docs/results/worlds.json")
+    dry_run: bool = False
+
+
+def plan(settings: Settings) -> list[QueuedRun]:
+    """All runs of the settings: world by world, the first seed of every row before the others."""
+    for method in settings.methods:
+        if method not in ORDER:
+            raise UsageError(f"--methods {method}: there is no such row, expected some of {', '.join(ORDER)}")
+    return [
+        _run(settings, world, method, seed)
+        for world in settings.only
+        for seed in range(settings.seeds)
+        for method in settings.methods
+        if seed == 0 or (world in SEVERAL_SEEDS and method in _SEEDED)
+    ]
+
+
+def _run(settings: Settings, world: str, method: str, seed: int) -> QueuedRun:
+    own = BUDGETS[world] if settings.preset == "laptop" else PRESETS["paper"].budget_images
+    images = settings.images or own
+    folder = settings.runs / f"{world}-{settings.preset}-{images}" / f"{method.replace('.', '_')}-{seed}"
+    flags = ["--method", method, "--preset", settings.preset, "--seed", str(seed)]
+    if method.startswith("super"):
+        flags[1:2] = ["super", "--labels", method.removeprefix("super_")]
+    return QueuedRun(f"{world} {method} seed {seed}, {images:,} images", folder, world, images, flags)
+
+
+def write(settings: Settings, runs: list[QueuedRun]) -> None:
+    """Results, tables and plot of all runs that are done, into what was there."""
+    from curio_train.evaluation.results_tables import markdown, plot
+
+    found = collect(run.evaluation for run in runs if run.done)
+    results = merge(load_results(settings.results), found)
+    if results:
+        save_results(settings.results, results)
+        settings.results.with_suffix(".md").write_text(markdown(results, "make results"), encoding="utf-8")
+        plot(results, settings.results.with_suffix(".png"))
+
+
+def main(settings: Settings) -> int:
+    """Carry out what is left."""
+    runs = plan(settings)
+    write(settings, runs)
+    if settings.dry_run:
+        for run in runs:
+            print(f"{'done' if run.done else 'to do'}: {run.name}: {run.folder}")
+        return 0
+    return carry_out(runs, settings.jobs, lambda: write(settings, runs))
+
+
+if __name__ == "__main__":
+    chosen = tyro.cli(Settings, description=__doc__)
+    sys.exit(answer(lambda _: main(chosen)))
