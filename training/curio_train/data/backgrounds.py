@@ -7,6 +7,7 @@ random patterns and light. It needs no download, nobody holds rights in it, and 
 import dataclasses
 import hashlib
 import json
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
@@ -219,7 +220,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _save(path: Path, pool: np.ndarray) -> None:
-    partial = path.with_suffix(".tmp")
+    partial = path.with_suffix(f".{os.getpid()}.tmp")  # runs that begin together each write their own
     try:
         with partial.open("wb") as file:
             np.save(file, pool)
