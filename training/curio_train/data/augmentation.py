@@ -1,4 +1,4 @@
-"""What lies between a rendering and a photograph: exposure, colour, blur, noise, things in front (torch)."""
+"""What lies between a rendering and a photograph: light, exposure, colour, blur, noise, things in front (torch)."""
 
 import numpy as np
 import torch
@@ -7,6 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 LARGEST_OCCLUDER = 0.35  # of the image's side
+_LARGEST_SHADE = 0.45  # standard deviation of the logarithm of uneven light
+_SHADE_CELLS = (2, 5)  # of its grid, a side: from a gradient over the image to shadows of a third of it
+_LARGEST_GAMMA = 0.35  # as a logarithm
 
 
 def disturb(images: Float[Tensor, "batch 3 height width"], random: np.random.Generator) -> Tensor:
@@ -20,6 +23,7 @@ def disturb(images: Float[Tensor, "batch 3 height width"], random: np.random.Gen
         Images of the same shape, in [0, 1].
     """
     images = _occlude(images, random)
+    images = _shade(images, random)
     images = _recolor(images, random)
     images = _blur(images, random)
     noise = torch.randn(images.shape, generator=torch.Generator().manual_seed(int(random.integers(2**63)))).to(images)
@@ -29,6 +33,15 @@ def disturb(images: Float[Tensor, "batch 3 height width"], random: np.random.Gen
 def _amounts(images: Tensor, random: np.random.Generator, low: float, high: float, channels: int = 1) -> Tensor:
     values = random.uniform(low, high, (len(images), channels, 1, 1)).astype(np.float32)
     return torch.from_numpy(values).to(images)
+
+
+def _shade(images: Tensor, random: np.random.Generator) -> Tensor:
+    """Light that falls unevenly, as next to other things, and a camera's response to it."""
+    cells = int(random.integers(*_SHADE_CELLS))
+    grid = torch.from_numpy(random.normal(size=(len(images), 1, cells, cells)).astype(np.float32)).to(images)
+    field = F.interpolate(grid, images.shape[-2:], mode="bicubic", align_corners=True)
+    lit = images * torch.exp(field * _amounts(images, random, 0.0, _LARGEST_SHADE))
+    return lit.clamp(1e-4, 1) ** torch.exp(_amounts(images, random, -_LARGEST_GAMMA, _LARGEST_GAMMA))
 
 
 def _recolor(images: Tensor, random: np.random.Generator) -> Tensor:

@@ -7,7 +7,8 @@ hemisphere around an object that stands on a table, camera rolled by up to 45°;
 Constants fixed before any training:
 
 * depth 0.5 to 1.5 m; the object's centre anywhere in the frame;
-* light from the camera's half space, of strength 0.2 to 1.1 over an ambient radiance of 0.4.
+* light from the camera's half space, of strength 0.2 to 2 over an ambient radiance of 0.4; the object's own colours
+  0.3 to 1.25 times as bright, and a little tinted.
 """
 
 from pathlib import Path

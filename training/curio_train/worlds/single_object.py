@@ -19,10 +19,14 @@ from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Batch, Camera, ImageSource, ObjectKind, Split, World, jitter_seed
 from curio_train.worlds.placement import colors
-from curio_train.worlds.views import AMBIENT, STRONGEST_LIGHT, lights, places, turned_towards, upper_views
+from curio_train.worlds.views import AMBIENT, STRONGEST_LIGHT, exposures, lights, places, turned_towards, upper_views
 
 Views = Callable[[int, np.random.Generator], Float[Tensor, "count 3 3"]]
 """Draws rotations cam_from_obj of objects on the optical axis."""
+
+EXPOSURE = "exposure"
+"""What the colours of an object that has its own are multiplied by, [batch, 1, 3]: drawn beside the code, never
+predicted. What a camera sees of a part on a desk is darker, and of another tint, than its mesh's colours."""
 
 LEAST_PAINT_VALUE = 0.1
 """Of the colours of an unpainted object, which may be black, white, grey or anything between."""
@@ -112,7 +116,7 @@ class SingleObjectWorld(World):
             camera_matrix=matrix,
             backgrounds=translation_m.new_zeros(size) if backgrounds is None else backgrounds,
             light=code[LIGHT].float(),
-            color=code[COLOR].float() if COLOR in code else None,
+            color=code[COLOR].float() if COLOR in code else code.get(EXPOSURE),
             confidence=code[CONFIDENCE][..., 0].float() if CONFIDENCE in code else None,
             seed=jitter_seed(code),
         )
@@ -151,8 +155,10 @@ def scene(translation: Tensor, rotation: Tensor, light: Tensor) -> dict[str, Ten
 
 
 def paint(thing: Object, count: int, random: np.random.Generator) -> dict[str, Tensor]:
-    """The entry of codes that says which colour an unpainted object has, [count, 1, 3] sRGB; none for others."""
-    return {COLOR: colors(count, 1, random, 0.0, LEAST_PAINT_VALUE)} if thing.painted else {}
+    """The entry of codes that says which colour an unpainted object has, [count, 1, 3] sRGB; others' exposure."""
+    if thing.painted:
+        return {COLOR: colors(count, 1, random, 0.0, LEAST_PAINT_VALUE)}
+    return {EXPOSURE: exposures(count, random)}
 
 
 def position_field(thing: Object) -> Field:

@@ -9,8 +9,10 @@ from curio_train.geometry import rotation_between
 from curio_train.scene_code import Field
 
 LARGEST_ROLL_DEG = 45.0
-WEAKEST_LIGHT, STRONGEST_LIGHT = 0.2, 1.1
+WEAKEST_LIGHT, STRONGEST_LIGHT = 0.2, 2.0
 AMBIENT = 0.4
+DARKEST_EXPOSURE, BRIGHTEST_EXPOSURE = 0.3, 1.25
+_TINT = 0.08
 
 
 def upper_views(count: int, random: np.random.Generator) -> Float[Tensor, "count 3 3"]:
@@ -42,8 +44,18 @@ def places(field: Field, count: int, random: np.random.Generator) -> Float[Tenso
 
 
 def lights(count: int, random: np.random.Generator) -> Float[Tensor, "count 3"]:
-    """Light from the camera's half space: towards it, camera frame; the length is the strength."""
+    """Light from the camera's half space: towards it, camera frame; its length is the strength, log-uniform."""
     direction = random.normal(size=(count, 3))
     direction[:, 2] = -np.abs(direction[:, 2])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return torch.from_numpy(direction * random.uniform(WEAKEST_LIGHT, STRONGEST_LIGHT, (count, 1))).float()
+    return torch.from_numpy(direction * _log_uniform(WEAKEST_LIGHT, STRONGEST_LIGHT, (count, 1), random)).float()
+
+
+def exposures(count: int, random: np.random.Generator) -> Float[Tensor, "count 1 3"]:
+    """What an object's colours are multiplied by, as if it stood in more or less, and warmer or colder, light."""
+    tint = np.exp(_TINT * random.normal(size=(count, 1, 3)))
+    return torch.from_numpy(_log_uniform(DARKEST_EXPOSURE, BRIGHTEST_EXPOSURE, (count, 1, 1), random) * tint).float()
+
+
+def _log_uniform(low: float, high: float, shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:
+    return np.exp(random.uniform(np.log(low), np.log(high), shape))
