@@ -19,7 +19,7 @@ from curio_train.networks.places import CANDIDATES, LOG_WEIGHTS, NUM_CANDIDATES,
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, index
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.gaze import ASSUMED_M, CROP_PX, FirstLook, GazeWorld, gaze_camera
-from curio_train.worlds.single_object import Object
+from curio_train.worlds.single_object import EXPOSURE, Object
 from curio_train.worlds.surface import SurfaceMap
 from torch import Tensor, nn
 
@@ -88,7 +88,8 @@ def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(w
     assert turned.max() < 0.05
     assert torch.allclose(found[LIGHT], code[LIGHT], atol=1e-5)
     assert torch.allclose(found[CONFIDENCE], relative[CONFIDENCE])
-    rendered = second.render(relative | {ASSUMED_M: distance, CONFIDENCE: torch.ones(6, 1, 1)})
+    given = {ASSUMED_M: distance, EXPOSURE: code[EXPOSURE]}
+    rendered = second.render(relative | given | {CONFIDENCE: torch.ones(6, 1, 1)})
     assert glance.shown[0].shape == (6, 3, CROP_PX, CROP_PX)
     missed = (glance.shown[0] - rendered).abs().mean()
     assert missed < 0.5 * (rendered - rendered.roll(1, dims=-1)).abs().mean(), "further off than half a pixel"
@@ -99,7 +100,7 @@ def test_objects_of_the_second_look_lie_where_its_code_says(world: GazeWorld) ->
     code = second.sample(40, (1,))
     assert 0 < (code[CONFIDENCE] == 0).sum() < 15
     code[CONFIDENCE][:] = 1
-    second.layout.check({name: value for name, value in code.items() if name != ASSUMED_M})
+    second.layout.check({name: value for name, value in code.items() if name not in (ASSUMED_M, EXPOSURE)})
     drawn = second.render(code).amax(dim=1) > 0.02
     place = code[TRANSLATION][:, 0]
     pixels = project(place[:, None], torch.from_numpy(second.camera.matrix).float()[None])[:, 0]

@@ -13,6 +13,7 @@ from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
 from curio_train.worlds.linemod import FAR_M, NEAR_M
 from curio_train.worlds.options import LinemodOptions
+from curio_train.worlds.single_object import EXPOSURE
 from curio_train.worlds.views import STRONGEST_LIGHT, WEAKEST_LIGHT
 
 
@@ -48,6 +49,9 @@ def world(data, photographs):
 
 def test_poses_come_from_the_published_range(world):
     code = world.sample(400, (1,))
+    exposure = code.pop(EXPOSURE)
+    assert exposure.shape == (400, 1, 3)
+    assert 0.2 < exposure.min() < 0.5 < 1.1 < exposure.max() < 1.7
     world.layout.check(code)
     position = code[TRANSLATION][:, 0]
     assert position[:, 2].min() >= NEAR_M
