@@ -95,7 +95,7 @@ def test_a_run_may_begin_with_the_network_of_another(tmp_path: Path, cache: Path
     others = replace(still, network=replace(CONFIG.network, hidden=16))
     with pytest.raises(UsageError, match=r"--init .*first: its network does not fit"):
         train(tmp_path / "third", cache, others)
-    with pytest.raises(CheckpointError, match="no run folder"):
+    with pytest.raises(UsageError, match="neither a run folder"):
         train(tmp_path / "fourth", cache, replace(still, init=tmp_path / "nothing"))
 
 

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +15,7 @@ from curio_train import cli
 from curio_train.config import RunConfig
 from curio_train.data.bop import ModelInfo
 from curio_train.errors import CurioError, DataError, ExportError, UsageError
-from curio_train.evaluation.evaluate import draw, evaluate, score, uses_synthetic_labels
+from curio_train.evaluation.evaluate import draw, evaluate, score
 from curio_train.evaluation.real_frames import evaluate_real_frames, look
 from curio_train.evaluation.scores import pose_scores, rotation_errors_deg
 from curio_train.evaluation.subject import Subject
@@ -25,7 +24,7 @@ from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds.base import Camera
 from curio_train.worlds.circles import Circles
 from curio_train.worlds.linemod import build
-from curio_train.worlds.options import CirclesOptions, LinemodOptions
+from curio_train.worlds.options import LinemodOptions
 from curio_train.worlds.single_object import SingleObjectWorld
 from scipy.spatial.transform import Rotation
 
@@ -203,15 +202,6 @@ def test_visible_targets_are_left_out_where_nothing_is_known_of_them(data: Path)
     found = evaluate_real_frames(always_at(world, [0.0, 0.0, 0.8]), data, None)
     assert found["num_targets_visible_80"] == 0
     assert "add_recall_visible_80" not in found["metrics"]
-
-
-def test_what_counts_as_labels_of_renderings(tmp_path: Path, write_run: WriteRun) -> None:
-    own = RunConfig(CirclesOptions(), method="our")
-    assert not uses_synthetic_labels(own)
-    assert all(uses_synthetic_labels(replace(own, method=method)) for method in ("super", "sleep", "wake_sleep"))
-    unlabelled = write_run(tmp_path / "unlabelled")
-    assert not uses_synthetic_labels(replace(own, init=unlabelled))
-    assert uses_synthetic_labels(replace(own, init=tmp_path / "gone"))
 
 
 def test_a_data_set_without_the_object_is_refused(data: Path) -> None:

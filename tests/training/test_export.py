@@ -87,7 +87,7 @@ def test_half_is_half_as_large_and_its_rounding_is_told(
 
 def test_a_file_stands_alone_and_tells_nothing_of_the_machine(single: Exported, half: Exported) -> None:
     for exported in (single, half):
-        assert files(exported.path) == ["golden.npz", "model.onnx"]
+        assert files(exported.path) == ["golden.npz", "model.onnx", "weights.safetensors"]
         content = (exported.path / "model.onnx").read_bytes()
         model = onnx.load_model_from_string(content)
         assert not any(onnx.external_data_helper.uses_external_data(tensor) for tensor in model.graph.initializer)
@@ -122,14 +122,15 @@ def test_the_spec_describes_world_and_making(single: Exported, run: Path) -> Non
 def test_versions_stand_beside_each_other(single: Exported, half: Exported, models: Path) -> None:
     assert (single.path, half.path) == (models / "circles" / "1", models / "circles" / "2")
     assert files(models) == [
-        "circles", "circles/1", "circles/1/golden.npz", "circles/1/model.onnx",
-        "circles/2", "circles/2/golden.npz", "circles/2/model.onnx",
+        "circles", "circles/1", "circles/1/golden.npz", "circles/1/model.onnx", "circles/1/weights.safetensors",
+        "circles/2", "circles/2/golden.npz", "circles/2/model.onnx", "circles/2/weights.safetensors",
         "circles/CARD.md", "circles/SHA256SUMS", "circles/config.pbtxt",
     ]  # fmt: skip
     sums = dict(line.split("  ")[::-1] for line in (models / "circles" / "SHA256SUMS").read_text().splitlines())
-    for version in ("1", "2"):
-        content = (models / "circles" / version / "model.onnx").read_bytes()
-        assert sums[f"{version}/model.onnx"] == hashlib.sha256(content).hexdigest()
+    listed = [f"{version}/{file}" for version in (1, 2) for file in ("model.onnx", "weights.safetensors")]
+    assert list(sums) == listed
+    for file in listed:
+        assert sums[file] == hashlib.sha256((models / "circles" / file).read_bytes()).hexdigest()
     card = (models / "circles" / "CARD.md").read_text()
     assert card.startswith("# circles\n\n## Version 2\n")
     assert card.count("# circles") == 1

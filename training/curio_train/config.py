@@ -192,8 +192,9 @@ class RunConfig:
             0 never is.
         recipe: Hyperparameters; the preset's unless given.
         network: Sizes of the networks; the paper's unless given.
-        init: Run folder whose network to begin with instead of random weights; of this world's kind, but the object may
-            be another: features that read one object read the next one sooner.
+        init: Run folder, model folder (its latest version) or version's folder whose network to begin with instead of
+            random weights; of this world's kind, but the object may be another: features that read one object read the
+            next one sooner.
     """
 
     world: OmitArgPrefixes[WorldOptions]

@@ -18,9 +18,10 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from curio_train.errors import ExportError
 from curio_train.learning.checkpoint import RunFolder
 from curio_train.learning.configuration import to_portable
+from curio_train.learning.initial import weights_file
 from curio_train.learning.provenance import sittings
 from curio_train.model_card import Making, card
-from curio_train.model_folder import ModelFolder, triton_config
+from curio_train.model_folder import GOLDEN_FILE, MODEL_FILE, WEIGHTS_FILE, ModelFolder, triton_config
 from curio_train.onnx_file import SCHEMA_VERSION, OnnxModel, put_spec, store_half, to_onnx
 from curio_train.scene_code import Field
 from curio_train.worlds import build
@@ -101,7 +102,11 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     spec = model_spec(world, target.path.name)
     spec.recipe = json.dumps(to_portable(folder.config))
     first = sittings(run)[0]
-    spec.commit, spec.images_seen, spec.training_seconds = first.commit, state.course.images, state.course.seconds
+    spec.commit, spec.images_seen, spec.training_seconds = (
+        first.commit,
+        state.course.all_images,
+        state.course.all_seconds,
+    )
     put_spec(model, spec)
 
     found = OnnxModel(model.SerializeToString(), "the exported graph")(images.numpy())
@@ -110,7 +115,12 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     version = target.next_version()
     made = Making(run, folder.config, first, state.course, _weights(half, rounding_error))
     text = card(version, spec, shapes, world.objects, made)
-    path = target.add(version, model.SerializeToString(), config, text, _golden(images, found))
+    files = {
+        MODEL_FILE: model.SerializeToString(),
+        GOLDEN_FILE: _golden(images, found),
+        WEIGHTS_FILE: weights_file(state, folder.config, half=half),
+    }
+    path = target.add(version, files, config, text)
     return Exported(path, spec.parity_max_abs_error, rounding_error, model.ByteSize())
 
 

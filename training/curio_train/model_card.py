@@ -54,10 +54,10 @@ def card(
         objects: Of the world, for their attribution.
         made: Where it comes from.
     """
-    evaluation = read_evaluation(made.run, made.course.images)
+    evaluation = read_evaluation(made.run, made.course.all_images)
     parts = [
         f"## Version {version}\n",
-        _table(("", ""), _origin(spec, made)),
+        _table(("", ""), _origin(version, spec, made)),
         _table(("output", "shape", "unit", "frame"), _outputs(spec, shapes)),
         _table(("object", "diameter", "mesh SHA-256", "source and licence of the mesh"), _objects(spec, objects)),
         _metrics(evaluation) if evaluation else "Not evaluated when it was exported.\n",
@@ -66,7 +66,7 @@ def card(
 
 
 def read_evaluation(run: Path, images: int) -> dict[str, Any] | None:
-    """The result that curio-eval left in a run folder, if it is of the checkpoint after ``images`` images."""
+    """The result that curio-eval left in a run folder, if it is of the network that has seen ``images`` images."""
     try:
         found = json.loads((run / EVALUATION_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -74,7 +74,7 @@ def read_evaluation(run: Path, images: int) -> dict[str, Any] | None:
     return found if isinstance(found, dict) and found.get("images_seen") == images else None
 
 
-def _origin(spec: ModelSpec, made: Making) -> Iterable[tuple[str, str]]:
+def _origin(version: int, spec: ModelSpec, made: Making) -> Iterable[tuple[str, str]]:
     terms = METHODS[made.config.method]
     supervision = [text for term, text in _SUPERVISION.items() if term in terms] or ["none: images alone"]
     yield "world", spec.world
@@ -82,11 +82,15 @@ def _origin(spec: ModelSpec, made: Making) -> Iterable[tuple[str, str]]:
     yield "supervision", "; ".join(supervision)
     yield "training", f"`{portable(made.sitting.command)}`"
     yield "commit", made.sitting.commit or "not from a git checkout"
-    yield "images seen", f"{made.course.images:,}"
-    yield "training time", f"{made.course.seconds / 60:.1f} minutes"
+    before, course = made.config.init, made.course
+    since = f", {course.images:,} of them since it was {before.name}" if before else ""
+    yield "images seen", f"{course.all_images:,}{since}"
+    since = f", {course.seconds / 60:.1f} of them since it was {before.name}" if before else ""
+    yield "training time", f"{course.all_seconds / 60:.1f} minutes{since}"
     yield "machine", made.sitting.machine
     yield "input", f"`image`, uint8 RGB [batch, {spec.camera.height}, {spec.camera.width}, 3]"
     yield "weights", made.weights
+    yield "to train it further", f"`curio-train {spec.world} --init models/{spec.name}/{version}`, other flags as above"
     yield "torch to onnxruntime", f"differ by at most {spec.parity_max_abs_error:.2g} in any output"
 
 

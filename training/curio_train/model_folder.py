@@ -4,8 +4,11 @@
 
     OUT/NAME/config.pbtxt        the tensors, the same for all versions
              CARD.md             where each version comes from, newest first
-             SHA256SUMS          of every model.onnx
-             1/model.onnx  2/…   versions; none is ever overwritten
+             SHA256SUMS          of every model.onnx and weights.safetensors
+             1/  2/  …           versions; none is ever overwritten
+                 model.onnx           what is served
+                 golden.npz           an image and its outputs, which a server asks again before it serves the version
+                 weights.safetensors  the network as it was trained, to train it further; no server reads it
 """
 
 import hashlib
@@ -21,7 +24,9 @@ from curio_train.errors import ExportError, UsageError
 
 MODEL_FILE = "model.onnx"
 GOLDEN_FILE = "golden.npz"
+WEIGHTS_FILE = "weights.safetensors"
 _CONFIG, _CARD, _SUMS = "config.pbtxt", "CARD.md", "SHA256SUMS"
+_LISTED = (MODEL_FILE, WEIGHTS_FILE)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # what a server takes for a model's name
 _MAX_BATCH_SIZE = 64
 
@@ -78,15 +83,14 @@ class ModelFolder:
                 "agree in them: choose another --name"
             )
 
-    def add(self, version: int, content: bytes, config: str, card: str, golden: bytes) -> Path:
+    def add(self, version: int, files: Mapping[str, bytes], config: str, card: str) -> Path:
         """Write a version.
 
         Args:
             version: From :meth:`next_version`.
-            content: Of model.onnx.
+            files: Contents of the version's files, by name.
             config: From :func:`triton_config`.
             card: Markdown, a section about this version.
-            golden: Of golden.npz: an image and its outputs, which a server asks again before it serves the version.
 
         Returns:
             The version's folder.
@@ -98,20 +102,19 @@ class ModelFolder:
         try:
             with _draft(self.path) as draft:
                 if self.path.exists():
-                    self._add_version(draft, target, content, card, golden)
+                    self._add_version(draft, target, files, card)
                 else:
-                    _fill(draft, self.path.name, version, content, card, config, golden)
+                    _fill(draft, self.path.name, version, files, card, config)
                     draft.rename(self.path)
         except OSError as exc:
             raise ExportError(f"cannot write {target}: {exc.strerror}; name another folder: --out") from exc
         return target
 
-    def _add_version(self, draft: Path, target: Path, content: bytes, card: str, golden: bytes) -> None:
+    def _add_version(self, draft: Path, target: Path, files: Mapping[str, bytes], card: str) -> None:
         """Beside earlier versions: first what speaks of it, at last the version itself, by one rename."""
-        (draft / MODEL_FILE).write_bytes(content)
-        (draft / GOLDEN_FILE).write_bytes(golden)
-        others = [line for line in _lines(self.path / _SUMS) if not line.endswith(f"  {target.name}/{MODEL_FILE}")]
-        sums = "".join(f"{line}\n" for line in [*others, _sum_line(target.name, content)])
+        _write(draft, files)
+        others = [line for line in _text(self.path / _SUMS).splitlines() if f"  {target.name}/" not in line]
+        sums = "".join(f"{line}\n" for line in others) + _sums(target.name, files)
         title, _, earlier = _text(self.path / _CARD).partition("\n\n")
         _replace(self.path / _SUMS, sums)
         draft.rename(target)
@@ -165,29 +168,31 @@ def _draft(folder: Path) -> Iterator[Path]:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _fill(folder: Path, name: str, version: int, content: bytes, card: str, config: str, golden: bytes) -> None:
+def _fill(folder: Path, name: str, version: int, files: Mapping[str, bytes], card: str, config: str) -> None:
     (folder / str(version)).mkdir()
-    (folder / str(version) / MODEL_FILE).write_bytes(content)
-    (folder / str(version) / GOLDEN_FILE).write_bytes(golden)
+    _write(folder / str(version), files)
     (folder / _CONFIG).write_text(config, encoding="utf-8")
-    (folder / _SUMS).write_text(_sum_line(str(version), content) + "\n", encoding="utf-8")
+    (folder / _SUMS).write_text(_sums(str(version), files), encoding="utf-8")
     (folder / _CARD).write_text(f"{_title(name)}\n\n{card}", encoding="utf-8")
+
+
+def _write(folder: Path, files: Mapping[str, bytes]) -> None:
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
 
 
 def _title(name: str) -> str:
     return f"# {name}"
 
 
-def _sum_line(version: str, content: bytes) -> str:
-    return f"{hashlib.sha256(content).hexdigest()}  {version}/{MODEL_FILE}"
+def _sums(version: str, files: Mapping[str, bytes]) -> str:
+    """Lines in ``sha256sum``'s format."""
+    listed = (name for name in _LISTED if name in files)
+    return "".join(f"{hashlib.sha256(files[name]).hexdigest()}  {version}/{name}\n" for name in listed)
 
 
 def _text(path: Path) -> str:
     return path.read_text(encoding="utf-8") if path.exists() else ""
-
-
-def _lines(path: Path) -> list[str]:
-    return _text(path).splitlines()
 
 
 def _replace(path: Path, text: str) -> None:

@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, ReportError, UsageError
 from curio_train.evaluation.real_frames import evaluate_real_frames
 from curio_train.evaluation.report import write_report
 from curio_train.evaluation.scores import add_errors, pose_scores, scene_errors, scene_scores
 from curio_train.evaluation.subject import Predict, Subject, load_subject
-from curio_train.learning.configuration import CONFIG_FILE, load_config, world_name
+from curio_train.learning.configuration import CONFIG_FILE, world_name
+from curio_train.learning.initial import uses_synthetic_labels
 from curio_train.learning.provenance import machine
 from curio_train.metrics.certainty import calibration_error, separation
 from curio_train.metrics.poses import ADD_THRESHOLD
@@ -152,21 +152,6 @@ def _scored(world: World, predict: Predict, held_out: HeldOut) -> tuple[SceneCod
     if held_out.empty is not None:
         scores |= certainty(world, predicted, held_out.code, read(predict, held_out.empty))
     return predicted, scores
-
-
-def uses_synthetic_labels(config: RunConfig) -> bool:
-    """Whether poses of renderings taught a network, in the sense of the paper's LineMOD table, or the one it began as.
-
-    A network that began as another, of which nothing is known any more, counts as so taught.
-    """
-    if config.terms & {"label", "sleep"}:
-        return True
-    if config.init is None:
-        return False
-    try:
-        return uses_synthetic_labels(load_config(config.init))
-    except CheckpointError:
-        return True
 
 
 def _origin(path: Path, subject: Subject) -> dict[str, Any]:

@@ -33,8 +33,8 @@ class Subject:
         config: What it was trained with.
         world: In which it was trained.
         predict: Reads images.
-        images_seen: In training.
-        training_seconds: Spent.
+        images_seen: In training, those of the networks that it began as included.
+        training_seconds: Spent, likewise.
         commit: Of the code that trained it.
     """
 
@@ -76,7 +76,7 @@ def _from_run(path: Path) -> Subject:
     state = run.trained(world)
     course = state.course
     return Subject(
-        run.config, world, _reader(state.pose.network), course.images, course.seconds, sittings(path)[0].commit
+        run.config, world, _reader(state.pose.network), course.all_images, course.all_seconds, sittings(path)[0].commit
     )
 
 

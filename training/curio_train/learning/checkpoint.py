@@ -4,7 +4,7 @@
 
     RUN/config.json
         checkpoints/00001200/tensors.safetensors     weights, buffers, Adam's moments
-                             course.json             step, images, seconds, smoothed image loss
+                             course.json             see Course
         checkpoints/00001400/…                       the last two are kept
         history.jsonl  samples.png  tensorboard/     written by ``progress``
 """
@@ -27,7 +27,6 @@ from curio_train.learning.state import Course, TrainState
 from curio_train.worlds.base import World
 
 _NUM_KEPT = 2
-_POSE = "pose.network."  # how the tensors of TrainState.pose.network are named
 
 
 class RunFolder:
@@ -108,47 +107,29 @@ class RunFolder:
         Raises:
             CheckpointError: The last checkpoint is damaged, or of other networks.
         """
-        checkpoints = self.checkpoints()
-        if not checkpoints:
+        if not self.checkpoints():
             return
-        last = checkpoints[-1]
+        tensors, course = self.last()
         try:
-            course = Course(**json.loads((last / "course.json").read_bytes()))
-            state.load(load((last / "tensors.safetensors").read_bytes()), course)
-        except (OSError, ValueError, TypeError, RuntimeError, SafetensorError) as exc:
-            raise CheckpointError(
-                f"checkpoint {last} cannot be read ({exc}); delete this folder to go on from the one before it"
-            ) from exc
+            state.load(tensors, course)
+        except RuntimeError as exc:
+            raise CheckpointError(_unreadable(self.checkpoints()[-1], exc)) from exc
 
-    def begin_with(self, state: TrainState) -> None:
-        """Give ``state`` this run's network, and nothing else of it.
+    def last(self) -> tuple[dict[str, Tensor], Course]:
+        """The last checkpoint: all tensors of the :class:`TrainState` by name, and how far the run was.
 
         Raises:
-            UsageError: The networks are not of one kind.
             CheckpointError: There is no checkpoint, or it is damaged.
         """
-        tensors = self._last_tensors()
-        network = {name.removeprefix(_POSE): value for name, value in tensors.items() if name.startswith(_POSE)}
-        try:
-            state.pose.network.load_state_dict(network)
-        except RuntimeError as exc:
-            raise UsageError(
-                f"--init {self.path}: its network does not fit this world ({str(exc).splitlines()[-1].strip()}); "
-                "expected a run of the same world and the same network flags"
-            ) from exc
-
-    def _last(self) -> Path:
         checkpoints = self.checkpoints()
         if not checkpoints:
             raise CheckpointError(f"{self.path} has no checkpoint yet; train it first: --resume {self.path}")
-        return checkpoints[-1]
-
-    def _last_tensors(self) -> dict[str, Tensor]:
-        file = self._last() / "tensors.safetensors"
+        last = checkpoints[-1]
         try:
-            return load(file.read_bytes())
-        except (OSError, ValueError, SafetensorError) as exc:
-            raise CheckpointError(f"{file} cannot be read ({exc}); delete its folder to use the one before it") from exc
+            course = Course(**json.loads((last / "course.json").read_bytes()))
+            return load((last / "tensors.safetensors").read_bytes()), course
+        except (OSError, ValueError, TypeError, SafetensorError) as exc:
+            raise CheckpointError(_unreadable(last, exc)) from exc
 
     def trained(self, world: World) -> TrainState:
         """The last checkpoint on the CPU with the network in evaluation mode: what is exported and scored.
@@ -156,9 +137,12 @@ class RunFolder:
         Raises:
             CheckpointError: There is no checkpoint yet, or it cannot be read.
         """
-        self._last()
+        tensors, course = self.last()
         state = TrainState(self.config, world, torch.device("cpu"))
-        self.restore(state)
+        try:
+            state.load(tensors, course)
+        except RuntimeError as exc:
+            raise CheckpointError(_unreadable(self.checkpoints()[-1], exc)) from exc
         state.pose.network.eval()
         return state
 
@@ -170,6 +154,10 @@ class RunFolder:
             else "there is no earlier one"
         )
         return f"cannot write checkpoint {target}: {exc.strerror}; {remains}"
+
+
+def _unreadable(checkpoint: Path, exc: Exception) -> str:
+    return f"checkpoint {checkpoint} cannot be read ({exc}); delete this folder to go on from the one before it"
 
 
 def _write_synced(path: Path, content: bytes) -> None:

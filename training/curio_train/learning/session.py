@@ -6,6 +6,7 @@ from typing import Literal
 
 from curio_train.config import RunConfig
 from curio_train.learning.checkpoint import RunFolder
+from curio_train.learning.initial import begin_with
 from curio_train.learning.interruption import Interruption
 from curio_train.learning.loop import Outcome, Trainer, train
 from curio_train.learning.parallel import ranks
@@ -57,10 +58,10 @@ def learn(
         trainer = Trainer(config, world, sources, here)
         if here.device.type == "cpu":
             choose_threads(trainer.rehearse)
-        if resume:
+        if resume and run.checkpoints():
             run.restore(trainer.state)
         elif config.init is not None:
-            RunFolder.open(config.init).begin_with(trainer.state)
+            begin_with(trainer.state, config.init)
         with reporting(path, trainer.state.course) if here.leads else nullcontext() as reporter:
             outcome = train(
                 trainer,

@@ -65,9 +65,9 @@ class Learner(Generic[N]):
         Raises:
             RuntimeError: Names or shapes differ from this network's.
         """
-        self.network.load_state_dict(_under("network.", tensors))
+        self.network.load_state_dict(under("network.", tensors))
         entries: dict[int, dict[str, Tensor]] = {}
-        for key, value in _under("optimizer.", tensors).items():
+        for key, value in under("optimizer.", tensors).items():
             number, name = key.split(".")
             entries.setdefault(int(number), {})[name] = value
         self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": entries})
@@ -82,12 +82,26 @@ class Course:
         images: Images shown.
         seconds: Time spent training, over all sessions.
         image_loss: Unweighted and smoothed; None before the first step and for methods without it.
+        images_before: Shown to the network that it began as, and to those that one began as.
+        seconds_before: Spent on them.
     """
 
     step: int = 0
     images: int = 0
     seconds: float = 0.0
     image_loss: float | None = None
+    images_before: int = 0
+    seconds_before: float = 0.0
+
+    @property
+    def all_images(self) -> int:
+        """That the network has seen, from random weights on."""
+        return self.images_before + self.images
+
+    @property
+    def all_seconds(self) -> float:
+        """Spent on the network, from random weights on."""
+        return self.seconds_before + self.seconds
 
 
 class TrainState:
@@ -127,9 +141,10 @@ class TrainState:
             RuntimeError: The tensors are not those of these networks.
         """
         for who, learner in self.learners.items():
-            learner.load(_under(f"{who}.", tensors))
+            learner.load(under(f"{who}.", tensors))
         self.course = course
 
 
-def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Those whose names begin with ``prefix``, without it."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -1,0 +1,142 @@
+"""What a run may begin with: runs and exported models give the same network, and what they are not is told."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from curio_train.config import NetworkConfig, RunConfig
+from curio_train.errors import CheckpointError, CurioError, UsageError
+from curio_train.export import export
+from curio_train.learning.checkpoint import RunFolder
+from curio_train.learning.initial import begin_with, uses_synthetic_labels
+from curio_train.learning.interruption import Interruption
+from curio_train.learning.session import learn
+from curio_train.learning.state import TrainState
+from curio_train.model_card import EVALUATION_FILE
+from curio_train.onnx_file import OnnxModel
+from curio_train.worlds.circles import Circles
+from curio_train.worlds.options import CirclesOptions
+from torch import Tensor
+
+WriteRun = Callable[..., Path]
+CONFIG = RunConfig(CirclesOptions(), method="noncur")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, write_run: WriteRun) -> Path:
+    return write_run(tmp_path_factory.mktemp("runs") / "circles")
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory, run: Path) -> Path:
+    """Version 1 in float32, version 2 in float16."""
+    models = tmp_path_factory.mktemp("models")
+    export(run, models)
+    return export(run, models, half=True).path.parent
+
+
+def begun(path: Path, config: RunConfig = CONFIG) -> TrainState:
+    state = TrainState(config, Circles(), torch.device("cpu"))
+    begin_with(state, path)
+    return state
+
+
+def network(state: TrainState) -> dict[str, Tensor]:
+    return state.pose.network.state_dict()
+
+
+def test_a_model_gives_the_network_that_it_was_exported_from(run: Path, model: Path) -> None:
+    """Batch norm's statistics, which write_run draws at random, among it."""
+    expected = network(RunFolder.open(run).trained(Circles()))
+    assert not torch.equal(expected["encoder.layers.0.weight"], network(begun_anew())["encoder.layers.0.weight"])
+    for path, tolerance in ((run, 0.0), (model / "1", 0.0), (model / "2", 1e-3), (model, 1e-3)):
+        state = begun(path)
+        found = network(state)
+        assert found.keys() == expected.keys()
+        for name, value in expected.items():
+            assert found[name].dtype == value.dtype
+            assert torch.allclose(found[name], value, rtol=tolerance, atol=1e-6 * bool(tolerance)), name
+        assert (state.course.all_images, state.course.images, state.course.all_seconds) == (64, 0, 1.5)
+    assert not torch.equal(network(begun(model))["encoder.layers.0.weight"], expected["encoder.layers.0.weight"])
+    assert (model / "2" / "weights.safetensors").stat().st_size < 0.51 * (
+        model / "1" / "weights.safetensors"
+    ).stat().st_size
+
+
+def begun_anew() -> TrainState:
+    return TrainState(CONFIG, Circles(), torch.device("cpu"))
+
+
+def test_images_count_on_over_models_and_in_their_cards(model: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    config = replace(CONFIG, images=8, init=model, recipe=replace(CONFIG.recipe, batch_size=4, micro_batch_size=4))
+    learn(config, path, Interruption(), resume=False, cache=tmp_path / "cache")
+    learn(replace(config, images=12), path, Interruption(), resume=True, cache=tmp_path / "cache")
+    (path / EVALUATION_FILE).write_text('{"images_seen": 76, "split": "test", "num_images": 5, "metrics": {"a": 2.0}}')
+    version = export(path, tmp_path / "models").path
+    spec = OnnxModel.open(version / "model.onnx").spec
+    assert spec.images_seen == 64 + 12
+    assert spec.training_seconds > 1.5
+    card = (version.parent / "CARD.md").read_text()
+    assert "| images seen | 76, 12 of them since it was circles |" in card
+    assert "| a | 2 |" in card
+    assert "`curio-train circles --init models/circles/1`" in card
+    assert begun(version).course.images_before == 76
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_with_the_same_network(run: Path, tmp_path: Path) -> None:
+    still = replace(CONFIG.recipe, batch_size=4, micro_batch_size=4, learning_rate=1e-30)
+    config = replace(CONFIG, images=4, init=run, recipe=still)
+    RunFolder(tmp_path / "run", config).write_config(new=True)
+    learn(config, tmp_path / "run", Interruption(), resume=True, cache=tmp_path / "cache")
+    learned, expected = (network(RunFolder.open(path).trained(Circles())) for path in (tmp_path / "run", run))
+    assert torch.equal(learned["encoder.layers.0.weight"], expected["encoder.layers.0.weight"])
+
+
+def test_what_taught_a_model_is_known_of_runs_that_begin_with_it(model: Path, run: Path, tmp_path: Path) -> None:
+    assert not uses_synthetic_labels(CONFIG)
+    assert all(uses_synthetic_labels(replace(CONFIG, method=method)) for method in ("super", "sleep", "wake_sleep"))
+    assert not uses_synthetic_labels(replace(CONFIG, init=run))
+    assert not uses_synthetic_labels(replace(CONFIG, init=model))
+    assert uses_synthetic_labels(replace(CONFIG, init=tmp_path / "gone"))
+    slept = tmp_path / "slept"
+    RunFolder(slept, replace(CONFIG, method="sleep")).write_config(new=True)
+    assert uses_synthetic_labels(replace(CONFIG, init=slept))
+
+
+def without_weights(version: Path) -> None:
+    (version / "weights.safetensors").unlink()
+
+
+def cut(version: Path) -> None:
+    file = version / "weights.safetensors"
+    file.write_bytes(file.read_bytes()[:-7])
+
+
+def of_nothing(version: Path) -> None:
+    (version / "model.onnx").unlink()
+
+
+@pytest.mark.parametrize(
+    ("damage", "error", "text"),
+    [
+        (without_weights, CheckpointError, r"circles/1 was exported without weights to go on from"),
+        (cut, CheckpointError, r"weights\.safetensors cannot be read .*export the model anew"),
+        (of_nothing, UsageError, "neither a run folder .* nor a model"),
+    ],
+)
+def test_what_cannot_be_begun_with_is_told(
+    run: Path, tmp_path: Path, damage: Callable[[Path], None], error: type[CurioError], text: str
+) -> None:
+    version = export(run, tmp_path).path
+    damage(version)
+    with pytest.raises(error, match=text):
+        begun(version)
+
+
+def test_networks_of_other_shapes_name_what_differs(model: Path) -> None:
+    other = replace(CONFIG, network=NetworkConfig(hidden=16))
+    with pytest.raises(UsageError, match=r"--init .*: its network does not fit this world \(size mismatch for heads"):
+        begun(model, other)
