@@ -1,8 +1,8 @@
 """Who may work, who waits, who is sent away.
 
-Every call has a thread of its own, and a waiting thread costs almost nothing; what is scarce is cores. So a call takes
-one of a few slots before it decodes or infers (work that leaves the interpreter's lock), and gives it back after. A
-call beyond the queue is refused at once: an answer that would come too late costs everyone.
+What is scarce is cores. So a call takes one of a few slots before it decodes or infers (work that leaves the
+interpreter's lock), and gives it back after; the one that has waited longest gets it next. A call beyond the queue is
+refused at once: an answer that would come too late costs everyone.
 """
 
 import os
@@ -18,15 +18,24 @@ from typing import NoReturn, Protocol
 from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
 from curio_serve.telemetry import Metrics
 
+_PROMISE_S = 1.0
+
 
 class Call(Protocol):
-    """What admission needs to know of a call; gRPC's servicer context knows it."""
+    """What admission needs to know of a call that waits on its own thread; gRPC's servicer context knows it."""
 
     def time_remaining(self) -> float | None:
         """Seconds until the caller's deadline; None without one."""
 
     def add_callback(self, callback: Callable[[], None]) -> bool:
         """Have a function called when the call ends; False if it has ended already."""
+
+
+class Waiter(Protocol):
+    """Who waits in the queue."""
+
+    def tell(self) -> None:
+        """It has a slot now."""
 
 
 def num_cores() -> int:
@@ -39,52 +48,100 @@ def num_cores() -> int:
     return cores if quota == "max" else max(1, min(cores, round(int(quota) / int(period))))
 
 
-class _Waiter:
-    """A call in the queue: waiting, until it is granted a slot or leaves."""
+class _Thread:
+    """A thread that waits, until its call is granted a slot or ends."""
 
     def __init__(self) -> None:
-        self.news: queue.SimpleQueue[None] = queue.SimpleQueue()  # a quarter of an Event's cost
-        self.is_granted = False
+        self._news: queue.SimpleQueue[None] = queue.SimpleQueue()  # a quarter of an Event's cost
 
     def tell(self) -> None:
-        """Wake it up: it was granted a slot, or its call has ended."""
-        self.news.put(None)
+        self._news.put(None)
+
+    def is_told_within(self, limit_s: float | None) -> bool:
+        try:
+            self._news.get(timeout=limit_s)
+        except queue.Empty:
+            return False
+        return True
 
 
 class WorkQueue:
     """A fixed number of slots behind a bounded queue, first come, first served."""
 
     def __init__(self, num_slots: int, max_waiting: int, metrics: Metrics) -> None:
-        self._num_slots, self._max_waiting = num_slots, max_waiting
+        self.num_slots = num_slots
+        self._max_waiting = max_waiting
         self._lock = threading.Lock()
         self._num_free = num_slots
-        self._waiting: deque[_Waiter] = deque()
+        self._waiting: deque[Waiter] = deque()
+        self._promised: dict[Waiter, float] = {}  # since when, oldest first
         self._mean_work_s = 0.005
         metrics.waiting.set_function(lambda: len(self._waiting))
         metrics.working.set_function(lambda: num_slots - self._num_free)
 
     @property
-    def is_full(self) -> bool:
-        """Whether a further call would be refused."""
-        return not self._num_free and len(self._waiting) >= self._max_waiting
+    def is_busy(self) -> bool:
+        """Whether a further call would have to wait."""
+        return not self._num_free
 
-    def refuse(self) -> NoReturn:
-        """Send a call away.
+    def promise(self, waiter: Waiter) -> None:
+        """Keep a place for a call whose message is still on its way: to refuse it later would cost its reading.
+
+        The place is kept for a second, so that callers who never send their message do not fill the queue.
 
         Raises:
-            Overloaded: Says when to come back.
+            Overloaded: There is none.
         """
-        waiting = len(self._waiting)
-        retry_s = self._mean_work_s * (waiting + 1) / self._num_slots
-        raise Overloaded(
-            f"{self._num_slots} requests are being worked on and {waiting} are waiting, which is the limit "
-            f"(--workers, --queue); try again in {retry_s:.2g} s",
-            retry_s,
-        )
+        with self._lock:
+            self._drop_old_promises()
+            if len(self._promised) + len(self._waiting) >= self._max_waiting + self._num_free:
+                self._refuse()
+            self._promised[waiter] = time.monotonic()
+
+    def enter(self, waiter: Waiter, *, always: bool = False) -> bool:
+        """Take a free slot (True) or a place in the queue (False); who waits there is told when it has a slot.
+
+        Args:
+            waiter: With or without a promise.
+            always: Wait even behind a full queue, for callers that are bounded otherwise.
+
+        Raises:
+            Overloaded: The queue is full.
+        """
+        with self._lock:
+            is_promised = self._promised.pop(waiter, None) is not None
+            if self._num_free:
+                self._num_free -= 1
+                return True
+            if len(self._waiting) >= self._max_waiting and not (is_promised or always):
+                self._refuse()
+            self._waiting.append(waiter)
+            return False
+
+    def withdraw(self, waiter: Waiter) -> bool:
+        """Give up a promise or a place in the queue; False if it has neither, but perhaps a slot."""
+        with self._lock:
+            if self._promised.pop(waiter, None) is not None:
+                return True
+            try:
+                self._waiting.remove(waiter)
+            except ValueError:
+                return False
+            return True
+
+    def leave(self, worked_s: float) -> Waiter | None:
+        """Hand a slot on to the first in the queue, who is returned and has to be told, or free it."""
+        with self._lock:
+            # A smoothed guess is enough to tell clients when to come back.
+            self._mean_work_s += 0.05 * (worked_s - self._mean_work_s)
+            if self._waiting:
+                return self._waiting.popleft()
+            self._num_free += 1
+            return None
 
     @contextmanager
     def slot(self, call: Call, *, always: bool = False) -> Iterator[float]:
-        """Hold a slot while working. Gives the seconds it took to get it.
+        """Hold a slot while working on this thread. Gives the seconds it took to get it.
 
         Args:
             call: Its deadline bounds the wait, its end takes it out of the queue.
@@ -97,54 +154,51 @@ class WorkQueue:
         """
         remaining_s = call.time_remaining()
         begun = time.monotonic()
-        waiter = self._enter(always)
-        if waiter is not None:
-            self._wait(waiter, call, remaining_s)
+        thread = _Thread()
+        if not self.enter(thread, always=always):
+            self._wait(thread, call, remaining_s)
         granted = time.monotonic()
         try:
             if remaining_s is not None and granted - begun >= remaining_s:
-                raise DeadlineError(f"the deadline passed after {granted - begun:.3g} s in the queue; nothing was done")
+                raise passed_in_queue(granted - begun)
             yield granted - begun
         finally:
-            self._leave(time.monotonic() - granted)
+            following = self.leave(time.monotonic() - granted)
+            if following is not None:
+                following.tell()
 
-    def _enter(self, always: bool) -> _Waiter | None:
-        """Take a free slot (None) or a place in the queue."""
-        with self._lock:
-            if self._num_free:
-                self._num_free -= 1
-                return None
-            if self.is_full and not always:
-                self.refuse()
-            waiter = _Waiter()
-            self._waiting.append(waiter)
-            return waiter
-
-    def _wait(self, waiter: _Waiter, call: Call, remaining_s: float | None) -> None:
+    def _wait(self, thread: _Thread, call: Call, remaining_s: float | None) -> None:
         """Return with a slot, or raise without one."""
-        if not call.add_callback(waiter.tell):
-            waiter.tell()
-        try:
-            waiter.news.get(timeout=remaining_s)
-            is_told = True
-        except queue.Empty:
-            is_told = False
-        with self._lock:
-            if waiter.is_granted:
-                return
-            self._waiting.remove(waiter)
+        if not call.add_callback(thread.tell):
+            thread.tell()
+        is_told = thread.is_told_within(remaining_s)
+        if not self.withdraw(thread):
+            return
         if is_told:
-            raise CallCancelled("the client hung up while the call was in the queue; nothing was done")
-        raise DeadlineError(f"the deadline passed after {remaining_s:.3g} s in the queue; nothing was done")
+            raise hung_up_in_queue()
+        raise passed_in_queue(remaining_s or 0.0)
 
-    def _leave(self, worked_s: float) -> None:
-        """Hand the slot to the first in the queue, or free it."""
-        with self._lock:
-            # A smoothed guess is enough to tell clients when to come back.
-            self._mean_work_s += 0.05 * (worked_s - self._mean_work_s)
-            if self._waiting:
-                waiter = self._waiting.popleft()
-                waiter.is_granted = True
-                waiter.tell()
-            else:
-                self._num_free += 1
+    def _drop_old_promises(self) -> None:
+        end = time.monotonic() - _PROMISE_S
+        while self._promised and self._promised[first := next(iter(self._promised))] < end:
+            del self._promised[first]
+
+    def _refuse(self) -> NoReturn:
+        waiting = len(self._waiting) + len(self._promised)
+        # Two digits say enough, and let the answers to a flood be made once for many.
+        retry_s = float(f"{self._mean_work_s * (waiting + 1) / self.num_slots:.2g}")
+        raise Overloaded(
+            f"{self.num_slots} requests are being worked on and {waiting} are waiting, which is the limit "
+            f"(--workers, --queue); try again in {retry_s:g} s",
+            retry_s,
+        )
+
+
+def passed_in_queue(waited_s: float) -> DeadlineError:
+    """What a call gets whose deadline passed while it waited."""
+    return DeadlineError(f"the deadline passed after {waited_s:.3g} s in the queue; nothing was done")
+
+
+def hung_up_in_queue() -> CallCancelled:
+    """What a call gets that ended while it waited."""
+    return CallCancelled("the client hung up while the call was in the queue; nothing was done")

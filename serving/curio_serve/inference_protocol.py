@@ -11,8 +11,8 @@ import numpy as np
 from curio_proto.inference import inference_pb2 as messages
 from curio_proto.inference.inference_pb2_grpc import GRPCInferenceServiceServicer
 
-from curio_serve.admission import WorkQueue
-from curio_serve.errors import ArgumentError, ModelNotFound
+from curio_serve.direct_calls import Caller, Method
+from curio_serve.errors import ArgumentError, CurioError, ModelNotFound
 from curio_serve.model import INPUT, Model, Outputs
 from curio_serve.repository import Repository
 from curio_serve.service import CallGuard, Context
@@ -25,8 +25,8 @@ _FP32 = np.dtype("<f4")
 class InferenceService(GRPCInferenceServiceServicer):
     """Answers ``inference.GRPCInferenceService``."""
 
-    def __init__(self, repository: Repository, work: WorkQueue, metrics: Metrics) -> None:
-        self._repository, self._work = repository, work
+    def __init__(self, repository: Repository, metrics: Metrics) -> None:
+        self._repository = repository
         self._guard = CallGuard(metrics)
         self._is_ready = True
 
@@ -51,12 +51,16 @@ class InferenceService(GRPCInferenceServiceServicer):
     def ModelMetadata(self, request: messages.ModelMetadataRequest, context: Context) -> messages.ModelMetadataResponse:
         return self._guard.run("ModelMetadata", "", context, partial(self._metadata, request))
 
-    def ModelInfer(self, request: messages.ModelInferRequest, context: Context) -> messages.ModelInferResponse:
-        return self._guard.run("ModelInfer", request.id[:128], context, partial(self._infer, request, context))
+    @property
+    def direct(self) -> Method:
+        """``ModelInfer``, for :mod:`curio_serve.direct_calls`."""
+        refused = partial(self._guard.refused, "ModelInfer", "")
+        return Method("/inference.GRPCInferenceService/ModelInfer", messages.ModelInferRequest, self._answer, refused)
 
-    def refuse(self, method: str, context: Context) -> None:
-        """Abort a call because the queue is full; its message was not read."""
-        self._guard.run(method, "", context, self._work.refuse)
+    def _answer(
+        self, request: messages.ModelInferRequest, caller: Caller, _waited_s: float
+    ) -> messages.ModelInferResponse | CurioError:
+        return self._guard.attempt("ModelInfer", request.id[:128], caller, partial(self._infer, request))
 
     def _model_ready(self, request: messages.ModelReadyRequest) -> messages.ModelReadyResponse:
         try:
@@ -76,16 +80,14 @@ class InferenceService(GRPCInferenceServiceServicer):
             answer.outputs.add(name=name, datatype="FP32", shape=[-1, *shape])
         return answer
 
-    def _infer(self, request: messages.ModelInferRequest, context: Context) -> messages.ModelInferResponse:
+    def _infer(self, request: messages.ModelInferRequest) -> messages.ModelInferResponse:
         model = self._repository.get(request.model_name, _version(request.model_version))
         images = _images(request, model)
         names = [output.name for output in request.outputs] or list(model.output_names)
         if (unknown := set(names) - set(model.output_names)) or len(names) > len(model.output_names):
             found = sorted(unknown)[:4] or f"{len(names)} names"
             raise ArgumentError(f"outputs has {found}; model {model.label} has each of {model.output_names} once")
-        with self._work.slot(context):
-            outputs = model.run(images)
-        return _answer(request.id, model, names, outputs)
+        return _answer(request.id, model, names, model.run(images))
 
 
 def _version(text: str) -> int:

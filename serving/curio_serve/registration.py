@@ -3,72 +3,45 @@
 Left to itself, grpcio answers such a message but never lets go of its call: after as many of them as a connection may
 have streams, that connection is dead, and a server with any of them waits out its whole grace time at the end. Here the
 bytes come to the handler's thread unread, and are parsed there.
-
-And a call whose work would find no place in the queue is refused before its message is read, which is most of what such
-a call costs: under a flood the time goes to calls that are answered.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial, update_wrapper
-from typing import Any, Protocol
+from typing import Any
 
 import grpc
 from google.protobuf.descriptor import MethodDescriptor, ServiceDescriptor
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
-from curio_serve.admission import WorkQueue
-from curio_serve.errors import ArgumentError
-from curio_serve.wire import status_from_error
+from curio_serve.wire import status_from_error, unreadable
 
 Behavior = Callable[..., Any]
 
 
-class Refusing(Protocol):
-    """A servicer whose work goes through the queue."""
+def register(server: grpc.Server, service: ServiceDescriptor, servicer: object, without: Collection[str] = ()) -> None:
+    """Answer a service's calls (one message or streams both ways) with the servicer's methods of the same names.
 
-    def refuse(self, method: str, context: Any) -> None:
-        """Abort a call of that method because the queue is full."""
-
-
-def register(server: grpc.Server, service: ServiceDescriptor, servicer: object) -> None:
-    """Answer a service's calls (one message or streams both ways) with the servicer's methods of the same names."""
-    server.add_generic_rpc_handlers((_Handlers(_handlers(service, servicer)),))
-
-
-def register_behind(
-    work: WorkQueue, server: grpc.Server, service: ServiceDescriptor, servicer: Refusing, methods: Collection[str]
-) -> None:
-    """The same; calls of these methods are refused by the servicer while the queue is full."""
-    refusals = {f"/{service.full_name}/{name}": _refusal(servicer, name) for name in methods}
-    server.add_generic_rpc_handlers((_Handlers(_handlers(service, servicer), work, refusals),))
+    Args:
+        server: Not started yet.
+        service: Its description.
+        servicer: Has a method for each of the service's.
+        without: Methods that are answered otherwise.
+    """
+    handlers = {
+        f"/{service.full_name}/{method.name}": _handler(method, getattr(servicer, method.name))
+        for method in service.methods
+        if method.name not in without
+    }
+    server.add_generic_rpc_handlers((_Handlers(handlers),))
 
 
 class _Handlers(grpc.GenericRpcHandler):
-    """Chooses how a call is answered when it comes, before its message."""
-
-    def __init__(
-        self,
-        handlers: Mapping[str, grpc.RpcMethodHandler],
-        work: WorkQueue | None = None,
-        refusals: Mapping[str, grpc.RpcMethodHandler] | None = None,
-    ) -> None:
-        self._handlers, self._work, self._refusals = handlers, work, refusals or {}
+    def __init__(self, handlers: Mapping[str, grpc.RpcMethodHandler]) -> None:
+        self._handlers = handlers
 
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> grpc.RpcMethodHandler | None:
-        method = handler_call_details.method
-        if self._work is not None and self._work.is_full and method in self._refusals:
-            return self._refusals[method]
-        return self._handlers.get(method)
-
-
-def _handlers(service: ServiceDescriptor, servicer: object) -> dict[str, grpc.RpcMethodHandler]:
-    return {f"/{service.full_name}/{m.name}": _handler(m, getattr(servicer, m.name)) for m in service.methods}
-
-
-def _refusal(servicer: Refusing, method: str) -> grpc.RpcMethodHandler:
-    """A stream's handler, whatever the method: it need not take the message."""
-    return grpc.stream_stream_rpc_method_handler(lambda _requests, context: servicer.refuse(method, context))
+        return self._handlers.get(handler_call_details.method)
 
 
 def _handler(method: MethodDescriptor, behavior: Behavior) -> grpc.RpcMethodHandler:
@@ -96,9 +69,5 @@ def _parse(kind: type[Message], data: bytes, context: grpc.ServicerContext) -> M
     try:
         return kind.FromString(data)
     except DecodeError:
-        name = kind.DESCRIPTOR.full_name
-        error = ArgumentError(
-            f"the message of {len(data)} bytes cannot be read as {name}; was the client made for this API?"
-        )
-        context.abort_with_status(status_from_error(error))
+        context.abort_with_status(status_from_error(unreadable(kind, len(data))))
         raise

@@ -1,7 +1,8 @@
 """Who may call: TLS, client certificates, bearer tokens."""
 
 import hmac
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -15,10 +16,30 @@ from curio_serve.wire import status_from_error
 _HEALTH_PREFIX = f"/{health.SERVICE_NAME}/"
 
 
+class Tokens:
+    """The bearer tokens that callers may show; none: everybody may call."""
+
+    def __init__(self, known: Sequence[bytes] = ()) -> None:
+        self._known = known
+
+    def refuse(self, metadata: Iterable[tuple[str, str | bytes]]) -> TokenError | None:
+        """Why a call with this metadata may not be made, if so."""
+        if not self._known:
+            return None
+        shown = dict(metadata).get("authorization", "")
+        text = shown.encode() if isinstance(shown, str) else shown
+        token = text.removeprefix(b"Bearer ")
+        # Every token is compared, in constant time, so that timing tells nothing.
+        matches = [hmac.compare_digest(token, known) for known in self._known]
+        if token != text and any(matches):
+            return None
+        return TokenError("bearer token missing or unknown; send the metadata `authorization: Bearer <token>`")
+
+
 class TokenInterceptor(grpc.ServerInterceptor):
     """Lets calls pass that show a known bearer token, and health checks."""
 
-    def __init__(self, tokens: list[bytes]) -> None:
+    def __init__(self, tokens: Tokens) -> None:
         self._tokens = tokens
 
     def intercept_service(
@@ -26,22 +47,16 @@ class TokenInterceptor(grpc.ServerInterceptor):
         continuation: Callable[[grpc.HandlerCallDetails], "grpc.RpcMethodHandler[Any, Any] | None"],
         handler_call_details: grpc.HandlerCallDetails,
     ) -> "grpc.RpcMethodHandler[Any, Any] | None":
-        shown = dict(handler_call_details.invocation_metadata).get("authorization", "")
-        if handler_call_details.method.startswith(_HEALTH_PREFIX) or self._knows(shown):
+        if handler_call_details.method.startswith(_HEALTH_PREFIX):
             return continuation(handler_call_details)
-        return grpc.stream_stream_rpc_method_handler(_refuse_token)
-
-    def _knows(self, shown: str | bytes) -> bool:
-        text = shown.encode() if isinstance(shown, str) else shown
-        token = text.removeprefix(b"Bearer ")
-        # Every token is compared, in constant time, so that timing tells nothing.
-        matches = [hmac.compare_digest(token, known) for known in self._tokens]
-        return token != text and any(matches)
+        error = self._tokens.refuse(handler_call_details.invocation_metadata)
+        if error is None:
+            return continuation(handler_call_details)
+        return grpc.stream_stream_rpc_method_handler(partial(_abort, status_from_error(error)))
 
 
-def _refuse_token(_requests: Iterator[bytes], context: grpc.ServicerContext) -> NoReturn:
-    error = TokenError("bearer token missing or unknown; send the metadata `authorization: Bearer <token>`")
-    context.abort_with_status(status_from_error(error))
+def _abort(status: grpc.Status, _requests: Iterator[bytes], context: grpc.ServicerContext) -> NoReturn:
+    context.abort_with_status(status)
 
 
 def server_credentials(config: ServeConfig) -> grpc.ServerCredentials | None:

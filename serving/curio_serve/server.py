@@ -16,13 +16,14 @@ from prometheus_client import CollectorRegistry, start_http_server
 
 from curio_serve.admission import WorkQueue, num_cores
 from curio_serve.config import ServeConfig
+from curio_serve.direct_calls import DirectCalls
 from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.inference_protocol import InferenceService
 from curio_serve.model import Runtime
 from curio_serve.model_check import ChildCheck
-from curio_serve.registration import register, register_behind
+from curio_serve.registration import register
 from curio_serve.repository import Change, Repository
-from curio_serve.security import TokenInterceptor, read_tokens, server_credentials
+from curio_serve.security import TokenInterceptor, Tokens, read_tokens, server_credentials
 from curio_serve.service import Limits, PoseService
 from curio_serve.telemetry import Metrics, log
 
@@ -53,9 +54,10 @@ class PoseServer:
         # Watchers of health wait without a thread each.
         watchers = ThreadPoolExecutor(1)
         self._health = health.HealthServicer(experimental_non_blocking=True, experimental_thread_pool=watchers)
-        self._inference = InferenceService(self._repository, self._work, self._metrics)
+        self._inference = InferenceService(self._repository, self._metrics)
         self._check = ChildCheck()
         self._server: grpc.Server | None = None
+        self._direct: DirectCalls | None = None
         self._stopped = threading.Event()
 
     def start(self) -> list[str]:
@@ -77,23 +79,22 @@ class PoseServer:
                 f"no model could be loaded from {self.config.models}; the log says why each was refused. "
                 "Export one with curio-export"
             )
-        self._server = self._build()
+        self._server, self._direct = self._build()
         addresses = [self._open_port(self._server)]
         if self.config.metrics_port is not None:
             addresses.append(self._open_metrics(self.config.metrics_port))
         self._server.start()
+        self._direct.start()
         self._announce()
         return addresses
 
-    def _build(self) -> grpc.Server:
+    def _build(self) -> tuple[grpc.Server, DirectCalls]:
         config = self.config
-        interceptors: list[grpc.ServerInterceptor] = []
-        if config.token_file:
-            interceptors.append(TokenInterceptor(read_tokens(config.token_file)))
+        tokens = Tokens(read_tokens(config.token_file) if config.token_file else ())
         server = grpc.server(
             # Threads are made as calls need them, so their number follows the load; one that waits takes 16 kB.
             ThreadPoolExecutor(config.max_calls, thread_name_prefix="curio-call"),
-            interceptors=interceptors,
+            interceptors=[TokenInterceptor(tokens)],
             options=channel_options(config),
             maximum_concurrent_rpcs=config.max_calls,
         )
@@ -106,12 +107,14 @@ class PoseServer:
             config.full_decode,
         )
         pose = PoseService(self._repository, self._work, limits, self._metrics)
-        register_behind(self._work, server, _POSE, pose, ["Detect"])
-        register_behind(self._work, server, _INFERENCE, self._inference, ["ModelInfer"])
+        methods = [pose.direct, self._inference.direct]
+        direct = DirectCalls(server, self._work, methods, config.max_calls, tokens.refuse)
+        register(server, _POSE, pose, without=["Detect"])
+        register(server, _INFERENCE, self._inference, without=["ModelInfer"])
         register(server, _HEALTH, self._health)
         names = [service.full_name for service in (_POSE, _INFERENCE, _HEALTH, _REFLECTION)]
         register(server, _REFLECTION, reflection.ReflectionServicer(names))
-        return server
+        return server, direct
 
     def _open_port(self, server: grpc.Server) -> str:
         host, port = self.config.host, self.config.port
@@ -162,12 +165,13 @@ class PoseServer:
 
     def _drain(self) -> None:
         """Refuse new calls and let accepted ones finish."""
-        if self._server is None:
+        if self._server is None or self._direct is None:
             return
         log(logging.INFO, "draining", grace_s=self.config.grace_s)
         self._inference.drain()
         self._health.enter_graceful_shutdown()
         self._server.stop(self.config.grace_s).wait()
+        self._direct.stop()
 
     def _watch(self) -> None:
         """Pick up new model versions for as long as the server lives."""

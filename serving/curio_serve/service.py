@@ -5,6 +5,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import TypeVar
@@ -17,9 +18,10 @@ from curio_serve import image, wire
 from curio_serve.admission import WorkQueue
 from curio_serve.camera import PinholeCamera
 from curio_serve.detector import Detector
+from curio_serve.direct_calls import Caller, Method
 from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, InternalError, Overloaded, status_of
 from curio_serve.repository import Repository
-from curio_serve.telemetry import Metrics, log
+from curio_serve.telemetry import LOGGER, Metrics, log
 
 Context = grpc.ServicerContext
 Answer = TypeVar("Answer")
@@ -51,34 +53,38 @@ class CallGuard:
             context.abort_with_status(wire.status_from_error(answer))
         return answer
 
-    def attempt(
-        self, method: str, request_id: str, context: Context, body: Callable[[], Answer]
-    ) -> Answer | CurioError:
+    def attempt(self, method: str, request_id: str, caller: Caller, body: Callable[[], Answer]) -> Answer | CurioError:
         """Call the body; what it raises is counted, logged and returned."""
-        code = "UNKNOWN"
         try:
             answer = body()
-            code = "OK"
         except CurioError as exc:
-            code = status_of(exc)
-            self._log(exc, method=method, request_id=request_id, code=code, peer=context.peer())
+            self.refused(method, request_id, exc, caller)
             return exc
-        finally:
-            self._requests(method, code).inc()
+        except Exception:  # noqa: BLE001 - a fault of ours, which its caller shall hear of
+            LOGGER.exception("a request could not be answered")
+            error = InternalError("the server failed on this request; its log says where")
+            self.refused(method, request_id, error, caller)
+            return error
+        self._requests(method, "OK").inc()
         log(logging.DEBUG, "answered", method=method, request_id=request_id)
         return answer
 
-    def _log(self, error: CurioError, **values: str) -> None:
+    def refused(self, method: str, request_id: str, error: CurioError, caller: Caller) -> None:
+        """Count and log a call that ends without an answer."""
+        code = status_of(error)
+        self._requests(method, code).inc()
         level = logging.INFO
         if isinstance(error, InternalError):
             level = logging.ERROR
         elif isinstance(error, Overloaded | CallEnded):
             level = logging.DEBUG  # they come by the thousand, when time is shortest; the metrics count them
-        log(level, "refused", reason=str(error)[: wire.MAX_TEXT], **values)
+        if LOGGER.isEnabledFor(level):
+            reason = str(error)[: wire.MAX_TEXT]
+            log(level, "refused", reason=reason, method=method, request_id=request_id, code=code, peer=caller.peer())
 
 
 class PoseService(PoseDetectorServicer):
-    """Answers ``PoseDetector``'s calls, each on a thread of its own."""
+    """Answers ``PoseDetector``'s calls: ``Detect`` by :attr:`direct`, the others each on a thread of its own."""
 
     def __init__(self, repository: Repository, work: WorkQueue, limits: Limits, metrics: Metrics) -> None:
         self._repository, self._work, self._limits, self._metrics = repository, work, limits, metrics
@@ -86,9 +92,17 @@ class PoseService(PoseDetectorServicer):
         self._num_streams, self._lock = 0, threading.Lock()
         metrics.streams.set_function(lambda: self._num_streams)
 
-    def Detect(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
-        body = partial(self._detect, request, context, always=False)
-        return self._guard.run("Detect", request.request_id[:_MAX_ID_LENGTH], context, body)
+    @property
+    def direct(self) -> Method:
+        """``Detect``, for :mod:`curio_serve.direct_calls`."""
+        refused = partial(self._guard.refused, "Detect", "")
+        return Method("/curio.v1.PoseDetector/Detect", messages.DetectRequest, self._answer, refused)
+
+    def _answer(
+        self, request: messages.DetectRequest, caller: Caller, waited_s: float
+    ) -> messages.DetectResponse | CurioError:
+        body = partial(self._detect, request, nullcontext(waited_s))
+        return self._guard.attempt("Detect", request.request_id[:_MAX_ID_LENGTH], caller, body)
 
     def DetectStream(
         self, request_iterator: Iterator[messages.DetectRequest], context: Context
@@ -97,10 +111,6 @@ class PoseService(PoseDetectorServicer):
         # One frame of a stream at a time: the next is read when this one is answered, so the client feels the load.
         for request in request_iterator:
             yield self._frame_of_stream(request, context)
-
-    def refuse(self, method: str, context: Context) -> None:
-        """Abort a call because the queue is full; its message was not read."""
-        self._guard.run(method, "", context, self._work.refuse)
 
     def ListModels(self, request: messages.ListModelsRequest, context: Context) -> messages.ListModelsResponse:
         return self._guard.run("ListModels", "", context, self._list)
@@ -111,7 +121,7 @@ class PoseService(PoseDetectorServicer):
     def _frame_of_stream(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
         """One frame's answer, or why it has none; only what ends the call ends the stream."""
         request_id = request.request_id[:_MAX_ID_LENGTH]
-        body = partial(self._detect, request, context, always=True)
+        body = partial(self._detect, request, self._work.slot(context, always=True))
         answer = self._guard.attempt("DetectStream.frame", request_id, context, body)
         if isinstance(answer, CallEnded):
             context.abort_with_status(wire.status_from_error(answer))
@@ -145,10 +155,10 @@ class PoseService(PoseDetectorServicer):
         model = self._repository.get(request.model.name, request.model.version)
         return messages.GetModelResponse(spec=model.spec, version=model.version)
 
-    def _detect(self, request: messages.DetectRequest, context: Context, *, always: bool) -> messages.DetectResponse:
+    def _detect(self, request: messages.DetectRequest, slot: AbstractContextManager[float]) -> messages.DetectResponse:
         self._check(request)
         detectors = [Detector(self._repository.get(m.name, m.version)) for m in request.models]
-        with self._work.slot(context, always=always) as waited_s:
+        with slot as waited_s:
             answer = detect_frame(request, detectors, self._limits, waited_s)
         spent = answer.milliseconds
         self._metrics.queue_s.observe(spent.queue / 1e3)
@@ -215,10 +225,11 @@ def _decode(
         raise ImageError("the request has no image; set encoded (JPEG, PNG, WebP) or raw")
     if kind == "raw":
         return wire.frame_from_raw(request.raw, limits.max_pixels), camera
-    header = image.open_header(request.encoded, limits.max_pixels)
+    data = request.encoded  # each look at the field copies it
+    header = image.open_header(data, limits.max_pixels)
     reductions = [1 if limits.full_decode else d.reduction(camera, header.width, header.height) for d in detectors]
     frame = image.decode(
-        request.encoded,
+        data,
         header=header,
         max_reduction=min(reductions),
         apply_exif_rotation=request.apply_exif_rotation,

@@ -9,11 +9,12 @@ from curio_proto.v1.detector_pb2 import Camera as CameraMessage
 from curio_proto.v1.detector_pb2 import Region as RegionMessage
 from google.protobuf.any_pb2 import Any as AnyMessage
 from google.protobuf.duration_pb2 import Duration
+from google.protobuf.message import Message
 from google.rpc import code_pb2, error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
 from curio_serve.camera import PinholeCamera
-from curio_serve.errors import CameraError, CurioError, ImageError, Overloaded, status_of
+from curio_serve.errors import ArgumentError, CameraError, CurioError, ImageError, Overloaded, status_of
 from curio_serve.image import Frame, RawFormat, from_raw
 from curio_serve.view import Region
 
@@ -24,18 +25,31 @@ _RAW_FORMATS: dict[int, RawFormat] = {PIXEL_FORMAT_RGB8: "RGB8", PIXEL_FORMAT_BG
 
 def status_from_error(error: CurioError) -> grpc.Status:
     """GRPC status with the exception's name as reason, and when to come back where the queue is full."""
-    name = status_of(error)
-    details = [error_details_pb2.ErrorInfo(reason=type(error).__name__, domain=DOMAIN)]
-    if isinstance(error, Overloaded):
+    retry_s = error.retry_after_s if isinstance(error, Overloaded) else None
+    return _status(status_of(error), type(error).__name__, str(error)[:MAX_TEXT], retry_s)
+
+
+@lru_cache(256)
+def _status(name: str, reason: str, message: str, retry_s: float | None) -> grpc.Status:
+    """Kept, because in a flood many calls are refused in the same words, and nothing must cost less than that."""
+    details: list[Message] = [error_details_pb2.ErrorInfo(reason=reason, domain=DOMAIN)]
+    if retry_s is not None:
         delay = Duration()
-        delay.FromNanoseconds(int(error.retry_after_s * 1e9))
+        delay.FromNanoseconds(int(retry_s * 1e9))
         details.append(error_details_pb2.RetryInfo(retry_delay=delay))
     packed = []
     for detail in details:
         packed.append(AnyMessage())
         packed[-1].Pack(detail)
-    message = str(error)[:MAX_TEXT]
     return rpc_status.to_status(status_pb2.Status(code=code_pb2.Code.Value(name), message=message, details=packed))
+
+
+def unreadable(kind: type[Message], num_bytes: int) -> ArgumentError:
+    """What a call gets whose message is none of its kind."""
+    name = kind.DESCRIPTOR.full_name
+    return ArgumentError(
+        f"the message of {num_bytes} bytes cannot be read as {name}; was the client made for this API?"
+    )
 
 
 def frame_error(error: CurioError) -> FrameError:
