@@ -47,10 +47,10 @@ def _shade(images: Tensor, random: np.random.Generator) -> Tensor:
 def _recolor(images: Tensor, random: np.random.Generator) -> Tensor:
     """Exposure, white balance, contrast and saturation."""
     grey = images.mean(1, keepdim=True)
-    images = grey + (images - grey) * _amounts(images, random, 0.6, 1.3)
-    images = images * _amounts(images, random, 0.65, 1.35) * _amounts(images, random, 0.88, 1.12, channels=3)
+    images = grey + (images - grey) * _amounts(images, random, 0.3, 1.6)
+    images = images * _amounts(images, random, 0.5, 1.5) * _amounts(images, random, 0.85, 1.15, channels=3)
     middle = images.mean((1, 2, 3), keepdim=True)
-    return middle + (images - middle) * _amounts(images, random, 0.7, 1.25) + _amounts(images, random, -0.08, 0.08)
+    return middle + (images - middle) * _amounts(images, random, 0.6, 1.3) + _amounts(images, random, -0.1, 0.1)
 
 
 def _blur(images: Tensor, random: np.random.Generator) -> Tensor:

@@ -12,7 +12,7 @@ LARGEST_ROLL_DEG = 45.0
 WEAKEST_LIGHT, STRONGEST_LIGHT = 0.2, 2.0
 AMBIENT = 0.4
 DARKEST_EXPOSURE, BRIGHTEST_EXPOSURE = 0.3, 1.25
-_TINT = 0.08
+_TINT = 0.2
 
 
 def upper_views(count: int, random: np.random.Generator) -> Float[Tensor, "count 3 3"]:
