@@ -1,6 +1,7 @@
 """Image in, poses out: one loaded model over the regions of a frame. No gRPC here."""
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 
 import numpy as np
 from curio_proto.v1.detector_pb2 import (
@@ -19,6 +20,7 @@ from curio_serve.view import FlatFrame, PinholeFrame, Region, View
 Array = np.ndarray
 _REDUCTIONS = (8, 4, 2)
 _MAX_BATCH = 8
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Detector:
@@ -134,41 +136,45 @@ def _fill(
     max_detections: int | None,
 ) -> None:
     """Turn one image's outputs back into the frame's camera; write down the most confident, best first."""
-    if "light" in outputs:
-        result.light.extend(view.turn(outputs["light"].astype(float)[:, None])[:, 0].tolist())
-    confidences = outputs["confidence"].clip(0, 1).tolist() if "confidence" in outputs else [1.0] * len(slots)
+    values = {name: output.tolist() for name, output in outputs.items()}
+    if "light" in values:
+        result.light.extend(view.turn(values["light"]))
+    confidences = (
+        [min(max(c, 0.0), 1.0) for c in values["confidence"]] if "confidence" in values else [1.0] * len(slots)
+    )
     confident = [row for row in range(len(slots)) if confidences[row] >= min_confidence]
     if not confident:
         result.status = REGION_STATUS_NO_OBJECT
         return
     result.status = REGION_STATUS_DETECTED
-    translations = view.translation(outputs["translation_m"].astype(float))
-    rotations = view.turn(outputs["rotation"].astype(float)) if "rotation" in outputs else None
     for row in sorted(confident, key=lambda row: -confidences[row])[:max_detections]:
-        rotation = None if rotations is None else rotations[row]
+        translation = view.translation(values["translation_m"][row])
+        rotation = view.turn(list(chain.from_iterable(values["rotation"][row]))) if "rotation" in values else None
         result.detections.add(
             object=slots[row].object,
             confidence=confidences[row],
-            translation_m=translations[row].tolist(),
-            color=outputs["color"][row].tolist() if "color" in outputs else (),
-            box_px=_box_px(view, slots[row], rotation, translations[row]),
+            translation_m=translation,
+            color=values["color"][row] if "color" in values else (),
+            box_px=view.project(_placed(slots[row].box_corners, rotation, translation)),
             **({} if rotation is None else _rotation_fields(rotation)),
         )
 
 
-def _rotation_fields(rotation: Array) -> dict[str, Sequence[float]]:
-    """A matrix [3, 3] as the messages have it: by rows, as its first two columns, as a quaternion."""
-    rows = rotation.ravel().tolist()
+def _rotation_fields(rows: Sequence[float]) -> dict[str, Sequence[float]]:
+    """A rotation, row after row, as the messages have it: so, as its first two columns, as a quaternion."""
     return {
         "rotation": rows,
-        "rotation_6d": rows[0::3] + rows[1::3],
+        "rotation_6d": [*rows[0::3], *rows[1::3]],
         "quaternion_xyzw": quaternion_xyzw(rows),
     }
 
 
-def _box_px(view: View, slot: Slot, rotation: Array | None, translation: Array) -> Sequence[float]:
-    """The projected corners, x and y in turn; none where the model tells no box."""
-    if not len(slot.box_corners):
-        return ()
-    corners = slot.box_corners if rotation is None else slot.box_corners @ rotation.T
-    return view.project(corners + translation).ravel().tolist()
+def _placed(
+    points: Sequence[Sequence[float]], rotation: Sequence[float] | None, translation: Sequence[float]
+) -> Sequence[Sequence[float]]:
+    """An object's points in the frame's camera."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation or _UPRIGHT
+    x, y, z = translation
+    return [
+        (xx * a + xy * b + xz * c + x, yx * a + yy * b + yz * c + y, zx * a + zy * b + zz * c + z) for a, b, c in points
+    ]

@@ -59,11 +59,11 @@ class Slot:
 
     Attributes:
         object: Name of the kind of object it holds.
-        box_corners: [8, 3], object frame, metres (image widths in 2D worlds); [0, 3] where the spec has none.
+        box_corners: 8 points (x, y, z), object frame, metres (image widths in 2D worlds); none where the spec has none.
     """
 
     object: str
-    box_corners: np.ndarray
+    box_corners: Sequence[Sequence[float]]
 
 
 class Model:
@@ -262,13 +262,14 @@ def slots(spec: ModelSpec, name: str) -> tuple[Slot, ...]:
     """
     rows: dict[int, Slot] = {}
     for kind in spec.objects:
-        corners = np.array(kind.box_corners_m, float)
-        if corners.size not in (0, 24):
-            raise ModelError(f"model {name}: the box of {kind.name} has {corners.size} values; expected 8 corners x 3")
+        values = list(kind.box_corners_m)
+        if len(values) not in (0, 24):
+            raise ModelError(f"model {name}: the box of {kind.name} has {len(values)} values; expected 8 corners x 3")
+        corners = list(zip(values[0::3], values[1::3], values[2::3], strict=True))
         for row in kind.slots:
             if row in rows:
                 raise ModelError(f"model {name}: slot {row} belongs to both {rows[row].object} and {kind.name}")
-            rows[row] = Slot(kind.name, corners.reshape(-1, 3))
+            rows[row] = Slot(kind.name, corners)
     if not spec.num_slots or sorted(rows) != list(range(spec.num_slots)):
         raise ModelError(f"model {name}: {spec.num_slots} slots, but its objects name the slots {sorted(rows)}")
     return tuple(rows[row] for row in range(spec.num_slots))

@@ -1,5 +1,6 @@
 """The typed API ``curio.v1.PoseDetector``: translates between messages and the detector, and nothing else."""
 
+import itertools
 import logging
 import secrets
 import threading
@@ -26,6 +27,7 @@ from curio_serve.telemetry import LOGGER, Metrics, log
 Context = grpc.ServicerContext
 Answer = TypeVar("Answer")
 _MAX_ID_LENGTH = 128
+_ID_PREFIX, _ID_NUMBERS = secrets.token_hex(8), itertools.count()
 
 
 @dataclass(frozen=True)
@@ -126,9 +128,7 @@ class PoseService(PoseDetectorServicer):
         if isinstance(answer, CallEnded):
             context.abort_with_status(wire.status_from_error(answer))
         if isinstance(answer, CurioError):
-            return messages.DetectResponse(
-                request_id=request_id or secrets.token_hex(16), error=wire.frame_error(answer)
-            )
+            return messages.DetectResponse(request_id=request_id or new_request_id(), error=wire.frame_error(answer))
         return answer
 
     def _open_stream(self, context: Context) -> None:
@@ -183,6 +183,11 @@ class PoseService(PoseDetectorServicer):
             raise ArgumentError("max_detections is 0; leave it out for no limit, or give at least 1")
 
 
+def new_request_id() -> str:
+    """32 hexadecimal digits, of this process and this request alone."""
+    return f"{_ID_PREFIX}{next(_ID_NUMBERS):016x}"
+
+
 def detect_frame(
     request: messages.DetectRequest, detectors: list[Detector], limits: Limits, waited_s: float
 ) -> messages.DetectResponse:
@@ -198,7 +203,7 @@ def detect_frame(
     decoded = time.perf_counter()
     regions = [wire.region_from_message(region) for region in request.regions]
     answer = messages.DetectResponse(
-        request_id=request.request_id or secrets.token_hex(16), width=frame.width, height=frame.height
+        request_id=request.request_id or new_request_id(), width=frame.width, height=frame.height
     )
     for detector in detectors:
         answer.results.extend(

@@ -22,6 +22,7 @@ from its centre.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -86,6 +87,8 @@ class CanonicalCamera:
 class View(ABC):
     """One region as the model sees it.
 
+    Poses are few and small, so they are turned back as plain numbers: numpy's calls cost more than these sums.
+
     Attributes:
         image: uint8 RGB [canonical height, canonical width, 3].
     """
@@ -93,16 +96,16 @@ class View(ABC):
     image: Array
 
     @abstractmethod
-    def translation(self, found: Array) -> Array:
-        """Positions [n, 3] of the model as positions in the frame's camera (or widths of the frame)."""
+    def translation(self, found: Sequence[float]) -> Sequence[float]:
+        """A position (3) of the model as a position in the frame's camera (or widths of the frame)."""
 
     @abstractmethod
-    def turn(self, found: Array) -> Array:
-        """Column vectors in the model's camera [..., 3, m] in the frame's camera: rotations, or a light with m = 1."""
+    def turn(self, found: Sequence[float]) -> Sequence[float]:
+        """A matrix of three rows, row after row, in the frame's camera: a rotation (9), or a light (3)."""
 
     @abstractmethod
-    def project(self, points: Array) -> Array:
-        """Pixels [n, 2] in the full-size frame of points [n, 3] in the frame's camera (or widths of the frame)."""
+    def project(self, points: Sequence[Sequence[float]]) -> Sequence[float]:
+        """Pixels, x and y in turn, in the full-size frame of points in the frame's camera (or widths of the frame)."""
 
 
 class PinholeView(View):
@@ -111,16 +114,19 @@ class PinholeView(View):
     def __init__(self, image: Array, camera: PinholeCamera, canonical_from_cam: Array) -> None:
         self.image = image
         self.canonical_from_cam = canonical_from_cam
+        self._cam_from_canonical: list[list[float]] = canonical_from_cam.T.tolist()
         self._camera = camera
 
-    def translation(self, found: Array) -> Array:
-        return found @ self.canonical_from_cam
+    def translation(self, found: Sequence[float]) -> Sequence[float]:
+        return self.turn(found)
 
-    def turn(self, found: Array) -> Array:
-        return self.canonical_from_cam.T @ found
+    def turn(self, found: Sequence[float]) -> Sequence[float]:
+        width = len(found) // 3
+        columns = list(zip(found[:width], found[width : 2 * width], found[2 * width :], strict=True))
+        return [a * x + b * y + c * z for a, b, c in self._cam_from_canonical for x, y, z in columns]
 
-    def project(self, points: Array) -> Array:
-        return self._camera.project(points)
+    def project(self, points: Sequence[Sequence[float]]) -> Sequence[float]:
+        return self._camera.pixels(points)
 
 
 class FlatView(View):
@@ -131,20 +137,20 @@ class FlatView(View):
         self._region = region
         self._frame_size = frame_size
 
-    def translation(self, found: Array) -> Array:
+    def translation(self, found: Sequence[float]) -> Sequence[float]:
         # From widths of the canonical image to its shares of the region, whose height may be stretched differently.
         region, (width, height) = self._region, self._frame_size
         canonical_height, canonical_width = self.image.shape[:2]
-        x = region.x + region.width * (found[:, 0] + 0.5)
-        y = region.y + region.height * (found[:, 1] * canonical_width / canonical_height + 0.5)
-        return np.stack([(x - width / 2) / width, (y - height / 2) / width, np.zeros_like(x)], axis=-1)
+        x = region.x + region.width * (found[0] + 0.5)
+        y = region.y + region.height * (found[1] * canonical_width / canonical_height + 0.5)
+        return (x - width / 2) / width, (y - height / 2) / width, 0.0
 
-    def turn(self, found: Array) -> Array:
+    def turn(self, found: Sequence[float]) -> Sequence[float]:
         return found
 
-    def project(self, points: Array) -> Array:
+    def project(self, points: Sequence[Sequence[float]]) -> Sequence[float]:
         width, height = self._frame_size
-        return points[:, :2] * width + np.array([(width - 1) / 2, (height - 1) / 2])
+        return [value for x, y, _ in points for value in (x * width + (width - 1) / 2, y * width + (height - 1) / 2)]
 
 
 class PinholeFrame:

@@ -93,11 +93,19 @@ def test_rays_and_pixels_are_inverse(distortion: tuple[float, ...]) -> None:
         np.testing.assert_allclose(camera.project(ray[None] * 3)[0], pixel, atol=0.05)
 
 
-def test_what_is_behind_has_no_pixel() -> None:
-    pixels = PinholeCamera(K).project(np.array([[0, 0, -1.0], [0, 0, 1.0], [0, 0, 0]]))
-    assert np.isnan(pixels[0]).all()
-    np.testing.assert_allclose(pixels[1], K[:2, 2])
-    assert np.isnan(pixels[2]).all()
+@pytest.mark.parametrize("distortion", [(), (0.1, -0.05, 0.002, -0.001, 0.01)])
+def test_what_is_behind_has_no_pixel(distortion: tuple[float, ...]) -> None:
+    camera, points = PinholeCamera(K, distortion), [[0, 0, -1.0], [0, 0, 1.0], [0, 0, 0]]
+    nothing = [np.nan, np.nan]
+    np.testing.assert_allclose(camera.project(np.array(points)), [nothing, K[:2, 2], nothing])
+    np.testing.assert_allclose(camera.pixels(points), [*nothing, *K[:2, 2], *nothing])
+
+
+@pytest.mark.parametrize("distortion", [(), (0.1, -0.05, 0.002, -0.001, 0.01)])
+def test_pixels_of_plain_numbers_are_the_projected_ones(distortion: tuple[float, ...]) -> None:
+    camera = PinholeCamera(K + np.array([[0, 1e-4, 0], [0, 0, 0], [0, 0, 0]]), distortion)
+    points = np.random.default_rng(0).uniform((-0.3, -0.3, 0.5), (0.3, 0.3, 2), (8, 3))
+    np.testing.assert_allclose(camera.pixels(points.tolist()), camera.project(points).ravel(), rtol=1e-12)
 
 
 def test_our_json(tmp_path: Path) -> None:

@@ -76,9 +76,11 @@ def test_poses_come_back(region: Region) -> None:
     view = PinholeFrame(np.zeros((480, 640, 3), np.uint8), PinholeCamera(K), CANONICAL).look(region)
     turn = view.canonical_from_cam
     truth = np.array([[0.1, -0.2, 1.3], [0.0, 0.3, 0.8]])
-    np.testing.assert_allclose(view.translation(truth @ turn.T), truth, atol=1e-12)
+    for position in truth:
+        np.testing.assert_allclose(view.translation((turn @ position).tolist()), position, atol=1e-12)
     rotations = np.stack([np.eye(3), smallest_rotation(np.array([0, 0, 1.0]), np.array([0.6, 0, 0.8]))])
-    np.testing.assert_allclose(view.turn(turn @ rotations), rotations, atol=1e-12)
+    for rotation in rotations:
+        np.testing.assert_allclose(view.turn((turn @ rotation).ravel().tolist()), rotation.ravel(), atol=1e-12)
 
 
 def test_a_region_brings_its_centre_to_the_middle() -> None:
@@ -145,7 +147,7 @@ def test_flat_positions_come_back(region: Region) -> None:
     columns, rows = np.meshgrid(np.arange(96), np.arange(64))
     weight = view.image[..., 0].astype(float)
     found = [((weight * axis).sum() / weight.sum() - (side - 1) / 2) / 96 for axis, side in ((columns, 96), (rows, 64))]
-    position = view.translation(np.array([[*found, 0.0]]))
+    position = view.translation([*found, 0.0])
     expected = (truth - [319.5, 239.5]) / 640
-    np.testing.assert_allclose(position[0], [*expected, 0], atol=1e-3)
-    np.testing.assert_allclose(view.project(position)[0], truth, atol=0.6)
+    np.testing.assert_allclose(position, [*expected, 0], atol=1e-3)
+    np.testing.assert_allclose(view.project([position]), truth, atol=0.6)
