@@ -58,7 +58,7 @@ def cache(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def options(folder: Path, **changes: object) -> CaptureOptions:
-    usual = {"mesh": folder / "bracket.stl", "camera": folder / "camera.json", "photos": folder / "photos"}
+    usual = {"mesh": (folder / "bracket.stl",), "camera": folder / "camera.json", "photos": folder / "photos"}
     return CaptureOptions(**{**usual, "mesh_unit": "mm", "background": folder / "plate.png"} | changes)  # type: ignore[arg-type]
 
 
@@ -101,7 +101,7 @@ def test_a_painted_part_keeps_its_colours(folder: Path, tmp_path: Path) -> None:
     shape = trimesh.load_mesh(folder / "bracket.stl")
     shape.visual.vertex_colors = np.tile([200, 30, 30, 255], (len(shape.vertices), 1))
     shape.export(tmp_path / "red.ply")
-    painted = build(options(folder, mesh=tmp_path / "red.ply"))
+    painted = build(options(folder, mesh=(tmp_path / "red.ply",)))
     assert COLOR not in painted.layout
     assert COLOR not in painted.sample(2, (0,))
 
@@ -174,7 +174,7 @@ def test_what_contradicts_itself_is_refused(folder: Path, tmp_path: Path) -> Non
     with pytest.raises(MeshError, match="--mesh-unit to"):
         build(options(folder, mesh_unit=None))
     with pytest.raises(MeshError, match=r"none\.stl"):
-        build(options(folder, mesh=folder / "none.stl"))
+        build(options(folder, mesh=(folder / "none.stl",)))
     (tmp_path / "camera.json").write_text("{")
     with pytest.raises(CameraError, match="not JSON"):
         build(options(folder, camera=tmp_path / "camera.json"))
@@ -236,7 +236,7 @@ def test_from_files_to_a_model_by_a_project_file(
 
 def test_project_files_that_cannot_be_used(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "part.toml"
-    for content, expected in ((None, "cannot be read"), ("", "empty"), ("mesh =", "not TOML"), ("a = [1]", "list")):
+    for content, expected in ((None, "cannot be read"), ("", "empty"), ("mesh =", "not TOML"), ("a = {b = 1}", "dict")):
         if content is not None:
             file.write_text(content)
         assert call("--project", file) == 2

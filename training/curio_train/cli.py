@@ -119,7 +119,7 @@ def _parse(arguments: list[str]) -> TrainCommand:
 def _path_flags() -> set[str]:
     """Names of all flags that are files or folders."""
     hints = [hint for kind in (*WORLDS.values(), RunConfig, Session) for hint in get_type_hints(kind).items()]
-    return {name for name, kind in hints if kind in (Path, Path | None)}
+    return {name for name, kind in hints if kind in (Path, Path | None, tuple[Path, ...])}
 
 
 def _unset(kind: type[WorldOptions]) -> WorldOptions:

@@ -7,6 +7,7 @@
     camera = "camera.json"
     photos = "photos"
     upright = true             # a flag without a value; false leaves it out
+    counts = [3, "0-2"]        # a flag with several values
     minutes = 25
 """
 
@@ -57,8 +58,9 @@ def _flag(name: str, value: object, file: Path, paths: Collection[str]) -> list[
     flag, plain = f"--{name.replace('_', '-')}", name.replace("-", "_")
     if isinstance(value, bool):
         return [flag] if value else []
-    if isinstance(value, str):
-        return [flag, str(file.parent / Path(value).expanduser()) if plain in paths else value]
-    if isinstance(value, int | float):
-        return [flag, str(value)]
-    raise UsageError(f"{FLAG} {file}, {name}: found a {type(value).__name__}, expected text, a number, true or false")
+    values: list[Any] = value if isinstance(value, list) else [value]
+    if values and all(isinstance(one, str | int | float) for one in values):
+        return [flag, *(str(file.parent / Path(one).expanduser()) if plain in paths else str(one) for one in values)]
+    raise UsageError(
+        f"{FLAG} {file}, {name}: found a {type(value).__name__}, expected text, a number, a list of them, true or false"
+    )

@@ -7,12 +7,13 @@ from curio_train.doctor.photographs import examine_photographs
 from curio_train.errors import DataError
 from curio_train.worlds.options import CaptureOptions
 
-_HARMLESS = ("no colour", "too few")  # colours are part of the code; nothing is learned from the photographs
+_HARMLESS_ON_A_PLANE = ("no colour",)  # colours are part of the code
+_HARMLESS = (*_HARMLESS_ON_A_PLANE, "too few")  # off the plane nothing is learned from the photographs
 _BROKEN = "photographs unreadable"  # all that matters about other scenes: they may differ in size and be few
 
 
 def refuse_unfit(options: CaptureOptions) -> list[str]:
-    """Compare the mesh, the camera, the photographs and the plate; read every other background.
+    """Compare the meshes, the camera, the photographs and the plate; read every other background.
 
     Returns:
         What is doubtful about them, a line each.
@@ -20,10 +21,12 @@ def refuse_unfit(options: CaptureOptions) -> list[str]:
     Raises:
         DataError: Something is certain not to work; says everything that is.
     """
-    subjects = Subjects(options.mesh, options.mesh_unit, options.camera, options.photos, options.background)
-    found = [
-        finding for finding in examine_files(subjects) if finding.state != "good" and finding.fault not in _HARMLESS
-    ]
+    first, *others = options.mesh
+    subjects = [Subjects(first, options.mesh_unit, options.camera, options.photos, options.background)]
+    subjects += [Subjects(mesh, options.mesh_unit) for mesh in others]
+    found = [finding for subject in subjects for finding in examine_files(subject)]
+    harmless = _HARMLESS if options.plane is None else _HARMLESS_ON_A_PLANE
+    found = [finding for finding in found if finding.state != "good" and finding.fault not in harmless]
     if options.backgrounds is not None:
         _, scenes = examine_photographs(options.backgrounds, None)
         found += [replace(finding, subject="backgrounds") for finding in scenes if finding.fault == _BROKEN]

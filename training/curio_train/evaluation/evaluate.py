@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from curio_train.errors import CheckpointError, ReportError, UsageError
+from curio_train.evaluation.photographed import judge
 from curio_train.evaluation.real_frames import evaluate_real_frames
 from curio_train.evaluation.report import write_report
 from curio_train.evaluation.scores import add_errors, pose_scores, scene_errors, scene_scores
@@ -68,7 +69,8 @@ def evaluate(
 
     Returns:
         What was evaluated, ``metrics`` by name, the same of the network before its first step as ``untrained``, and
-        ``real`` where real frames were scored. A run folder gets it as well, and a report.
+        ``real`` where real frames were scored, ``photographs`` where there are some to judge by. A run folder gets it
+        as well, and a report.
 
     Raises:
         CurioError: Any of this package's errors.
@@ -90,6 +92,8 @@ def evaluate(
     if data is not None:
         progress(f"real frames in {data}")
         result["real"] = evaluate_real_frames(subject, data, bop_results)
+    if (judgement := judge(subject.world, subject.predict)) is not None:
+        result["photographs"] = judgement.summary
     if (path / CONFIG_FILE).exists():
         _keep(path, result)
         progress("the report")

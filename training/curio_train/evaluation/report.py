@@ -16,6 +16,7 @@ from torch import Tensor
 
 from curio_train.errors import ReportError
 from curio_train.evaluation import report_figures as figures
+from curio_train.evaluation.photographed import Judgement, judge
 from curio_train.evaluation.subject import Subject, load_subject
 from curio_train.evaluation.tables import label
 from curio_train.learning.checkpoint import CONFIG_FILE
@@ -92,7 +93,7 @@ def _page(
     rendered = world.render(code, batch.backgrounds).clamp(0, 1)
     columns = (batch.images, rendered, world.novel_view(code).clamp(0, 1))
     shown = errors or {"image_dssim": dssim(rendered, batch.images)}
-    made = sittings(run)
+    made, judgement = sittings(run), judge(world, subject.predict)
     pages = Environment(loader=PackageLoader("curio_train.evaluation", ""), autoescape=True)
     return pages.get_template("report.html.jinja").render(
         title=f"{world_name(config)}, {config.method}, seed {config.seed}",
@@ -102,6 +103,8 @@ def _page(
         num_images=evaluation["num_images"] if evaluation else len(batch.images),
         samples=figures.samples([column[:_NUM_SAMPLES] for column in columns]),
         photographs=_photographs(subject),
+        judgement=judgement,
+        judged=None if judgement is None else _judged(judgement),
         curves=figures.curves(read_history(run)),
         histograms=figures.histograms({label(name): values for name, values in shown.items()}),
         scores=_scores(evaluation or {}),
@@ -118,6 +121,12 @@ def _photographs(subject: Subject) -> str:
     order = code[CONFIDENCE].flatten().argsort() if CONFIDENCE in code else torch.arange(len(images))
     drawn = subject.world.render(code | {CONFIDENCE: torch.ones(len(images), 1, 1)}, images).clamp(0, 1)
     return figures.samples((images[order], drawn[order]), ("photograph", "what was found, drawn over it"))
+
+
+def _judged(judgement: Judgement) -> str:
+    """Photographs and what was found in them from each camera, the worst scenes first."""
+    columns = [column[:_NUM_PHOTOGRAPHS] for column in judgement.columns.values()]
+    return figures.samples(columns, tuple(judgement.columns))
 
 
 def _facts(subject: Subject, made: list[Sitting]) -> dict[str, str]:

@@ -29,6 +29,7 @@ class QueuedRun:
         world: What ``curio-train`` is to learn.
         images: Its budget.
         flags: What else it is started with.
+        scoring: What else ``curio-eval`` is called with.
         process: What it is doing now, if anything.
     """
 
@@ -37,6 +38,7 @@ class QueuedRun:
     world: str
     images: int
     flags: Sequence[str]
+    scoring: Sequence[str] = ()
     process: subprocess.Popen[bytes] | None = field(default=None)
 
     @property
@@ -63,7 +65,7 @@ class QueuedRun:
             yield [*train, "--resume", str(self.folder)]
         else:
             yield [*train, *self.flags, "--out", str(self.folder)]
-        yield [str(here / "curio-eval"), str(self.folder)]
+        yield [str(here / "curio-eval"), str(self.folder), *self.scoring]
 
     def carry_out(self, threads: int) -> int:
         """Train and score; the exit status of what failed, or 0.

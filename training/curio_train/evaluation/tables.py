@@ -33,6 +33,15 @@ _LABELS: Mapping[str, str] = {
     "present_auroc": "object present or absent, AUROC",
     "mssd_recall": "MSSD, average recall",
     "mspd_recall": "MSPD, average recall",
+    "own_view_dssim": "own camera, DSSIM",
+    "own_view_dssim_blurred": "   both blurred",
+    "own_view_plate_dssim": "   of the empty plate",
+    "own_view_plate_dssim_blurred": "   of the empty plate, both blurred",
+    "second_view_dssim": "second camera, DSSIM",
+    "second_view_dssim_blurred": "   both blurred",
+    "second_view_plate_dssim": "   of the empty plate",
+    "second_view_plate_dssim_blurred": "   of the empty plate, both blurred",
+    "better_than_plate": "nearer to the photograph than the plate, share",
 }
 
 
@@ -59,6 +68,18 @@ def print_evaluation(result: Mapping[str, Any], console: Console) -> None:
     console.print(table)
     if "real" in result:
         _print_real(result["real"], console)
+    if "photographs" in result:
+        _print_photographs(result["photographs"], console)
+
+
+def _print_photographs(found: Mapping[str, Any], console: Console) -> None:
+    table = Table(title=f"{found['num_photographs']} photographs, without labels", title_justify="left")
+    table.add_column("metric")
+    table.add_column("this", justify="right")
+    for name, value in found["metrics"].items():
+        table.add_row(label(name), f"{value:.4g}")
+    console.print(table)
+    console.print(found["verdict"], markup=False)
 
 
 def _print_real(real: Mapping[str, Any], console: Console) -> None:

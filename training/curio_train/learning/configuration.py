@@ -29,7 +29,7 @@ def to_json(config: RunConfig) -> dict[str, Any]:
 
 def to_portable(config: RunConfig) -> dict[str, Any]:
     """The same without the folders that the world was given: what a model tells other machines of its making."""
-    folders = [field.name for field in fields(config.world) if isinstance(getattr(config.world, field.name), Path)]
+    folders = [field.name for field in fields(config.world) if _has_paths(getattr(config.world, field.name))]
     plain = to_json(config)
     if config.init is not None:
         plain["init"] = config.init.name
@@ -87,6 +87,10 @@ def refuse_other(stored: RunConfig, wanted: RunConfig, run: Path) -> None:
         )
 
 
+def _has_paths(value: Any) -> bool:
+    return isinstance(value, Path) or (isinstance(value, tuple) and any(isinstance(one, Path) for one in value))
+
+
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _plain(entry) for name, entry in value.items()}
@@ -105,7 +109,7 @@ def _typed(kind: Any, value: Any) -> Any:
         return kind(**{name: _typed(hints[name], entry) for name, entry in value.items()})
     if kind is Path:
         return Path(value)
-    return tuple(value) if isinstance(value, list) else value
+    return tuple(_typed(choices[0] if choices else None, one) for one in value) if isinstance(value, list) else value
 
 
 def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:

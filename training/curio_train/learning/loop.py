@@ -121,9 +121,10 @@ class Trainer:
                 raw, code = self._read(network, batch.images)
                 backgrounds = batch.backgrounds
             if terms & {"image", "curiosity"}:
-                rendered = world.render(code, backgrounds)
+                rendered = world.compared(world.render(code, backgrounds))
+                images = world.compared(batch.images)
             if "image" in terms:
-                losses["image"] = image_loss(rendered, batch.images)
+                losses["image"] = image_loss(rendered, images)
             if critic is not None:
                 with frozen(critic.network):
                     losses["curiosity"] = curiosity_loss(self._judge, rendered)
@@ -145,11 +146,11 @@ class Trainer:
 
             # The critic: tell data from renderings, with the weights it had when it judged above.
             if critic is not None:
-                losses["critic"] = critic_loss(self._judge, batch.images, rendered)
+                losses["critic"] = critic_loss(self._judge, images, rendered)
                 critic_total = losses["critic"]
                 if recipe.gradient_penalty and self.state.course.step % recipe.gradient_penalty_every == 0:
                     weight = recipe.gradient_penalty * recipe.gradient_penalty_every
-                    critic_total = critic_total + weight * gradient_penalty(self._judge, batch.images)
+                    critic_total = critic_total + weight * gradient_penalty(self._judge, images)
                 (critic_total / self._num_micro).backward()
 
             of_look = f", {world.name}" if len(turns) > 1 else ""

@@ -76,6 +76,19 @@ class Batch:
     given: SceneCode = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """Photographs from one place.
+
+    Attributes:
+        photographs: uint8 [num, 3, height, width], as the world's camera takes them.
+        plate: uint8 [3, height, width], the empty scene from there.
+    """
+
+    photographs: Tensor
+    plate: Tensor
+
+
 class ImageSource(ABC):
     """Unlabelled (or, when asked for, labelled) training images.
 
@@ -214,6 +227,17 @@ class World(ABC):
     def disturb(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
         """What lies between renderings and the data, done to renderings that the network learns to read (sleep)."""
         return images
+
+    def compared(self, images: Tensor) -> Tensor:
+        """What image loss and critic see of images and of renderings: all of them, in most worlds."""
+        return images
+
+    def views(self) -> tuple["View", ...]:
+        """Unlabelled photographs to judge by: from the own camera, and of the same scenes from a second one.
+
+        The first are compared with :meth:`render`, the second with :meth:`novel_view`. None, in most worlds.
+        """
+        return ()
 
     def photographs(self, count: int) -> Tensor | None:
         """Photographs that nobody labelled, as this world's camera would take them, where there are some.

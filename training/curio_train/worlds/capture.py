@@ -1,4 +1,4 @@
-"""A part of one's own: one mesh, one camera, six degrees of freedom, no labels.
+"""A part of one's own: one mesh, one camera, six degrees of freedom, no labels. Parts on a plane: ``table.py``.
 
 Images are rendered without end, as for LineMOD; what a data set's authors publish there is asked for or found out here:
 
@@ -12,7 +12,6 @@ Images are rendered without end, as for LineMOD; what a data set's authors publi
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -20,15 +19,16 @@ from torch import Tensor
 from curio_train.camera import Intrinsics, load_intrinsics
 from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
 from curio_train.data.meshes import Mesh, load_mesh
-from curio_train.data.photographs import Photographs, read_frame
+from curio_train.data.photographs import Photographs, read_frames
 from curio_train.data.plate import PLATE_SHARE, MixedBackgrounds, PlateBackgrounds
 from curio_train.data.symmetries import find_symmetries
 from curio_train.errors import UsageError
 from curio_train.geometry import random_rotations
-from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.base import ObjectKind, World
 from curio_train.worlds.gaze import LARGEST_LOG_SCALE, GazeWorld
 from curio_train.worlds.options import CaptureOptions
 from curio_train.worlds.single_object import Object
+from curio_train.worlds.table_files import build_table
 from curio_train.worlds.views import upper_views
 
 
@@ -44,25 +44,27 @@ class Capture(GazeWorld):
         """Spread over the folder, without the lens's distortion, in the canonical size."""
         paths = Photographs(self._images).paths
         chosen = [paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))]
-        size = (self.camera.width, self.camera.height)
-        frames = (read_frame(path, self.object.camera) for path in chosen)
-        resized = [cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames]
-        return torch.from_numpy(np.stack(resized)).permute(0, 3, 1, 2).float() / 255
+        frames = read_frames(chosen, self.object.camera, self.camera.width, self.camera.height)
+        return torch.from_numpy(frames).float() / 255
 
 
-def build(options: CaptureOptions) -> Capture:
-    """The world of one part.
+def build(options: CaptureOptions) -> World:
+    """The world of one part in free space, or of parts on a plane.
 
     Raises:
         UsageError: The part would reach into the camera.
         MeshError: The mesh is missing or broken.
         CameraError: The camera file is missing or describes no camera.
+        DataError: Of a plane, photographs, plates or its file cannot be used.
     """
-    mesh, camera = load_mesh(options.mesh, options.mesh_unit), load_intrinsics(options.camera)
+    if options.plane is not None:
+        return build_table(options)
+    (file,) = options.mesh
+    mesh, camera = load_mesh(file, options.mesh_unit), load_intrinsics(options.camera)
     _refuse_collision(options, mesh)
     found = find_symmetries(mesh)
     kind = ObjectKind(
-        options.mesh.stem, (0,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous
+        file.stem, (0,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous
     )
     thing = Object(
         kind,
@@ -84,7 +86,7 @@ def _refuse_collision(options: CaptureOptions, mesh: Mesh) -> None:
     if options.near_m > least:
         return
     raise UsageError(
-        f"--near-m {options.near_m:g}: {options.mesh} reaches {reach:.3g} m from its origin, so the camera would be "
+        f"--near-m {options.near_m:g}: {options.mesh[0]} reaches {reach:.3g} m from its origin, so the camera would be "
         f"inside it; expected more than {least:.3g} m. If the part is smaller than that, check --mesh-unit, and that "
         "the origin lies within the part (curio-doctor --mesh)"
     )

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from curio_train.data.meshes import Mesh
-from curio_train.geometry import Pose, camera_looking_at, matrix_from_yaw, rotation_6d_from_matrix
+from curio_train.geometry import Pose, camera_looking_at, rotation_6d_from_matrix
 from curio_train.rendering.ground import Ground
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW, Field, Layout, SceneCode
 from curio_train.worlds.base import Camera
@@ -78,9 +78,26 @@ class GroundWorld(MeshWorld):
 
     object_shadows = True
 
-    def __init__(self, fields: Sequence[Field], kinds: Sequence[Kind]) -> None:
-        layout = Layout((POSITION, TURN, *fields), sum(kind.num_slots for kind in kinds))
-        super().__init__(layout, kinds, stage())
+    def __init__(
+        self,
+        fields: Sequence[Field],
+        kinds: Sequence[Kind],
+        where: Stage | None = None,
+        poses: Sequence[Field] = (POSITION, TURN),
+    ) -> None:
+        """Stand the objects on the ground.
+
+        Args:
+            fields: Of the scene code beside the poses.
+            kinds: Meshes with y up and their lowest point at y = 0.
+            where: Camera and light; those of :func:`stage` unless given.
+            poses: Fields of position and rotation.
+
+        Raises:
+            RendererError: No usable libLLVM.
+        """
+        layout = Layout((*poses, *fields), sum(kind.num_slots for kind in kinds))
+        super().__init__(layout, kinds, where or stage())
         self.radii_m = [footprint_radius_m(kind.mesh) for kind in kinds for _ in range(kind.num_slots)]
 
     def ground(self, cam_from_world: Pose) -> Ground:
@@ -98,12 +115,14 @@ class GroundWorld(MeshWorld):
     def exported_fields(self) -> tuple[Field, ...]:
         """As in the camera frame, with 6D rotations in place of yaw and the light as a vector."""
         turn, shift = self.stage.cam_from_world
-        corners = np.array(list(itertools.product(*zip(POSITION.lower, POSITION.upper, strict=True)))) @ turn.T + shift
+        sun = float(np.linalg.norm(self.stage.sun))
+        position = self.layout[TRANSLATION]
+        corners = np.array(list(itertools.product(*zip(position.lower, position.upper, strict=True)))) @ turn.T + shift
         low, high = tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist())
         exported = {
-            TRANSLATION: dataclasses.replace(POSITION, frame="camera", lower=low, upper=high),
+            TRANSLATION: dataclasses.replace(position, frame="camera", lower=low, upper=high),
             YAW: Field(ROTATION_6D, 6, frame="camera"),
-            LIGHT: Field(LIGHT, 3, per_object=False, frame="camera", lower=(-SUN,) * 3, upper=(SUN,) * 3),
+            LIGHT: Field(LIGHT, 3, per_object=False, frame="camera", lower=(-sun,) * 3, upper=(sun,) * 3),
         }
         return tuple(exported.get(field.name, field) for field in self.layout.fields)
 
@@ -112,7 +131,7 @@ class GroundWorld(MeshWorld):
         turn, shift = self._cam_from_world(code[TRANSLATION])
         outputs = {name: value for name, value in code.items() if name != YAW}
         outputs[TRANSLATION] = code[TRANSLATION] @ turn.T + shift
-        outputs["rotation"] = turn @ matrix_from_yaw(code[YAW])
+        outputs["rotation"] = turn @ self.own_rotation(code)
         outputs[ROTATION_6D] = rotation_6d_from_matrix(outputs["rotation"])
         if LIGHT in self.layout:
             outputs[LIGHT] = self.light(code) @ turn.T
@@ -123,17 +142,18 @@ class GroundWorld(MeshWorld):
     def from_exported(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The scene code that :meth:`exported` made these outputs of; yaws come out with length 1."""
         turn, shift = self._cam_from_world(outputs[TRANSLATION])
-        own = turn.T @ outputs["rotation"]
-        code = {
-            TRANSLATION: (outputs[TRANSLATION] - shift) @ turn,
-            YAW: torch.stack([own[..., 0, 0], own[..., 0, 2]], dim=-1),
-        }
+        code = {TRANSLATION: (outputs[TRANSLATION] - shift) @ turn}
+        code |= self._rotation_entry(turn.T @ outputs["rotation"])
         if LIGHT in self.layout:
             sun = outputs[LIGHT] @ turn
             code[LIGHT] = torch.stack([sun[:, 0] / sun[:, 1], sun[:, 2] / sun[:, 1]], dim=-1)
         if CONFIDENCE in self.layout:
             code[CONFIDENCE] = outputs[CONFIDENCE].unsqueeze(-1)
         return {name: code[name] if name in code else outputs[name] for name in (f.name for f in self.layout.fields)}
+
+    def _rotation_entry(self, own: Tensor) -> dict[str, Tensor]:
+        """The entry of the scene code for rotations world_from_obj."""
+        return {YAW: torch.stack([own[..., 0, 0], own[..., 0, 2]], dim=-1)}
 
     def _cam_from_world(self, like: Tensor) -> tuple[Tensor, Tensor]:
         turn, shift = self.stage.cam_from_world

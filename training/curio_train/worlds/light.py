@@ -63,11 +63,11 @@ class Light(GroundWorld):
             YAW: yaws(count, num_slots, random),
             COLOR: colors(count, num_slots, random),
             CONFIDENCE: presence(count, num_slots, FEWEST, random),
-            LIGHT: _suns(count, random),
+            LIGHT: suns(count, random),
         }
 
 
-def _suns(count: int, random: np.random.Generator) -> Tensor:
+def suns(count: int, random: np.random.Generator) -> Tensor:
     """(x / y, z / y) [count, 2]: a height uniform on the unit sphere is uniform in area."""
     lowest, highest = (float(np.sin(np.radians(degrees))) for degrees in (LOWEST_SUN_DEG, HIGHEST_SUN_DEG))
     height = random.uniform(lowest, highest, count)

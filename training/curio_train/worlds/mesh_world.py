@@ -153,15 +153,20 @@ class MeshWorld(World):
         """What the objects stand on, as a camera there sees it; None: they float before black."""
         return None
 
+    def own_rotation(self, code: SceneCode) -> Float[Tensor, "batch slots 3 3"]:
+        """world_from_obj of each object: turned about y by its yaw, where the code has one."""
+        if YAW in self.layout:
+            return matrix_from_yaw(code[YAW].float())
+        place = code[TRANSLATION].float()
+        return torch.eye(3).to(place).expand(*place.shape[:2], 3, 3)
+
     def _view(self, code: SceneCode, cam_from_world: Pose, backgrounds: Tensor | None) -> Tensor:
         place = code[TRANSLATION].float()
         turn, shift = (torch.as_tensor(part).to(place) for part in cam_from_world)
-        upright = torch.eye(3).to(place).expand(*place.shape[:2], 3, 3)
-        own = matrix_from_yaw(code[YAW].float()) if YAW in self.layout else upright
         light = self.light(code) @ turn.T
         assert self.camera.matrix is not None  # every stage has a pinhole camera
         scene: dict[str, Any] = {
-            "rotation": turn @ own,
+            "rotation": turn @ self.own_rotation(code),
             "translation_m": place @ turn.T + shift,
             "camera_matrix": self.camera.matrix,
             "light": light,
@@ -169,11 +174,15 @@ class MeshWorld(World):
             "seed": jitter_seed(code),
         }
         color = code[COLOR].float() if COLOR in self.layout else None
-        behind = self._behind(self.ground(cam_from_world), scene) if backgrounds is None else backgrounds
+        behind = self._behind(self.ground(cam_from_world), scene, backgrounds)
         return self._renderer(**scene, color=color, backgrounds=behind)
 
-    def _behind(self, ground: Ground | None, scene: Mapping[str, Any]) -> Float[Tensor, "batch 3 height width"]:
-        """What is seen past the objects: black, or the ground with their shadows."""
+    def _behind(
+        self, ground: Ground | None, scene: Mapping[str, Any], backgrounds: Tensor | None
+    ) -> Float[Tensor, "batch 3 height width"]:
+        """What is seen past the objects: what was given, black, or the ground with their shadows."""
+        if backgrounds is not None:
+            return backgrounds
         light: Tensor = scene["light"]
         if ground is None:
             return light.new_zeros(len(light), 3, self.camera.height, self.camera.width)

@@ -24,6 +24,8 @@ def _make_absolute(options: WorldOptions, *names: str) -> None:
     for name in names:
         if isinstance(path := getattr(options, name), Path):
             object.__setattr__(options, name, path.absolute())
+        elif isinstance(path, tuple):
+            object.__setattr__(options, name, tuple(one.absolute() for one in path))
 
 
 @dataclass(frozen=True)
@@ -87,11 +89,14 @@ class LinemodOptions(WorldOptions):
 class CaptureOptions(WorldOptions):
     """A part of your own, from its CAD file, in six degrees of freedom. With --calibrate: find out its camera instead.
 
+    With --plane: one or more parts on a table or floor, learned from the photographs.
+
     Attributes:
-        mesh: Mesh file: STL, OBJ, PLY, GLB, glTF or OFF. Without colours it is learned in any colour.
+        mesh: Mesh file: STL, OBJ, PLY, GLB, glTF or OFF; on a plane as many as there are kinds of parts. Without
+            colours it is learned in any colour.
         camera: Camera file of the photographs: camera JSON, or BOP's camera.json.
         photos: Folder of unlabelled photographs. They are checked against the camera, and the report shows what was
-            found in them; nothing is learned from them yet.
+            found in them; only on a plane anything is learned from them.
         mesh_unit: Unit of the mesh file's coordinates; the file's own, or metres, unless given.
         background: Photograph of the empty scene, taken as the others were.
         backgrounds: Folder of photographs to see the part in front of, where the scene changes; clutter is rendered
@@ -99,12 +104,24 @@ class CaptureOptions(WorldOptions):
         near_m: Least distance of the part's origin along the optical axis, metres.
         far_m: Largest.
         upright: The part is only seen from above (z of the mesh is up, rolled by up to 45 degrees), not from any side.
+        plane: JSON file with cam_from_world of the plate --background, y up, in metres, as --calibrate --views-out
+            writes it: parts lie on the plane y = 0.
+        counts: On a plane, how many there are of each mesh, or from how many to how many: --counts 3 or --counts 0-4
+            1-2. One of each unless given.
+        up: Axis of the meshes that points up on the plane.
+        lying: Parts lie on the plane any way, not upright and turned about --up alone.
+        held_out: Folder of further photographs on the plane, to judge by instead of --photos.
+        second: Folder of photographs of those same scenes, under the same names, from a second camera of the same kind:
+            what was learned is judged by them.
+        second_background: The empty scene from there; --plane has its cam_from_world, too.
+        blur_px: On a plane, side of the Gaussian filter over images and renderings where they are compared (paper: 9);
+            1 compares them as they are.
     """
 
     default_method: ClassVar[Method] = "sleep"
     default_recipe: ClassVar[Mapping[str, Any]] = _GAZE_RECIPE
 
-    mesh: Path
+    mesh: tuple[Path, ...]
     camera: Path
     photos: Path
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
@@ -113,13 +130,68 @@ class CaptureOptions(WorldOptions):
     near_m: float = 0.3
     far_m: float = 1.0
     upright: tyro.conf.FlagCreatePairsOff[bool] = False
+    plane: Path | None = None
+    counts: tuple[str, ...] = ()
+    up: Literal["x", "y", "z"] = "z"
+    lying: tyro.conf.FlagCreatePairsOff[bool] = False
+    held_out: Path | None = None
+    second: Path | None = None
+    second_background: Path | None = None
+    blur_px: int = 9
 
     def __post_init__(self) -> None:
         """Make paths absolute, and refuse what contradicts itself."""
-        _make_absolute(self, "mesh", "camera", "photos", "background", "backgrounds")
+        _make_absolute(self, "mesh", "camera", "photos", "background", "backgrounds", "plane", "held_out")
+        _make_absolute(self, "second", "second_background")
         if self.background is not None and self.backgrounds is not None:
             raise UsageError("--background and --backgrounds exclude each other: a plate, or a folder of other scenes")
         if not 0 < self.near_m < self.far_m:
             raise UsageError(
                 f"found --near-m {self.near_m:g} and --far-m {self.far_m:g}, expected 0 < near < far, in metres"
             )
+        if self.plane is None:
+            self._refuse_without_plane()
+        else:
+            self._refuse_with_plane()
+
+    @property
+    def amounts(self) -> list[tuple[int, int]]:
+        """The fewest and the most there are of each mesh.
+
+        Raises:
+            UsageError: They are no numbers, or not as many as meshes.
+        """
+        counts = self.counts or ("1",) * len(self.mesh)
+        if len(counts) != len(self.mesh):
+            raise UsageError(f"found {len(counts)} --counts for {len(self.mesh)} meshes, expected one each")
+        return [_amount(count) for count in counts]
+
+    def _refuse_without_plane(self) -> None:
+        given = {name: getattr(self, name) for name in ("counts", "lying", "held_out", "second", "second_background")}
+        if flags := [f"--{name.replace('_', '-')}" for name, value in given.items() if value]:
+            raise UsageError(f"{', '.join(flags)}: for parts on a plane, which --plane has to say; expected it as well")
+        if isinstance(self.mesh, tuple) and len(self.mesh) != 1:
+            raise UsageError(
+                f"--mesh names {len(self.mesh)} files; several parts are learned on a plane alone: give --plane, or "
+                "train a model for each"
+            )
+
+    def _refuse_with_plane(self) -> None:
+        if self.background is None or self.backgrounds is not None or self.upright:
+            raise UsageError(
+                f"--plane {self.plane}: parts on a plane are learned before its photograph: expected --background, and "
+                "neither --backgrounds nor --upright"
+            )
+        if (self.second is None) != (self.second_background is None):
+            raise UsageError("--second and --second-background belong together: expected both, or neither")
+        if self.blur_px < 1 or self.blur_px % 2 == 0:
+            raise UsageError(f"--blur-px {self.blur_px}: expected an odd number of pixels, 1 for none")
+        if max(most for _, most in self.amounts) < 1:
+            raise UsageError(f"--counts {' '.join(self.counts)}: there is never anything; expected a part or more")
+
+
+def _amount(text: str) -> tuple[int, int]:
+    fewest, dash, most = text.partition("-")
+    if not (fewest.isdigit() and (most.isdigit() or not dash)) or (dash and int(most) < int(fewest)):
+        raise UsageError(f"--counts {text}: expected a number such as 3, or the fewest and the most, such as 0-4")
+    return int(fewest), int(most or fewest)

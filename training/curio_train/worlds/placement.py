@@ -1,6 +1,6 @@
 """Drawing scenes: places that keep objects apart, colours, presence."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -9,9 +9,16 @@ from torch import Tensor
 LEAST_SATURATION, LEAST_VALUE = 0.5, 0.7
 """Of drawn colours; black and grey are left to what is behind the objects."""
 
+_MOST_ROUNDS = 2000
+
 
 def places(
-    count: int, radii_m: Sequence[float], lower: Sequence[float], upper: Sequence[float], random: np.random.Generator
+    count: int,
+    radii_m: Sequence[float],
+    lower: Sequence[float],
+    upper: Sequence[float],
+    random: np.random.Generator,
+    allowed: Callable[[np.ndarray], np.ndarray] = lambda points: np.ones(len(points), dtype=bool),
 ) -> Tensor:
     """Positions by rejection, one object after the other: each is drawn anew until it touches none before it.
 
@@ -21,18 +28,21 @@ def places(
         lower: Corner of the box that positions are uniform in.
         upper: The opposite corner.
         random: Source of the draws.
+        allowed: Which of the points [n, 3] are places at all, in a box that is not.
 
     Returns:
-        [count, num_objects, 3] metres; no two objects of a scene are closer than the sum of their radii.
+        [count, num_objects, 3] metres; no two objects of a scene are closer than the sum of their radii, unless there
+        is no room for so many.
     """
     radii = np.asarray(radii_m)
     found = np.zeros((count, len(radii), 3))
     for number, radius in enumerate(radii):
-        waiting = np.arange(count)
-        while len(waiting):
+        waiting, rounds = np.arange(count), 0
+        while len(waiting) and rounds < _MOST_ROUNDS:
             found[waiting, number] = random.uniform(lower, upper, (len(waiting), 3))
             distance = np.linalg.norm(found[waiting, :number] - found[waiting, number, None], axis=-1)
-            waiting = waiting[(distance < radii[:number] + radius).any(axis=1)]
+            touching = (distance < radii[:number] + radius).any(axis=1)
+            waiting, rounds = waiting[touching | ~allowed(found[waiting, number])], rounds + 1
     return torch.from_numpy(found).float()
 
 

@@ -34,11 +34,15 @@ class StoredImages(ImageSource):
     Attributes:
         images: uint8 [num, 3, height, width].
         code: The true codes of all images, or None.
+        behind: uint8 [num, 3, height, width], what is behind the objects of each image; None: the world knows.
     """
 
-    def __init__(self, images: Tensor, code: SceneCode | None, *, seed: int, shuffle: bool) -> None:
+    def __init__(
+        self, images: Tensor, code: SceneCode | None, *, seed: int, shuffle: bool, behind: Tensor | None = None
+    ) -> None:
         self.images = images
         self.code = code
+        self.behind = behind
         self._seed = seed
         self._shuffle = shuffle
 
@@ -51,13 +55,15 @@ class StoredImages(ImageSource):
         if not 0 < count <= len(self):
             raise UsageError(f"a share of {share} of {len(self)} images is {count} images, expected 1 to {len(self)}")
         code = None if self.code is None else index(self.code, slice(count))
-        return StoredImages(self.images[:count], code, seed=self._seed, shuffle=self._shuffle)
+        behind = None if self.behind is None else self.behind[:count]
+        return StoredImages(self.images[:count], code, seed=self._seed, shuffle=self._shuffle, behind=behind)
 
     def batch(self, step: int, size: int) -> Batch:
         """Images ``step * size`` to ``(step + 1) * size`` of the endless sequence of epochs."""
         rows = self._rows(np.arange(step * size, (step + 1) * size))
         images = self.images[rows].float() / 255
-        return Batch(images, code=None if self.code is None else index(self.code, rows))
+        behind = None if self.behind is None else self.behind[rows].float() / 255
+        return Batch(images, behind, None if self.code is None else index(self.code, rows))
 
     def _rows(self, positions: np.ndarray) -> Tensor:
         epochs, places = np.divmod(positions, len(self))
