@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from curio_train.data.backgrounds import POOL_HEIGHT, POOL_WIDTH, ClutterBackgrounds, PhotographBackgrounds, render_pool
+from curio_train.data.leaves import scatter_leaves
 from curio_train.data.photographs import Photographs
 from curio_train.data.shapes import sphere
 from curio_train.errors import DataError
@@ -23,13 +24,30 @@ def test_clutter_is_varied_and_repeatable(pool):
     assert not np.array_equal(pool, render_pool(10, seed=6))
 
 
+def test_leaves_cover_each_other_with_strong_edges_everywhere():
+    random = np.random.default_rng(2)
+    pictures = np.full((12, POOL_HEIGHT, POOL_WIDTH, 3), 0.5, np.float32)
+    for picture in pictures:
+        scatter_leaves(picture, random)
+    assert pictures.min() >= 0
+    assert pictures.max() <= 1
+    covered = (pictures != 0.5).any(axis=-1)
+    assert 0.2 < covered.mean() < 0.95
+    assert covered.mean(axis=0).min() > 0, "somewhere no leaf ever lies"
+    steps = np.abs(np.diff(pictures, axis=2)).max(axis=-1)
+    assert (steps > 0.2).mean() > 0.02
+
+
 def test_other_objects_lie_about():
-    """A mesh of a colour that nothing else has shows up in most pictures."""
+    """A mesh of a colour that nothing else has covers more in most pictures than in those without it."""
     shape = sphere(0.06)
     green = dataclasses.replace(shape, vertex_colors_srgb=np.tile([0.0, 1.0, 0.0], (len(shape.vertices_m), 1)))
-    pictures = render_pool(10, seed=5, others=[green] * 3).astype(int)
-    greenest = (pictures[..., 1] - 4 * pictures[..., [0, 2]].max(axis=-1)).reshape(10, -1) > 0
-    assert (greenest.sum(axis=1) > 20).mean() > 0.5
+    found = []
+    for others in ([], [green] * 3):
+        pictures = render_pool(10, seed=5, others=others).astype(int)
+        greenest = (pictures[..., 1] - 4 * pictures[..., [0, 2]].max(axis=-1)).reshape(10, -1) > 0
+        found.append(greenest.sum(axis=1))
+    assert (found[1] > found[0] + 20).mean() > 0.5
 
 
 def test_draws_are_a_function_of_the_seed(pool):

@@ -1,7 +1,8 @@
 """What objects are seen in front of: a folder of photographs, or clutter of our own making.
 
-Own clutter is rendered like everything else: coloured noise for a wall or a desk, then heaps of simple shapes with
-random patterns and light. It needs no download, nobody holds rights in it, and what is trained over it may be shipped.
+Own clutter is rendered like everything else: coloured noise for a wall or a desk with prints and tiles on it, then
+heaps of simple shapes with random patterns and light. It needs no download, nobody holds rights in it, and what is
+trained over it may be shipped.
 """
 
 import dataclasses
@@ -18,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from curio_train.data.leaves import scatter_leaves
 from curio_train.data.meshes import Mesh
 from curio_train.data.photographs import Photographs
 from curio_train.data.shapes import box, capsule, cone, sphere
@@ -82,7 +84,7 @@ class ClutterBackgrounds(Backgrounds):
             DataError: The cache folder cannot be written.
         """
         names = [mesh.sha256 for mesh in others]
-        recipe = json.dumps([POOL_SIZE, POOL_WIDTH, POOL_HEIGHT, HEAPS, NUM_SLOTS, _SEED, "v2", *names])
+        recipe = json.dumps([POOL_SIZE, POOL_WIDTH, POOL_HEIGHT, HEAPS, NUM_SLOTS, _SEED, "v3", *names])
         path = cache.expanduser() / f"clutter-{hashlib.sha256(recipe.encode()).hexdigest()[:16]}.npy"
         if not path.is_file():
             _make_folder(path.parent)  # before half a minute is spent on the pictures
@@ -122,7 +124,7 @@ def render_pool(count: int, seed: int, others: Sequence[Mesh] = ()) -> np.ndarra
     """Draw uint8 [count, height, width, 3] images of clutter, with ``others`` spread over its heaps."""
     random = np.random.default_rng(seed)
     meshes = [_patterned(mesh, random) for mesh in _shapes(random) for _ in range(4)]
-    images = np.stack([_noise(random) for _ in range(count)])
+    images = np.stack([_desk(random) for _ in range(count)])
     pool = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
     for heap in range(HEAPS):
         known = list(others[heap::HEAPS])[:NUM_SLOTS]
@@ -200,8 +202,8 @@ def _patterned(mesh: Mesh, random: np.random.Generator) -> Mesh:
     return dataclasses.replace(mesh, vertex_colors_srgb=np.clip(base + field, 0, 1))
 
 
-def _noise(random: np.random.Generator) -> np.ndarray:
-    """Coloured noise with more of it at low frequencies: float32 [height, width, 3] in [0, 1]."""
+def _desk(random: np.random.Generator) -> np.ndarray:
+    """Coloured noise with more of it at low frequencies, under leaves: float32 [height, width, 3] in [0, 1]."""
     image = np.empty((POOL_HEIGHT, POOL_WIDTH, 3), np.float32)
     image[:] = random.uniform(0.1, 0.9) + random.normal(size=3) * random.uniform(0, 0.2)
     shared = np.zeros((POOL_HEIGHT, POOL_WIDTH), np.float32)
@@ -209,7 +211,9 @@ def _noise(random: np.random.Generator) -> np.ndarray:
         grid = random.normal(size=(octave, octave + octave // 3 + 1)).astype(np.float32) * random.uniform(0, 0.25)
         shared += cv2.resize(grid, (POOL_WIDTH, POOL_HEIGHT), interpolation=cv2.INTER_CUBIC) / np.sqrt(octave)
     image += shared[..., None] * random.uniform(0.3, 1.0, 3).astype(np.float32)
-    return np.clip(image, 0, 1)
+    np.clip(image, 0, 1, out=image)
+    scatter_leaves(image, random)
+    return image
 
 
 def _make_folder(folder: Path) -> None:
