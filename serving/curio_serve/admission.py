@@ -80,9 +80,9 @@ class WorkQueue:
         metrics.working.set_function(lambda: num_slots - self._num_free)
 
     @property
-    def is_busy(self) -> bool:
-        """Whether a further call would have to wait."""
-        return not self._num_free
+    def is_long(self) -> bool:
+        """Whether a further call would have to wait for more than one frame."""
+        return len(self._waiting) >= self.num_slots
 
     def promise(self, waiter: Waiter) -> None:
         """Keep a place for a call whose message is still on its way: to refuse it later would cost its reading.

@@ -154,7 +154,8 @@ class DirectCalls:
             call.refuse(ArgumentError("the call ended before its message had come; expected one message"))
             return None
         call.data = data
-        if self._work.is_busy:
+        # To hear of its end costs a call more than it saves where its turn comes soon.
+        if self._work.is_long:
             call.watch()
         try:
             return call if self._work.enter(call) else None

@@ -161,9 +161,7 @@ class PoseService(PoseDetectorServicer):
         with slot as waited_s:
             answer = detect_frame(request, detectors, self._limits, waited_s)
         spent = answer.milliseconds
-        self._metrics.queue_s.observe(spent.queue / 1e3)
-        self._metrics.decode_s.observe(spent.decode / 1e3)
-        self._metrics.inference_s.observe(spent.inference / 1e3)
+        self._metrics.phases.observe(spent.queue / 1e3, spent.decode / 1e3, spent.inference / 1e3)
         return answer
 
     def _check(self, request: messages.DetectRequest) -> None:
