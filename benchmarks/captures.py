@@ -1,6 +1,6 @@
 """The paper's Table 4 on stand-ins for its captures: make photographs, learn from them, judge from a second camera.
 
-    python benchmarks/captures.py [--only sphere_real] [--methods noncur our] [--images 6400] [--jobs 2] [--dry-run]
+    python benchmarks/captures.py [--only sphere_real] [--methods noncur our] [--images 16000] [--jobs 2] [--dry-run]
 
 What is there already is kept: photographs, finished runs, checkpoints. After each run docs/results/captures.json and
 captures.md are written anew. Every method of a scene sees as many images.
@@ -49,7 +49,7 @@ class Settings:
 
     only: tuple[Scene, ...] = ("sphere_real", "bunny", "shapes")
     methods: tuple[Method, ...] = ("noncur", "sleep", "our")
-    images: int = 6_400
+    images: int = 16_000
     photos: int = 200
     tests: int = 50
     jobs: int = min(2, os.cpu_count() or 1)

@@ -167,21 +167,27 @@ class CaptureOptions(WorldOptions):
         return [_amount(count) for count in counts]
 
     def _refuse_without_plane(self) -> None:
-        given = {name: getattr(self, name) for name in ("counts", "lying", "held_out", "second", "second_background")}
-        if flags := [f"--{name.replace('_', '-')}" for name, value in given.items() if value]:
-            raise UsageError(f"{', '.join(flags)}: for parts on a plane, which --plane has to say; expected it as well")
+        names = ("counts", "up", "lying", "held_out", "second", "second_background", "blur_px")
+        if flags := self._flags_of(names):
+            raise UsageError(f"{flags}: for parts on a plane, which --plane has to say; expected it as well")
         if isinstance(self.mesh, tuple) and len(self.mesh) != 1:
             raise UsageError(
                 f"--mesh names {len(self.mesh)} files; several parts are learned on a plane alone: give --plane, or "
                 "train a model for each"
             )
 
+    def _flags_of(self, names: tuple[str, ...]) -> str:
+        """Those of the flags that were given another value than the usual one."""
+        given = [name for name in names if getattr(self, name) != getattr(CaptureOptions, name)]
+        return ", ".join(f"--{name.replace('_', '-')}" for name in given)
+
     def _refuse_with_plane(self) -> None:
-        if self.background is None or self.backgrounds is not None or self.upright:
-            raise UsageError(
-                f"--plane {self.plane}: parts on a plane are learned before its photograph: expected --background, and "
-                "neither --backgrounds nor --upright"
-            )
+        if self.background is None:
+            raise UsageError(f"--plane {self.plane}: expected --background, a photograph of it without parts, as well")
+        if flags := self._flags_of(("backgrounds", "upright", "near_m", "far_m")):
+            raise UsageError(f"{flags}: for a part in free space; leave it out, or --plane {self.plane}")
+        if len({file.stem for file in self.mesh}) < len(self.mesh):
+            raise UsageError(f"--mesh {' '.join(map(str, self.mesh))}: parts are named after their files: rename one")
         if (self.second is None) != (self.second_background is None):
             raise UsageError("--second and --second-background belong together: expected both, or neither")
         if self.blur_px < 1 or self.blur_px % 2 == 0:
