@@ -152,6 +152,54 @@ def test_a_call_that_ended_before_it_waits_never_works(gate: threading.Event, ma
     assert first.result(30) == "done"
 
 
+class Place:
+    """A waiter that is never told anything."""
+
+    def tell(self) -> None:
+        raise AssertionError("nobody left")
+
+
+def test_a_promise_keeps_a_place() -> None:
+    queue = WorkQueue(1, 1, Metrics(CollectorRegistry()))
+    first, second, third = Place(), Place(), Place()
+    queue.promise(first)
+    queue.promise(second)
+    with pytest.raises(Overloaded):
+        queue.promise(third)
+    assert queue.enter(first)
+    assert not queue.enter(second)
+    with pytest.raises(Overloaded):
+        queue.enter(third)
+    assert queue.withdraw(second)
+    assert not queue.withdraw(second)
+    assert not queue.enter(third)
+    assert queue.leave(0.001) is third
+    assert queue.leave(0.001) is None
+
+
+def test_a_promise_given_up_is_free_again() -> None:
+    queue, place = WorkQueue(1, 0, Metrics(CollectorRegistry())), Place()
+    for _ in range(3):
+        queue.promise(place)
+        assert queue.withdraw(place)
+    assert queue.enter(Place())
+
+
+def test_promises_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Callers who never send their message do not keep others out."""
+    queue = WorkQueue(1, 1, Metrics(CollectorRegistry()))
+    slow = [Place(), Place()]
+    for place in slow:
+        queue.promise(place)
+    monkeypatch.setattr("curio_serve.admission._PROMISE_S", 0.0)
+    queue.promise(quick := Place())
+    assert queue.enter(quick)
+    # Their messages come late; they find a place where there is one.
+    assert not queue.enter(slow[0])
+    with pytest.raises(Overloaded):
+        queue.enter(slow[1])
+
+
 def test_errors_of_the_work_give_the_slot_back() -> None:
     queue = WorkQueue(1, 0, Metrics(CollectorRegistry()))
     for _ in range(5):
