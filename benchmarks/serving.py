@@ -7,6 +7,9 @@ process, and a load generator in a process of its own.
 
 served_over_raw   CPU time a frame of a bare loop (same decode, warp and session; as many threads as the server has
                   workers) over the server process's CPU time a request at concurrency 4; median of alternating rounds
+plain_over_raw    the same of grpcio's own threaded server with the bare loop in its handler and nothing else, in the
+                  same rounds: what gRPC in Python leaves of the model. The bare loop has both cores and their caches
+                  to itself; a server shares them with the load generator, and pays for it in the model's time, too
 frame_ms          one frame end to end at concurrency 1, median
 ready_s           from starting the process until its health service says SERVING, median of three starts
 rss_mb            the server's resident memory after that load; ``peak_rss_mb`` its largest
@@ -85,21 +88,29 @@ def main() -> None:
 def cost(models: Path, frames: list[bytes], arguments: Arguments) -> dict[str, Any]:
     """Latency of one caller, CPU time a request beside the bare loop's, memory."""
     cores = sorted(os.sched_getaffinity(0))
-    raw_ms, served_ms = [], []
-    with running_server(models, cores) as (address, pid), worker(cores) as load:
-        target = pose_target(address, frames)
-        load(closed_loop, target, 4, _WARM_UP_S)
+    raw_ms, plain_ms, served_ms = [], [], []
+    with (
+        running_server(models, cores) as (address, pid),
+        plain_server(models / MODEL, len(cores)) as (plain_address, plain_pid),
+        worker(cores) as load,
+    ):
+        target, plain = pose_target(address, frames, pid), pose_target(plain_address, frames, plain_pid)
+        for warm in (target, plain):
+            load(closed_loop, warm, 4, _WARM_UP_S)
         alone = load(closed_loop, target, 1, arguments.seconds)
         for _ in range(arguments.rounds):
             with worker(cores) as bare:
                 raw_ms.append(bare(bare_cpu_ms, models / MODEL, frames, len(cores), arguments.seconds))
-            before_s = cpu_s(pid)
-            served = load(closed_loop, target, 4, arguments.seconds)
-            served_ms.append(1000 * (cpu_s(pid) - before_s) / served["codes"]["OK"])
+            for figures, server in ((served_ms, target), (plain_ms, plain)):
+                before_s = sum(map(cpu_s, server.processes))
+                served = load(closed_loop, server, 4, arguments.seconds)
+                figures.append(1000 * (sum(map(cpu_s, server.processes)) - before_s) / served["codes"]["OK"])
         rss_mb, peak_rss_mb = memory_mb(pid)
     return {
         "served_over_raw": round(float(np.median(np.divide(raw_ms, served_ms))), 3),
+        "plain_over_raw": round(float(np.median(np.divide(raw_ms, plain_ms))), 3),
         "raw_cpu_ms": round(statistics.median(raw_ms), 3),
+        "plain_cpu_ms": round(statistics.median(plain_ms), 3),
         "served_cpu_ms": round(statistics.median(served_ms), 3),
         "frame_ms": round(statistics.median(alone["latencies_ms"]), 3),
         "rss_mb": rss_mb,
@@ -187,6 +198,20 @@ def running_server(models: Path, cores: Sequence[int], *flags: str) -> Iterator[
         if answer.status != health_pb2.HealthCheckResponse.SERVING:
             raise RuntimeError(f"the server at {address} answers its health check with {answer.status}")
         yield address, process.pid
+    finally:
+        process.terminate()
+        process.wait(timeout=_START_LIMIT_S)
+
+
+@contextmanager
+def plain_server(model_folder: Path, num_threads: int) -> Iterator[tuple[str, int]]:
+    """Address and process id of the bare loop behind grpcio's own server."""
+    program = Path(__file__).parent / "load" / "plain_server.py"
+    call = [sys.executable, str(program), str(model_folder), str(num_threads)]
+    process = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        yield f"127.0.0.1:{process.stdout.readline().strip()}", process.pid
     finally:
         process.terminate()
         process.wait(timeout=_START_LIMIT_S)
