@@ -1,5 +1,6 @@
 """Scores on cases worked out by hand, on real frames of a small data set, and what an evaluation refuses."""
 
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ from curio_train.evaluation.evaluate import draw, evaluate, score
 from curio_train.evaluation.real_frames import evaluate_real_frames, look
 from curio_train.evaluation.scores import pose_scores, rotation_errors_deg
 from curio_train.evaluation.subject import Subject
+from curio_train.evaluation.tables import print_evaluation
 from curio_train.geometry import Pose
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds.base import Camera
@@ -26,6 +28,7 @@ from curio_train.worlds.circles import Circles
 from curio_train.worlds.linemod import build
 from curio_train.worlds.options import LinemodOptions
 from curio_train.worlds.single_object import SingleObjectWorld
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 WriteRun = Callable[..., Path]
@@ -256,3 +259,26 @@ def test_flags_that_make_no_sense_are_refused(tmp_path: Path, write_run: WriteRu
         evaluate(run, bop_results=tmp_path, cache=tmp_path)
     with pytest.raises(UsageError, match=r"--data .*: world circles has no real frames"):
         evaluate(run, data=tmp_path, cache=tmp_path)
+
+
+def test_refined_poses_stand_beside_those_as_read(data: Path, tmp_path: Path) -> None:
+    world = build(LinemodOptions("ape", data, gaze=False))
+    as_read = evaluate_real_frames(always_at(world, [0.0, 0.0, 0.8]), data, tmp_path)
+    better = evaluate_real_frames(always_at(world, [0.06, 0.0, 0.9]), data, tmp_path, "-refined")
+    assert {file.name for file in tmp_path.glob("*.csv")} == {
+        "wake-sleep_lmx-test.csv",
+        "wake-sleep-refined_lmx-test.csv",
+    }
+    result = {
+        "source": "ape", "world": "linemod", "objects": ["ape"], "method": "sleep", "preset": "laptop", "seed": 0,
+        "images_seen": 10, "training_seconds": 60.0, "split": "test", "num_images": 5,
+        "metrics": {"add_recall": 0.25}, "untrained": {"add_recall": 0.125}, "real": as_read,
+    }  # fmt: skip
+    console = Console(record=True, width=120, file=io.StringIO())
+    print_evaluation(result, console)
+    assert "refined" not in console.export_text()
+    print_evaluation(result | {"refined": {"metrics": {"add_recall": 0.75}, "real": better}}, console)
+    rows = [[cell.strip() for cell in line.split("│")] for line in console.export_text().splitlines()]
+    assert ["ADD(-S) below 0.1 diameters, share", "0.25", "0.125", "0.75"] in [row[1:-1] for row in rows]
+    seen = next(row for row in rows if "40–60 % visible" in "".join(row))
+    assert seen[2:4] == ["0", "1"]

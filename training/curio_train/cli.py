@@ -182,6 +182,7 @@ class EvaluateCommand:
         num_images: How many images.
         data: BOP data set whose real frames are scored as well; needed for an exported LineMOD model.
         bop_results: Folder for a results file of the real frames in BOP's format.
+        refine: Score the poses once more after rendering and comparing; needs the renderer, as serving never does.
         json: Print the result as one JSON object on the last line.
         cache: Where image sets that a world draws once are kept.
     """
@@ -191,6 +192,7 @@ class EvaluateCommand:
     num_images: int = 500
     data: Path | None = None
     bop_results: Path | None = None
+    refine: FlagCreatePairsOff[bool] = False
     json: FlagCreatePairsOff[bool] = False
     cache: Path = Session.cache
 
@@ -205,17 +207,10 @@ def _evaluate(command: EvaluateCommand) -> int:
     from curio_train.evaluation.evaluate import evaluate
     from curio_train.evaluation.tables import print_evaluation
 
+    names = ("split", "num_images", "data", "bop_results", "refine", "cache")
+    given = {name: getattr(command, name) for name in names}
     with Console(stderr=True).status("") as status:
-        result = evaluate(
-            command.path,
-            split=command.split,
-            num_images=command.num_images,
-            data=command.data,
-            bop_results=command.bop_results,
-            cache=command.cache,
-            progress=status.update,
-            warn=_warn,
-        )
+        result = evaluate(command.path, **given, progress=status.update, warn=_warn)
     print_evaluation(result, Console())
     if command.json:
         print(json.dumps(result))

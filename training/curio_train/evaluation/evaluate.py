@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from curio_train.errors import CheckpointError, ReportError, UsageError
 from curio_train.evaluation.photographed import judge
 from curio_train.evaluation.real_frames import evaluate_real_frames
+from curio_train.evaluation.refinement import refined
 from curio_train.evaluation.report import write_report
 from curio_train.evaluation.scores import add_errors, pose_scores, scene_errors, scene_scores
 from curio_train.evaluation.subject import Predict, Subject, load_subject
@@ -51,6 +52,7 @@ def evaluate(
     num_images: int = 500,
     data: Path | None = None,
     bop_results: Path | None = None,
+    refine: bool = False,
     cache: Path,
     progress: Callable[[str], None] = lambda text: None,
     warn: Callable[[str], None] = lambda text: None,
@@ -63,14 +65,15 @@ def evaluate(
         num_images: How many; of a finite set at most all.
         data: A BOP data set whose real frames are scored as well, in the LineMOD world.
         bop_results: Folder for a results file of those frames in BOP's format.
+        refine: Score the poses once more after :class:`~curio_train.evaluation.refinement.Refinement`.
         cache: Where worlds keep their image sets.
         progress: Told what is being done.
         warn: Told why a report could not be written, for which no evaluation is thrown away.
 
     Returns:
         What was evaluated, ``metrics`` by name, the same of the network before its first step as ``untrained``, and
-        ``real`` where real frames were scored, ``photographs`` where there are some to judge by. A run folder gets it
-        as well, and a report.
+        ``real`` where real frames were scored, ``photographs`` where there are some to judge by, and
+        ``refined`` with ``metrics`` and ``real`` of refined poses. A run folder gets it as well, and a report.
 
     Raises:
         CurioError: Any of this package's errors.
@@ -82,6 +85,7 @@ def evaluate(
     subject = load_subject(path, data)
     if data is not None and subject.world.mesh is None:
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
+    better = replace(subject, predict=refined(subject.predict, subject.world)) if refine else None
     progress(f"{num_images} images of the {split} split")
     held_out = draw(subject.world, split, num_images, cache)
     result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images)}
@@ -92,6 +96,11 @@ def evaluate(
     if data is not None:
         progress(f"real frames in {data}")
         result["real"] = evaluate_real_frames(subject, data, bop_results)
+    if better is not None:
+        progress("refined poses")
+        result["refined"] = {"metrics": _scored(better.world, better.predict, held_out)[1]}
+        if data is not None:
+            result["refined"]["real"] = evaluate_real_frames(better, data, bop_results, "-refined")
     if (judgement := judge(subject.world, subject.predict)) is not None:
         result["photographs"] = judgement.summary
     if (path / CONFIG_FILE).exists():

@@ -62,13 +62,14 @@ class Estimate:
 Pairs = Sequence[tuple[Estimate, Annotation]]
 
 
-def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None) -> dict[str, Any]:
+def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None, suffix: str = "") -> dict[str, Any]:
     """Score on the targets of the object in a data set.
 
     Args:
         subject: Reads poses of one object.
         data: In BOP's layout.
         bop_results: Folder for a results file in BOP's format, or None.
+        suffix: Of the method's name in that file's.
 
     Raises:
         UsageError: The world has no camera, or the data set does not know the object.
@@ -79,7 +80,9 @@ def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None)
     frames = scored_frames(dataset, kind.name)
     estimates = estimate_frames(subject, dataset, frames.targets)
     if bop_results is not None:
-        _write_bop(bop_results, subject.config.method, data.resolve().name, dataset.object_id(kind.name), estimates)
+        _write_bop(
+            bop_results, subject.config.method + suffix, data.resolve().name, dataset.object_id(kind.name), estimates
+        )
     pairs = list(zip(estimates, frames.targets, strict=True))
     points = dataset.evaluation_mesh(kind.name).vertices_m
     info = kind.info

@@ -63,11 +63,11 @@ def print_evaluation(result: Mapping[str, Any], console: Console) -> None:
     table.add_column("metric")
     table.add_column("this", justify="right")
     table.add_column("untrained", justify="right")
-    for name, value in result["metrics"].items():
-        table.add_row(label(name), f"{value:.4g}", f"{result['untrained'][name]:.4g}")
+    refined = result.get("refined")
+    _add_rows(table, result["metrics"], result["untrained"], *([refined["metrics"]] if refined else []))
     console.print(table)
     if "real" in result:
-        _print_real(result["real"], console)
+        _print_real(result["real"], refined and refined["real"], console)
     if "photographs" in result:
         _print_photographs(result["photographs"], console)
 
@@ -82,16 +82,30 @@ def _print_photographs(found: Mapping[str, Any], console: Console) -> None:
     console.print(found["verdict"], markup=False)
 
 
-def _print_real(real: Mapping[str, Any], console: Console) -> None:
+def _add_rows(table: Table, first: Mapping[str, float], *others: Mapping[str, float]) -> None:
+    """A row a metric; what has no column yet is of refined poses."""
+    if len(table.columns) < 2 + len(others):
+        table.add_column("refined", justify="right")
+    for name, value in first.items():
+        table.add_row(label(name), *(f"{found:.4g}" for found in (value, *(other[name] for other in others))))
+
+
+def _print_real(real: Mapping[str, Any], refined: Mapping[str, Any] | None, console: Console) -> None:
     table = Table(
         title=f"{real['num_targets']} real targets of {real['dataset']}, {real['split']}: {real['split_name']}",
         title_justify="left",
     )
     table.add_column("metric")
     table.add_column("this", justify="right")
-    for name, value in real["metrics"].items():
-        table.add_row(label(name), f"{value:.4g}")
-    for row in real["by_visibility"]:
-        bin_name = f"ADD(-S), {100 * row['from']:.0f}–{100 * row['to']:.0f} % visible, {row['num_targets']} targets"
-        table.add_row(bin_name, f"{row['add_recall']:.4g}")
+    _add_rows(table, *(found["metrics"] | _bins(found) for found in (real, refined) if found))
     console.print(table)
+
+
+def _bins(real: Mapping[str, Any]) -> dict[str, float]:
+    """Recall in bins of the visible share, by their names for people."""
+    return {
+        f"ADD(-S), {100 * row['from']:.0f}–{100 * row['to']:.0f} % visible, {row['num_targets']} targets": row[
+            "add_recall"
+        ]
+        for row in real["by_visibility"]
+    }

@@ -1,0 +1,142 @@
+"""Refined poses: nearer to the truth where the picture shows the object, and left alone where it does not."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from curio_train.camera import Intrinsics
+from curio_train.data.backgrounds import ClutterBackgrounds
+from curio_train.data.bop import ModelInfo
+from curio_train.data.shapes import chair
+from curio_train.errors import UsageError
+from curio_train.evaluation.evaluate import evaluate
+from curio_train.evaluation.refinement import Refinement, filled_in, rotation_from_vector
+from curio_train.evaluation.scores import add_errors
+from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, poses
+from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.circles import Circles
+from curio_train.worlds.gaze import GazeWorld
+from curio_train.worlds.single_object import Object
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
+MESH = chair(0.12)
+NUM = 6
+
+
+@pytest.fixture(scope="module")
+def world() -> GazeWorld:
+    kind = ObjectKind("chair", (0,), MESH.diameter_m, MESH.box_corners_m, MESH.sha256)
+    random = np.random.default_rng(3)
+    pool = np.stack([cv2.resize(random.integers(0, 256, (24, 32, 3), np.uint8), (640, 480)) for _ in range(4)])
+    return GazeWorld(
+        "linemod", Object(kind, MESH, Intrinsics(K, 640, 480), 0.5, 1.0, lambda _: ClutterBackgrounds(pool))
+    )
+
+
+@pytest.fixture(scope="module")
+def refinement(world: GazeWorld) -> Refinement:
+    return Refinement(world)
+
+
+@pytest.fixture(scope="module")
+def scenes(world: GazeWorld) -> tuple[Tensor, Tensor, SceneCode]:
+    """Pictures of the object in whole, the clutter behind it, and the truth."""
+    code = world.sample(NUM, (1,))
+    code[TRANSLATION][..., :2] *= 0.6
+    behind = world.backgrounds(Path()).draw(NUM, 640, 480, (2,))
+    images = [(picture.clamp(0, 1) * 255).round().byte() for picture in (world.render(code, behind), behind)]
+    return images[0], images[1], code
+
+
+def off(code: SceneCode) -> dict[str, Tensor]:
+    """The code as a network might read it: 8 degrees, 4 % of the distance and some pixels beside the truth."""
+    random = np.random.default_rng(5)
+    axes = random.normal(size=(NUM, 3))
+    turns = Rotation.from_rotvec(np.radians(8) * axes / np.linalg.norm(axes, axis=1, keepdims=True)).as_matrix()
+    rotation = torch.from_numpy(turns).float() @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
+    scale = torch.from_numpy(random.choice([0.96, 1.04], (NUM, 1, 1))).float()
+    shift = torch.tensor([0.005, -0.004, 0.0])
+    read = {TRANSLATION: code[TRANSLATION] * scale + shift, ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None]}
+    return dict(code) | read | {LIGHT: code[LIGHT].roll(1, dims=0)}
+
+
+def errors(found: SceneCode, true: SceneCode) -> np.ndarray:
+    return np.array(add_errors(poses(found), poses(true), MESH.vertices_m, ModelInfo(MESH.diameter_m)))
+
+
+def test_estimates_come_at_least_half_way_to_the_truth(
+    refinement: Refinement, scenes: tuple[Tensor, Tensor, SceneCode]
+) -> None:
+    images, _, true = scenes
+    estimate = off(true)
+    found = refinement(images, estimate)
+    before, after = errors(estimate, true), errors(found, true)
+    assert before.min() > 0.1
+    assert after.mean() < 0.5 * before.mean(), (before, after)
+    rotation = matrix_from_rotation_6d(found[ROTATION_6D][:, 0])
+    assert torch.allclose(rotation @ rotation.transpose(1, 2), torch.eye(3).expand(NUM, 3, 3), atol=1e-5)
+    assert all(torch.equal(found[name], estimate[name]) for name in estimate.keys() - {TRANSLATION, ROTATION_6D})
+
+
+def test_objects_half_hidden_are_not_lost(refinement: Refinement, scenes: tuple[Tensor, Tensor, SceneCode]) -> None:
+    """The right half of each object behind something else: what cannot be explained may not pull it away."""
+    images, behind, true = scenes
+    place = true[TRANSLATION][:, 0]
+    hidden = images.clone()
+    for number, column in enumerate((K[0, 0] * place[:, 0] / place[:, 2] + K[0, 2] + 8).int().tolist()):
+        hidden[number, :, :, column:] = behind[number].flip(1)[:, :, column:]
+    estimate = off(true)
+    before, after = errors(estimate, true), errors(refinement(hidden, estimate), true)
+    assert (after < before + 0.02).all(), (before, after)
+
+
+def test_where_there_is_nothing_estimates_stand(
+    refinement: Refinement, scenes: tuple[Tensor, Tensor, SceneCode]
+) -> None:
+    _, behind, true = scenes
+    estimate = off(true)
+    flat = torch.full_like(behind, 128)
+    for images in (behind, flat):
+        found = refinement(images, estimate)
+        assert all(torch.equal(found[name], estimate[name]) for name in estimate)
+
+
+def test_objects_out_of_the_picture_give_numbers(
+    refinement: Refinement, scenes: tuple[Tensor, Tensor, SceneCode]
+) -> None:
+    images, _, true = scenes
+    lost = dict(true) | {TRANSLATION: true[TRANSLATION] + torch.tensor([3.0, 0.0, 0.0])}
+    lost[TRANSLATION][0] = torch.tensor([0.0, 0.0, 1e-3])
+    found = refinement(images, lost)
+    assert all(value.isfinite().all() for value in found.values())
+
+
+def test_hidden_pixels_continue_their_surroundings() -> None:
+    ramp = torch.linspace(0, 1, 32).expand(1, 3, 32, 32).clone()
+    hidden = torch.zeros(1, 1, 32, 32, dtype=torch.bool)
+    hidden[..., 10:20, 12:22] = True
+    filled = filled_in(torch.where(hidden, torch.full_like(ramp, 7.0), ramp), hidden)
+    assert torch.equal(filled[..., :10, :], ramp[..., :10, :])
+    assert (filled - ramp).abs().max() < 0.15
+
+
+def test_rotations_of_vectors_are_scipys() -> None:
+    vectors = torch.tensor([[0.3, -0.2, 0.5], [0.0, 0.0, 0.0], [1e-5, 0.0, 0.0]], requires_grad=True)
+    found = rotation_from_vector(vectors)
+    assert found.detach().numpy() == pytest.approx(Rotation.from_rotvec(vectors.detach().numpy()).as_matrix(), abs=1e-6)
+    found[:, 0, 1].sum().backward()
+    assert vectors.grad is not None
+    assert vectors.grad.isfinite().all()
+    assert vectors.grad[1, 2] == pytest.approx(-1, abs=1e-4)
+
+
+def test_worlds_without_one_object_are_refused(tmp_path: Path, write_run) -> None:
+    with pytest.raises(UsageError, match="--refine: world circles cannot be refined, expected one object"):
+        Refinement(Circles())
+    with pytest.raises(UsageError, match="--refine: world circles"):
+        evaluate(write_run(tmp_path / "run"), refine=True, cache=tmp_path)
