@@ -25,7 +25,7 @@ from google.protobuf.message import DecodeError, Message
 from grpc._cython import cygrpc  # type: ignore[attr-defined]
 
 from curio_serve.admission import Waiter, WorkQueue, hung_up_in_queue, passed_in_queue
-from curio_serve.errors import ArgumentError, CurioError, Overloaded
+from curio_serve.errors import ArgumentError, CurioError, Overloaded, Unavailable
 from curio_serve.telemetry import LOGGER
 from curio_serve.wire import status_from_error, unreadable
 
@@ -82,6 +82,7 @@ class DirectCalls:
         self._work, self._methods = work, methods
         self._max_calls, self._refuse_caller = max_calls, refuse_caller
         self._open: set[_Call] = set()
+        self.is_stopping, self._all_ended = False, threading.Event()
         self._events = cygrpc.CompletionQueue()
         self._server.register_completion_queue(self._events)
         for method in methods:
@@ -100,7 +101,13 @@ class DirectCalls:
             thread.start()
 
     def stop(self) -> None:
-        """End the threads; the server must have been stopped."""
+        """End the threads; the server must have been stopped.
+
+        Frames that are worked on are finished first: gRPC ends the process if anything is sent after the shutdown.
+        """
+        self.is_stopping = True
+        if self._open:
+            self._all_ended.wait()
         self._events.shutdown()
         for thread in self._threads:
             thread.join()
@@ -133,17 +140,20 @@ class DirectCalls:
             return
         self._expect(method)
         call = _Call(self, method, event.call, event.call_details.deadline)
+        self._open.add(call)
+        if self.is_stopping:
+            self.forget(call)
+            return
         if error := self._refuse_caller(event.invocation_metadata):
             call.send_error(error)
             return
         try:
-            if len(self._open) >= self._max_calls:
-                raise Overloaded(f"{len(self._open)} calls are open, which is the limit (--max-calls)", 1.0)
+            if len(self._open) > self._max_calls:
+                raise Overloaded(f"{self._max_calls} calls are open, which is the limit (--max-calls)", 1.0)
             self._work.promise(call)
         except Overloaded as exc:
             call.refuse(exc)
             return
-        self._open.add(call)
         event.call.start_server_batch((cygrpc.ReceiveMessageOperation(_NO_FLAGS),), partial(self._received, call))
 
     def _received(self, call: "_Call", event: Any) -> "_Call | None":
@@ -188,6 +198,8 @@ class DirectCalls:
     def forget(self, call: "_Call") -> None:
         """A call has ended."""
         self._open.discard(call)
+        if self.is_stopping and not self._open:
+            self._all_ended.set()
 
 
 class _Call:
@@ -225,6 +237,9 @@ class _Call:
 
     def answer(self, now: float) -> None:
         """Do the work and send what comes of it."""
+        if self._calls.is_stopping:
+            self.refuse(Unavailable("the server's grace time is over; nothing was done"))
+            return
         if time.time() >= self._deadline:
             self.refuse(passed_in_queue(now - self._since))
             return

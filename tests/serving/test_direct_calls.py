@@ -133,3 +133,17 @@ def test_no_more_open_calls_than_allowed(start_server: Callable[..., Any], model
         for call in held:
             call.cancel()
         over.set()
+
+
+def test_the_grace_time_ends_before_the_work(
+    start_server: Callable[..., Any], models_dir: Any, slow: pb.DetectRequest
+) -> None:
+    server = start_server(models_dir, "--workers", "2", "--grace-s", "0", "--metrics-port", "0")
+    with grpc.insecure_channel(server.address) as channel:
+        calls = [PoseDetectorStub(channel).Detect.future(slow, timeout=60) for _ in range(6)]
+        while _metric(server, "curio_queue_length") < 4:
+            assert server.process.poll() is None
+        assert server.stop() == 0
+        ends = {error.code() if (error := call.exception()) else grpc.StatusCode.OK for call in calls}
+    assert ends <= {grpc.StatusCode.OK, grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED}
+    assert ends != {grpc.StatusCode.OK}
