@@ -15,7 +15,7 @@ from curio_train.geometry import (
 )
 from curio_train.networks.crop import SURFACE
 from curio_train.networks.look import Look
-from curio_train.networks.places import CANDIDATES, LOG_WEIGHTS, NUM_CANDIDATES, PLACES
+from curio_train.networks.places import CANDIDATE_LOG_WEIGHTS, CANDIDATES, LOG_WEIGHTS, NUM_CANDIDATES, PLACES
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, index
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.gaze import ASSUMED_M, CROP_PX, FirstLook, GazeWorld, gaze_camera
@@ -79,9 +79,11 @@ def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(w
         ROTATION_6D: rotation_6d_from_matrix(turn @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0]))[:, None],
         CONFIDENCE: torch.full((6, 1, 1), 0.7),
         LIGHT: (turn @ code[LIGHT][..., None])[..., 0],
+        SURFACE: torch.zeros(6, 4, 16, 16),
     }
     glance = Told(relative)
-    network = world.assemble([Told({CANDIDATES: code[TRANSLATION]}), glance])
+    places = {CANDIDATES: code[TRANSLATION], CANDIDATE_LOG_WEIGHTS: torch.zeros(6, 1)}
+    network = world.assemble([Told(places), glance])
     found = network(images)
     assert torch.allclose(found[TRANSLATION], code[TRANSLATION], atol=1e-5)
     turned = rotation_angle_deg(*(matrix_from_rotation_6d(c[ROTATION_6D][:, 0]) for c in (found, code)))
@@ -227,33 +229,39 @@ def test_batches_of_crops_give_what_rendering_needs_and_no_label(world: GazeWorl
 
 
 class Bright(Look):
-    """A look at crops that is as sure as its crop is bright, and says what it sees is in the middle."""
+    """A look at crops that sees the more of the object the brighter they are, and says that it is in the middle."""
 
     def __init__(self) -> None:
         super().__init__()
         self.encoder = nn.Identity()
 
     def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        count = len(features)
+        count, brightness = len(features), features.mean((1, 2, 3))
         return {}, {
             TRANSLATION: torch.tensor([0.0, 0, 1]).expand(count, 1, 3),
             ROTATION_6D: torch.tensor([1.0, 0, 0, 0, 1, 0]).expand(count, 1, 6),
-            CONFIDENCE: features.mean((1, 2, 3)).view(count, 1, 1),
+            CONFIDENCE: brightness.view(count, 1, 1),
             LIGHT: torch.zeros(count, 3),
+            SURFACE: brightness.view(count, 1, 1, 1).expand(count, 4, 16, 16),
         }
 
 
-def test_of_several_candidates_the_surest_is_answered(world: GazeWorld) -> None:
-    """Two frames, each bright at another of three candidates."""
+def test_of_several_candidates_the_likeliest_is_answered(world: GazeWorld) -> None:
+    """Two frames, each bright at another of three candidates; then a first look that knows better than the second."""
     candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8], [0.0, 0.2, 1.2]]).expand(2, 3, 3)
     pixels = project(candidates, torch.from_numpy(K).float()[None]).round().int()
     frames = torch.zeros(2, 3, 480, 640)
     for image, chosen in enumerate((2, 0)):
         u, v = pixels[image, chosen].tolist()
         frames[image, :, v - 30 : v + 31, u - 30 : u + 31] = 1.0
-    found = world.assemble([Told({CANDIDATES: candidates}), Bright()])(frames)
+    equal = {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: torch.full((2, 3), -1.1)}
+    found = world.assemble([Told(equal), Bright()])(frames)
     assert torch.allclose(found[TRANSLATION][:, 0], candidates[0, [2, 0]], atol=1e-5)
     assert found[CONFIDENCE].min() > 0.1
+    assert set(found) == {field.name for field in world.layout.fields}
+    known = {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: torch.tensor([[-9.0, 0, -9]]).expand(2, 3)}
+    found = world.assemble([Told(known), Bright()])(frames)
+    assert torch.allclose(found[TRANSLATION][:, 0], candidates[0, [1, 1]], atol=1e-5)
 
 
 def test_candidates_are_apart_and_the_likeliest_comes_first(world: GazeWorld) -> None:
@@ -263,10 +271,11 @@ def test_candidates_are_apart_and_the_likeliest_comes_first(world: GazeWorld) ->
     chosen = torch.tensor([5 * 20 + 5, 5 * 20 + 6, 10 * 20 + 12, 2 * 20 + 17])
     weights[0, chosen] = torch.tensor([0.5, 0.3, 0.15, 0.05])
     places = torch.cat([network.cells, torch.ones(300, 1)], dim=1)[None]
-    found = network._candidates(places, weights)
+    found, of_found = network._candidates(places, weights)
     assert found.shape == (1, NUM_CANDIDATES, 3)
     assert torch.equal(found[0, :3], places[0, chosen[[0, 2, 3]]])
+    assert torch.equal(of_found[0, :3], weights[0, chosen[[0, 2, 3]]])
     # Cells far from each other that mean one place are one candidate.
     places[0, chosen[2]] = places[0, chosen[0]] + 0.01
-    found = network._candidates(places, weights)
+    found, _ = network._candidates(places, weights)
     assert torch.equal(found[0, :2], places[0, chosen[[0, 3]]])

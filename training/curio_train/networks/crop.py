@@ -2,7 +2,7 @@
 
 On its way it says, for each of 16x16 patches, whether the object is seen there and which point of it. Those 1,024
 numbers an image teach the features long before nine numbers of a pose can (dense coordinates as in Wang et al. 2021,
-"GDR-Net"); nothing else is made of them.
+"GDR-Net"). Of several crops of a frame the gaze goes on with one that shows the object most clearly.
 """
 
 import torch

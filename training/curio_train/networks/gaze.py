@@ -10,10 +10,13 @@ from torch import Tensor, nn
 
 from curio_train.camera import gaze_at, sampling_grid
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.networks.crop import SURFACE
 from curio_train.networks.look import Look
-from curio_train.networks.places import CANDIDATES
+from curio_train.networks.places import CANDIDATE_LOG_WEIGHTS, CANDIDATES
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
+_EVIDENCE = "evidence"
+_NUM_CLEAREST = 16  # of 256 patches
 _OVERSAMPLING = 2  # a crop is sampled at so many points a pixel and side, then averaged: no aliasing of near objects
 
 
@@ -41,8 +44,8 @@ class Optics:
 class GazeNetwork(nn.Module):
     """Whole frame to scene code, all in one graph.
 
-    A glance at each of the likeliest places; where the second look is surest of what it reads, it looks once more, at
-    a crop placed by its own answer.
+    A glance at each of the likeliest places. Where the first look's weight and what the second look sees of the object
+    together say that it is, the second looks once more, at a crop placed by its own answer.
 
     Attributes:
         first: Reads places from frames at low resolution.
@@ -61,9 +64,11 @@ class GazeNetwork(nn.Module):
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
-        candidates = self.first(F.avg_pool2d(images, self._optics.first_look_share))[CANDIDATES]
-        surest = _surest(self._glance(images, candidates), candidates.shape[1])
-        code = self._glance(images, surest[TRANSLATION])
+        seen = self.first(F.avg_pool2d(images, self._optics.first_look_share))
+        glances = self._glance(images, seen[CANDIDATES])
+        likeliest = _likeliest(glances[TRANSLATION], glances[_EVIDENCE], seen[CANDIDATE_LOG_WEIGHTS])
+        code = self._glance(images, likeliest)
+        del code[_EVIDENCE]
         slope, offset = self.calibration
         return code | {CONFIDENCE: torch.sigmoid(slope * torch.logit(code[CONFIDENCE], 1e-6) + offset)}
 
@@ -71,7 +76,7 @@ class GazeNetwork(nn.Module):
         """Look at crops around places, and turn what is read there back into the frame's camera.
 
         Returns:
-            Codes of all crops, those of one image after the other.
+            Codes of all crops, those of one image after the other, and the evidence that each shows the object.
         """
         optics, place = self._optics, places.flatten(0, 1)
         depth = place.norm(dim=1, keepdim=True).clamp(min=optics.near_m)  # along the crop camera's axis
@@ -89,6 +94,7 @@ class GazeNetwork(nn.Module):
         back = gaze.rotation.transpose(1, 2)
         rotation = back @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
         return {name: code[name] for name in (COLOR,) if name in code} | {
+            _EVIDENCE: _evidence(code[SURFACE]),
             TRANSLATION: (back @ seen[..., None])[:, None, :, 0],
             ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None],
             CONFIDENCE: code[CONFIDENCE],
@@ -96,8 +102,18 @@ class GazeNetwork(nn.Module):
         }
 
 
-def _surest(code: dict[str, Tensor], num: int) -> dict[str, Tensor]:
-    """Of ``num`` codes an image the one with the highest confidence."""
-    best = code[CONFIDENCE].reshape(-1, num).argmax(dim=1, keepdim=True)
-    rows = (torch.arange(best.shape[0], device=best.device)[:, None] * num + best)[:, 0]
-    return {name: value[rows] for name, value in code.items()}
+def _likeliest(
+    places: Float[Tensor, "rows 1 3"], evidence: Float[Tensor, " rows"], log_weights: Float[Tensor, "batch num"]
+) -> Float[Tensor, "batch 1 3"]:
+    """Of the places of each image the one with the highest sum of evidence and log weight."""
+    best = (evidence.view_as(log_weights) + log_weights).argmax(dim=1)
+    first = torch.arange(best.shape[0], device=best.device) * log_weights.shape[1]
+    return places[first + best]
+
+
+def _evidence(surface: Float[Tensor, "rows 4 side side"]) -> Float[Tensor, " rows"]:
+    """How surely the object is seen in a crop: mean logit of the patches that show it most clearly.
+
+    Not the confidence that the pose is right, which is as low where a pose is hard to read as where there is nothing.
+    """
+    return surface[:, 3].flatten(1).topk(_NUM_CLEAREST, dim=1).values.mean(dim=1)

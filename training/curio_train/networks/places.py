@@ -16,15 +16,18 @@ from curio_train.networks.layers import convolution
 from curio_train.networks.look import Look
 from curio_train.scene_code import TRANSLATION, Field
 
-PLACES, LOG_WEIGHTS, CANDIDATES = "places_m", "place_log_weights", "candidates_m"
-"""What :meth:`PlaceNetwork.decode` gives beside the place: all hypotheses [batch, cells, 3], their log weights, and the
-likeliest places that are not beside each other [batch, NUM_CANDIDATES, 3]."""
+PLACES, LOG_WEIGHTS = "places_m", "place_log_weights"
+CANDIDATES, CANDIDATE_LOG_WEIGHTS = "candidates_m", "candidate_log_weights"
+"""What :meth:`PlaceNetwork.decode` gives beside the place: all hypotheses [batch, cells, 3] with their log weights, and
+the likeliest places that are not beside each other [batch, NUM_CANDIDATES, 3] with the logarithm of the weight around
+each."""
 
 NUM_CANDIDATES = 6
 
 STRIDE = 8
 _WIDTHS = (24, 48, 96)
 _CONTEXT_DILATIONS = (1, 2, 1)
+_LEAST_WEIGHT = 1e-6
 _APART = 2  # cells that candidates are at least apart, across or down
 
 
@@ -74,19 +77,22 @@ class PlaceNetwork(Look):
         # Neighbours that mean the same place share its weight: together they count as one, led by the strongest.
         weights = log_weights.exp()
         around = F.avg_pool2d(weights.unflatten(1, scores.shape[-2:])[:, None], 3, 1, 1).flatten(1)
-        candidates = self._candidates(places, around + weights)
-        known = {PLACES: places, LOG_WEIGHTS: log_weights, CANDIDATES: candidates}
+        candidates, of_candidates = self._candidates(places, around + weights)
+        known = {PLACES: places, LOG_WEIGHTS: log_weights}
+        known |= {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: of_candidates.clamp(min=_LEAST_WEIGHT).log()}
         return {}, {TRANSLATION: candidates[:, :1], **known}
 
     def _candidates(
         self, places: Float[Tensor, "batch cells 3"], weights: Float[Tensor, "batch cells"]
-    ) -> Float[Tensor, "batch candidates 3"]:
-        """The likeliest place, the likeliest of those not beside it, and so on."""
+    ) -> tuple[Float[Tensor, "batch candidates 3"], Float[Tensor, "batch candidates"]]:
+        """The likeliest place, the likeliest of those not beside it, and so on, each with its weight."""
         slopes = places[..., :2] / places[..., 2:]
-        found = []
+        found, found_weights = [], []
         for _ in range(NUM_CANDIDATES):
-            best = weights.argmax(dim=1)[:, None, None].expand(-1, 1, 3)
+            best = weights.argmax(dim=1, keepdim=True)
+            found_weights.append(weights.gather(1, best))
+            best = best[..., None].expand(-1, 1, 3)
             found.append(places.gather(1, best))
             distance = (slopes - slopes.gather(1, best[..., :2])).abs().amax(dim=-1)
             weights = weights * (distance > _APART * self._pitch)
-        return torch.cat(found, dim=1)
+        return torch.cat(found, dim=1), torch.cat(found_weights, dim=1)
