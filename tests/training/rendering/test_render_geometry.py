@@ -23,6 +23,13 @@ def test_adjacency_of_a_box(meshes) -> None:
     assert found.crease.sum() == 12  # the six diagonals lie in flat faces
 
 
+def test_slivers_are_left_out_and_long_strips_are_not() -> None:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1e-3, 0], [0.5, -1e-4, 0], [0.5, -1.0, 0]])
+    found = adjacency(vertices, np.array([[0, 1, 2], [1, 0, 3], [0, 4, 1]]))
+    assert found.faces.tolist() == [[0, 1, 2], [0, 4, 1]]
+    assert np.allclose(np.linalg.norm(found.face_normals, axis=1), 1)
+
+
 def test_normals_are_smooth_between_folds_alone(meshes) -> None:
     box, pebble = meshes["box"], meshes["pebble"]
     source, _, normals = smooth_normals(box.vertices_m, adjacency(box.vertices_m / 0.05, box.faces))

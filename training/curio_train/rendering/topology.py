@@ -9,13 +9,17 @@ from scipy.sparse.csgraph import connected_components
 CREASE_DEG = 30.0
 """Faces that meet at a larger angle are shaded apart, with a fold in between, as in CAD viewers."""
 
+SLIVER = 5e-4
+"""Height of a face by its longest side at which float32 no longer knows where on it a point is: Mitsuba interpolates
+colours there as 0/0, and one such pixel ends a training."""
+
 
 @dataclass(frozen=True)
 class Adjacency:
-    """Edges of a mesh, vertices in the same place taken as one, faces without area left out.
+    """Edges of a mesh, vertices in the same place taken as one, faces without area and slivers left out.
 
     Attributes:
-        faces: int [f, 3], the faces with area.
+        faces: int [f, 3], the other faces.
         face_normals: [f, 3], unit length.
         first: int [e], half-edge (3 · face + corner, from that corner to the next) of one face at each edge.
         second: int [e], half-edge of another face; meaningless where not ``paired``.
@@ -50,7 +54,8 @@ def adjacency(vertices: np.ndarray, faces: np.ndarray) -> Adjacency:
     corners = np.asarray(vertices, dtype=np.float64)[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1)
-    solid = area > 1e-14
+    longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
+    solid = area > np.maximum(1e-14, SLIVER * longest**2)
     faces, normals = faces[solid], normals[solid] / area[solid, None]
     ends = merged.reshape(-1)[np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)]
     forward = ends[:, 0] < ends[:, 1]
