@@ -133,14 +133,7 @@ class Trainer:
 
             # Asleep: render codes of one's own making, read them back.
             if "sleep" in terms:
-                seed = (self.config.seed, number)
-                if raw is None:
-                    dream = self._to_device_code(world.sample(recipe.micro_batch_size, (*seed, _ASLEEP)))
-                else:
-                    dream = sleep_codes(world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
-                with torch.no_grad():
-                    dreamt = world.disturb(world.render(dream, backgrounds), seed)
-                losses["sleep"] = world.code_loss(self._read(network, dreamt)[1], dream)
+                losses["sleep"] = self._dream(world, network, raw, backgrounds, number)
 
             torch.stack([weights[name] * loss for name, loss in losses.items()]).sum().div(self._num_micro).backward()
 
@@ -159,6 +152,19 @@ class Trainer:
         means = self._add_up_over_ranks(sums)
         self._move(means, rate)
         return means
+
+    def _dream(
+        self, world: World, network: Look, raw: SceneCode | None, backgrounds: Tensor | None, number: int
+    ) -> Tensor:
+        """The loss of sleep: of codes around ``raw`` or, without, drawn by the world."""
+        recipe, seed = self.config.recipe, (self.config.seed, number)
+        if raw is None:
+            dream = self._to_device_code(world.sample(recipe.micro_batch_size, (*seed, _ASLEEP)))
+        else:
+            dream = sleep_codes(world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
+        with torch.no_grad():
+            dreamt = world.disturb(world.render(dream, backgrounds), seed)
+        return world.code_loss(self._read(network, dreamt)[1], dream)
 
     @torch.no_grad()
     def rehearse(self) -> None:
