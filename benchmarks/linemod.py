@@ -1,4 +1,4 @@
-"""One network a LineMOD class on held-out renderings and on real frames, beside published figures.
+"""One network a LineMOD class on held-out renderings and on real frames, served and refined, beside published figures.
 
     python benchmarks/linemod.py --runs runs/linemod --data DIR [--frames DIR] [--sheets DIR] [--json]
 
@@ -8,7 +8,7 @@ real labels are those of its row is kept as it is, so the same command goes on w
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
@@ -17,8 +17,9 @@ from curio_train.data.bop import BopDataset
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.linemod_markdown import markdown
 from curio_train.evaluation.linemod_sheet import write_sheet
-from curio_train.evaluation.linemod_table import Candidate, candidates, is_current, load_table, make_row
+from curio_train.evaluation.linemod_table import REFINED, Candidate, candidates, is_current, load_table, make_row
 from curio_train.evaluation.real_frames import evaluate_real_frames
+from curio_train.evaluation.refinement import refined
 from curio_train.evaluation.results import Results, Row, save_results
 from curio_train.evaluation.subject import load_subject
 
@@ -57,20 +58,29 @@ def log(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def score(settings: Settings, candidate: Candidate) -> Row:
-    """Everything that is said of one network."""
+def score(settings: Settings, candidate: Candidate) -> dict[str, Row]:
+    """Everything that is said of one network: by method, as it is served and refined."""
     result = evaluate(
         candidate.path,
         num_images=settings.num_images,
         data=settings.data,
+        refine=True,
         cache=settings.cache,
         progress=lambda text: log(f"{candidate.path.name}: {text}"),
         warn=log,
     )
-    frames = []
-    if settings.frames is not None and candidate.name in BopDataset(settings.frames).classes:
-        frames = evaluate_real_frames(load_subject(candidate.path, settings.data), settings.frames, None)["targets"]
-    return make_row(result, candidate, settings.data, frames)
+    served = load_subject(candidate.path, settings.data)
+    refiner = replace(served, predict=refined(served.predict, served.world))
+    rows = {}
+    for method, subject, found in (
+        (candidate.method, served, result),
+        (candidate.method + REFINED, refiner, result | result["refined"]),
+    ):
+        frames = []
+        if settings.frames is not None and candidate.name in BopDataset(settings.frames).classes:
+            frames = evaluate_real_frames(subject, settings.frames, None)["targets"]
+        rows[method] = make_row(found, candidate, settings.data, frames)
+    return rows
 
 
 def draw(settings: Settings, candidate: Candidate) -> None:
@@ -85,11 +95,12 @@ def main(settings: Settings) -> int:
     """Score what is left."""
     table: Results = load_table(settings.results)
     for candidate in candidates(settings.runs):
-        rows = table.setdefault(candidate.method, {})
-        if is_current(rows.get(candidate.name), candidate, settings.num_images, settings.data):
+        rows = [table.get(method, {}).get(candidate.name) for method in (candidate.method, candidate.method + REFINED)]
+        if all(is_current(row, candidate, settings.num_images, settings.data) for row in rows):
             log(f"{candidate.path.name}: kept")
         else:
-            rows[candidate.name] = score(settings, candidate)
+            for method, row in score(settings, candidate).items():
+                table.setdefault(method, {})[candidate.name] = row
         draw(settings, candidate)
         save_results(settings.results, table)
         settings.results.with_suffix(".md").write_text(markdown(table, COMMAND), encoding="utf-8")

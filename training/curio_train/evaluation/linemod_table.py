@@ -5,8 +5,9 @@
     {method: {class: {weights_sha256, num_images, real_sha256, labels_real, labels_synthetic, rendered: {…}, real: {…},
                       frames: […], images_seen, training_seconds, preset, seed, commit, machine}}}
 
-``frames`` are single frames of a second data set, each with its errors. A row is kept as long as weights, number of
-renderings and real labels are those that it was made of.
+Beside each method stands the same followed by ``, refined``: its poses after render-and-compare, see
+:mod:`~curio_train.evaluation.refinement`. ``frames`` are single frames of a second data set, each with its errors. A
+row is kept as long as weights, number of renderings and real labels are those that it was made of.
 """
 
 import hashlib
@@ -23,6 +24,9 @@ from curio_train.learning.configuration import CONFIG_FILE
 from curio_train.model_folder import MODEL_FILE, find_model
 from curio_train.onnx_file import OnnxModel
 from curio_train.worlds.options import LinemodOptions
+
+REFINED = ", refined"
+"""What follows the method's name where poses were refined."""
 
 _KEPT = ("labels_real", "labels_synthetic", "images_seen", "training_seconds", "preset", "seed", "commit", "machine")
 _RENDERED = ("add_recall", "rotation_deg_median", "translation_mm_median", "confidence_ece", "present_auroc")
