@@ -149,11 +149,12 @@ def always_at(world: SingleObjectWorld, translation_m: list[float]) -> Subject:
     """A reader that sees the object at one place of the canonical camera, whatever it is shown."""
 
     def predict(images: torch.Tensor) -> dict[str, torch.Tensor]:
-        assert images.shape == (1, 3, 128, 128)
+        count = len(images)
+        assert images.shape == (count, 3, 128, 128)
         return {
-            TRANSLATION: torch.tensor(translation_m).view(1, 1, 3),
-            ROTATION_6D: torch.tensor([1.0, 0, 0, 0, 1, 0]).view(1, 1, 6),
-            LIGHT: torch.zeros(1, 3),
+            TRANSLATION: torch.tensor(translation_m).expand(count, 1, 3),
+            ROTATION_6D: torch.tensor([1.0, 0, 0, 0, 1, 0]).expand(count, 1, 6),
+            LIGHT: torch.zeros(count, 3),
         }
 
     config = RunConfig(LinemodOptions("ape", Path()), method="wake_sleep")
