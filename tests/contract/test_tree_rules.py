@@ -36,7 +36,8 @@ def functions(tree: ast.Module) -> Iterator[ast.FunctionDef | ast.AsyncFunctionD
 
 def swallows(handler: ast.ExceptHandler) -> bool:
     """Whether it catches everything and doesn't write a traceback to the log."""
-    logged = any(isinstance(node, ast.Attribute) and node.attr == "exception" for node in ast.walk(handler))
+    calls = (node.func for node in ast.walk(handler) if isinstance(node, ast.Call))
+    logged = any(ast.unparse(called) == "LOGGER.exception" for called in calls)
     return is_broad(handler) and not logged
 
 
