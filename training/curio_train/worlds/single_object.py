@@ -47,6 +47,7 @@ class Object:
         backgrounds: What it is seen in front of, made or found in a cache folder.
         views: From where it is seen.
         painted: The mesh has no colours: it has another one in each image, which is part of the scene code.
+        known_scene: What is behind the object where it is looked for, and the light there, are known.
     """
 
     kind: ObjectKind
@@ -57,6 +58,7 @@ class Object:
     backgrounds: Callable[[Path], Backgrounds]
     views: Views = field(default=upper_views)
     painted: bool = False
+    known_scene: bool = False
 
 
 class SingleObjectWorld(World):
