@@ -1,11 +1,12 @@
 """Can anything stand in for curiosity? The paper says that no weight, learning rate, randomisation or patience can.
 
-    python benchmarks/curiosity.py [--world spheres] [--images 32000] [--only longer]
+    python benchmarks/curiosity.py [--world spheres] [--images 16000] [--only noncur]
 
 Runs of image loss alone with each of these changed, beside the paper's method with batch and with instance norm in the
-critic, and full supervision, in one world. Each run is trained and scored in a folder of its own under
-``runs/curiosity``; after each, docs/results/curiosity.json and curiosity.md are written anew. Stop it at any time: the
-same command goes on where it stopped.
+critic, without the critic's gradient penalty, with learning rates that stay as they are, and full supervision, in one
+world. Each run is trained and scored in a folder of its own under ``runs/curiosity``; after each, the world's part of
+docs/results/curiosity.json and curiosity.md is written anew. Stop it at any time: the same command goes on where it
+stopped.
 
 para, img   Eq. 1 and DSSIM from the novel view
 """
@@ -16,7 +17,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 from curio_train.cli import answer
@@ -36,6 +37,8 @@ VARIANTS: Mapping[str, Sequence[str]] = {
     "super": ("--method", "super"),
     "our": ("--method", "our"),
     "our, instance norm": ("--method", "our", "--critic-normalisation", "instance"),
+    "our, no gradient penalty": ("--method", "our", "--gradient-penalty", "0"),
+    "our, constant learning rates": ("--method", "our", "--warm-up-steps", "0", "--final-learning-rate", "1"),
     "noncur": ("--method", "noncur"),
     "noncur, image weight / 10": _changed("image-weight", _RECIPE.image_weight, 0.1),
     "noncur, image weight x 10": _changed("image-weight", _RECIPE.image_weight, 10),
@@ -58,11 +61,11 @@ class Settings:
         only: Variants by name; all unless given.
         jobs: Runs at once, each with its share of the cores.
         runs: Where run folders lie.
-        results: The file of results; the table lies beside it.
+        results: The file of results, by world; the tables lie beside it.
     """
 
     world: Literal["circles", "spheres", "chairs", "varied", "multi", "light"] = "spheres"
-    images: int = 32_000
+    images: int = 16_000
     only: tuple[str, ...] = tuple(VARIANTS)
     jobs: int = min(2, os.cpu_count() or 1)
     runs: Path = Path("runs/curiosity")
@@ -83,28 +86,31 @@ def plan(settings: Settings) -> list[QueuedRun]:
 
 
 def write(settings: Settings, runs: list[QueuedRun]) -> None:
-    """Results and table of the runs that are done."""
+    """Results and table of the runs that are done, beside those of other worlds."""
     rows = {run.name: _row(run) for run in runs if run.done}
     if not rows:
         return
+    results = json.loads(settings.results.read_text(encoding="utf-8")) if settings.results.exists() else {}
+    found = results.get(settings.world, {}) | rows
+    results[settings.world] = {name: found[name] for name in VARIANTS if name in found}
     settings.results.parent.mkdir(parents=True, exist_ok=True)
-    settings.results.write_text(json.dumps({"world": settings.world, "runs": rows}, indent=1) + "\n", encoding="utf-8")
-    lines = [
-        f"# In place of curiosity: {settings.world}",
-        "",
-        "Written by `python benchmarks/curiosity.py`; one seed each.",
-        "",
-        "| run | Para | Img | images seen | minutes |",
-        "| --- | --- | --- | --- | --- |",
-        *(
+    settings.results.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    settings.results.with_suffix(".md").write_text(_markdown(results), encoding="utf-8")
+
+
+def _markdown(results: Mapping[str, Mapping[str, Any]]) -> str:
+    lines = ["# In place of curiosity", "", "Written by `python benchmarks/curiosity.py`; one seed each."]
+    for world, rows in results.items():
+        lines += ["", f"## {world.capitalize()}", ""]
+        lines += ["| run | Para | Img | images seen | minutes |", "| --- | --- | --- | --- | --- |"]
+        lines += [
             f"| {name} | {row['para']:.3g} | {row['img']:.3g} | {row['images_seen']:,} | {row['seconds'] / 60:.1f} |"
             for name, row in rows.items()
-        ),
-    ]
-    settings.results.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        ]
+    return "\n".join(lines) + "\n"
 
 
-def _row(run: QueuedRun) -> dict[str, object]:
+def _row(run: QueuedRun) -> dict[str, Any]:
     found = run.evaluation
     return {
         "para": found["metrics"]["scene_error"],

@@ -139,13 +139,38 @@ def test_an_unknown_row_is_refused(tmp_path: Path) -> None:
     assert "--methods ours: there is no such row" in done.stderr
 
 
-def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path) -> None:
+def sweep_module() -> Any:
     spec = importlib.util.spec_from_file_location("curiosity", ROOT / "benchmarks" / "curiosity.py")
     assert spec is not None
     assert spec.loader is not None
     sweep = importlib.util.module_from_spec(spec)
     sys.modules["curiosity"] = sweep  # where its dataclass looks itself up
     spec.loader.exec_module(sweep)
+    return sweep
+
+
+def test_the_sweep_keeps_what_other_worlds_and_earlier_calls_found(tmp_path: Path) -> None:
+    sweep = sweep_module()
+    scored = {"images_seen": 640, "training_seconds": 6.0, "machine": "a machine", "commit": "abc"}
+    for world, only, para in (("circles", "our", 1.5), ("spheres", "noncur", 2.5), ("circles", "noncur", 3.5)):
+        settings = sweep.Settings(
+            world=world, images=640, only=(only,), runs=tmp_path, results=tmp_path / "curiosity.json"
+        )
+        (run,) = sweep.plan(settings)
+        run.folder.mkdir(parents=True)
+        found = scored | {"metrics": {"scene_error": para, "novel_view_dssim": 0.1}}
+        (run.folder / "evaluation.json").write_text(json.dumps(found))
+        sweep.write(settings, [run])
+    results = json.loads((tmp_path / "curiosity.json").read_text())
+    assert {world: {name: row["para"] for name, row in rows.items()} for world, rows in results.items()} == {
+        "circles": {"our": 1.5, "noncur": 3.5},
+        "spheres": {"noncur": 2.5},
+    }
+    assert "## Spheres" in (tmp_path / "curiosity.md").read_text()
+
+
+def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path) -> None:
+    sweep = sweep_module()
     runs = sweep.plan(sweep.Settings(world="circles", images=640, runs=tmp_path))
     assert len({run.folder for run in runs}) == len(runs) == len(sweep.VARIANTS)
     configs = {run.name: to_json(_parse(["circles", "--images", str(run.images), *run.flags]).config) for run in runs}
@@ -159,6 +184,8 @@ def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path) -> None:
     assert all(len(changed) == 1 for changed in changes.values()), changes
     ours, instance = flat(configs["our"]), flat(configs["our, instance norm"])
     assert {key for key in ours if ours[key] != instance[key]} == {"network.critic_normalisation"}
+    unpenalised = flat(configs["our, no gradient penalty"])
+    assert {key for key in ours if ours[key] != unpenalised[key]} == {"recipe.gradient_penalty"}
 
 
 def flat(config: dict[str, Any]) -> dict[str, Any]:
