@@ -24,6 +24,9 @@ from curio_train.worlds.views import AMBIENT, STRONGEST_LIGHT, exposures, lights
 Views = Callable[[int, np.random.Generator], Float[Tensor, "count 3 3"]]
 """Draws rotations cam_from_obj of objects on the optical axis."""
 
+Paints = Callable[[int, np.random.Generator], Float[Tensor, "count 1 3"]]
+"""Draws sRGB colours of objects."""
+
 EXPOSURE = "exposure"
 """What the colours of an object that has its own are multiplied by, [batch, 1, 3]: drawn beside the code, never
 predicted. What a camera sees of a part on a desk is darker, and of another tint, than its mesh's colours."""
@@ -32,6 +35,11 @@ LEAST_PAINT_VALUE = 0.1
 """Of the colours of an unpainted object, which may be black, white, grey or anything between."""
 
 _SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+
+
+def any_paint(count: int, random: np.random.Generator) -> Float[Tensor, "count 1 3"]:
+    """Colours of a part of which nothing is known: black, white, grey or anything between."""
+    return colors(count, 1, random, 0.0, LEAST_PAINT_VALUE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +55,7 @@ class Object:
         backgrounds: What it is seen in front of, made or found in a cache folder.
         views: From where it is seen.
         painted: The mesh has no colours: it has another one in each image, which is part of the scene code.
+        paints: Which ones.
         known_scene: What is behind the object where it is looked for, and the light there, are known.
     """
 
@@ -58,6 +67,7 @@ class Object:
     backgrounds: Callable[[Path], Backgrounds]
     views: Views = field(default=upper_views)
     painted: bool = False
+    paints: Paints = field(default=any_paint)
     known_scene: bool = False
 
 
@@ -159,7 +169,7 @@ def scene(translation: Tensor, rotation: Tensor, light: Tensor) -> dict[str, Ten
 def paint(thing: Object, count: int, random: np.random.Generator) -> dict[str, Tensor]:
     """The entry of codes that says which colour an unpainted object has, [count, 1, 3] sRGB; others' exposure."""
     if thing.painted:
-        return {COLOR: colors(count, 1, random, 0.0, LEAST_PAINT_VALUE)}
+        return {COLOR: thing.paints(count, random)}
     return {EXPOSURE: exposures(count, random)}
 
 
