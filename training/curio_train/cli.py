@@ -134,7 +134,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_train.preparation import prepared
 
     session = command.session
-    config = command.config if session.resume else prepared(command.config, session.cache, _warn)
+    config = command.config if session.resume else prepared(command.config, session.cache, _warn, _tell)
     path = session.resume or session.out or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
     outcome, course = learn(
         config,
@@ -169,7 +169,11 @@ def _report(run: Path, cache: Path) -> None:
 
 
 def _warn(text: str) -> None:
-    print(f"warning: {text}", file=sys.stderr)
+    _tell(f"warning: {text}")
+
+
+def _tell(text: str) -> None:
+    print(text, file=sys.stderr)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""What a world's options need before anything is trained: data is fetched, files of one's own are examined."""
+"""What a world's options need before anything is trained: data is fetched, files of one's own are examined.
+
+What is found out here is written into the run's configuration, so that a run keeps it whatever becomes of the files.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,13 +11,14 @@ from curio_train.config import RunConfig
 from curio_train.worlds.options import CaptureOptions, LinemodOptions
 
 
-def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None]) -> RunConfig:
+def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: Callable[[str], None]) -> RunConfig:
     """The configuration of a new run, ready to be trained.
 
     Args:
         config: As called.
         cache: Where downloads are kept.
         warn: Told of what is doubtful.
+        tell: Told of what was found out.
 
     Raises:
         DataError: A download failed, or files of one's own are certain not to work.
@@ -29,4 +33,27 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None]) -> Run
 
         for doubt in refuse_unfit(options):
             warn(doubt)
+        return replace(config, world=_with_paint(options, tell))
     return config
+
+
+def _with_paint(options: CaptureOptions, tell: Callable[[str], None]) -> CaptureOptions:
+    """Off the plane an unpainted part is drawn in the colour that photographs over a plate show."""
+    from curio_train.camera import load_intrinsics
+    from curio_train.data.meshes import load_mesh
+    from curio_train.data.part_color import find_color, is_unpainted
+
+    if options.plane is not None or options.paint is not None:
+        return options
+    if not is_unpainted(load_mesh(options.mesh[0], options.mesh_unit)):
+        return options
+    anyway = "it is learned in any colour, which takes longer; --paint '#8a6f4c' says which it has"
+    if options.background is None:
+        tell(f"the part's colour is not known without --background, a photograph of the empty scene: {anyway}")
+        return options
+    found = find_color(options.photos, options.background, load_intrinsics(options.camera))
+    if found is None:
+        tell(f"the part's colour was not found where the photographs differ from {options.background}: {anyway}")
+        return options
+    tell(f"the part's colour, from {found.num_used} of {found.num_compared} photographs: {found.hex}")
+    return replace(options, paint=found.hex)

@@ -5,7 +5,8 @@ Images are rendered without end, as for LineMOD; what a data set's authors publi
 * distances are given (0.3 to 1 m unless said otherwise), the part's origin is anywhere in the frame;
 * it is seen from all sides alike, or from above alone;
 * its symmetries are found from its shape; poses that differ by one count as equal, whatever is painted on it;
-* a mesh without colours has another colour in each image, of any saturation, which is read with the pose;
+* a mesh without colours has another colour in each image, which is read with the pose: about the one that the part
+  has in the photographs where a plate shows what is not the part, else of any saturation;
 * light is that of LineMOD: from the camera's half space, over an ambient radiance of 0.4.
 """
 
@@ -19,6 +20,7 @@ from torch import Tensor
 from curio_train.camera import Intrinsics, load_intrinsics
 from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
 from curio_train.data.meshes import Mesh, load_mesh
+from curio_train.data.part_color import is_unpainted
 from curio_train.data.photographs import Photographs, read_frames
 from curio_train.data.plate import PLATE_SHARE, MixedBackgrounds, PlateBackgrounds
 from curio_train.data.symmetries import find_symmetries
@@ -27,7 +29,8 @@ from curio_train.geometry import random_rotations
 from curio_train.worlds.base import ObjectKind, World
 from curio_train.worlds.gaze import LARGEST_LOG_SCALE, GazeWorld
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object import Object
+from curio_train.worlds.paints import paints_like
+from curio_train.worlds.single_object import Object, any_paint
 from curio_train.worlds.table_files import build_table
 from curio_train.worlds.views import upper_views
 
@@ -52,7 +55,7 @@ def build(options: CaptureOptions) -> World:
     """The world of one part in free space, or of parts on a plane.
 
     Raises:
-        UsageError: The part would reach into the camera.
+        UsageError: The part would reach into the camera, or has two colours.
         MeshError: The mesh is missing or broken.
         CameraError: The camera file is missing or describes no camera.
         DataError: Of a plane, photographs, plates or its file cannot be used.
@@ -62,6 +65,8 @@ def build(options: CaptureOptions) -> World:
     (file,) = options.mesh
     mesh, camera = load_mesh(file, options.mesh_unit), load_intrinsics(options.camera)
     _refuse_collision(options, mesh)
+    if options.paint is not None and not is_unpainted(mesh):
+        raise UsageError(f"--paint {options.paint}: {file} has colours of its own; leave it out")
     found = find_symmetries(mesh)
     kind = ObjectKind(
         file.stem, (0,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous
@@ -74,7 +79,9 @@ def build(options: CaptureOptions) -> World:
         options.far_m,
         partial(_backgrounds, options, camera),
         upper_views if options.upright else random_rotations,
-        painted=mesh.texture is None and mesh.vertex_colors_srgb is None,
+        painted=is_unpainted(mesh),
+        paints=any_paint if options.paint is None else paints_like(options.paint),
+        known_scene=options.background is not None,
     )
     return Capture(thing, options.photos)
 

@@ -92,15 +92,16 @@ class CaptureOptions(WorldOptions):
     With --plane: one or more parts on a table or floor, learned from the photographs.
 
     Attributes:
-        mesh: Mesh file: STL, OBJ, PLY, GLB, glTF or OFF; on a plane as many as there are kinds of parts. Without
-            colours it is learned in any colour.
+        mesh: Mesh file: STL, OBJ, PLY, GLB, glTF or OFF; on a plane as many as there are kinds of parts.
         camera: Camera file of the photographs: camera JSON, or BOP's camera.json.
-        photos: Folder of unlabelled photographs. They are checked against the camera, and the report shows what was
-            found in them; only on a plane anything is learned from them.
+        photos: Folder of unlabelled photographs. They are checked against the camera, tell the part's colour, and the
+            report shows what was found in them; only on a plane anything else is learned from them.
         mesh_unit: Unit of the mesh file's coordinates; the file's own, or metres, unless given.
         background: Photograph of the empty scene, taken as the others were.
         backgrounds: Folder of photographs to see the part in front of, where the scene changes; clutter is rendered
             where neither is given.
+        paint: Colour of a part whose mesh has none, sRGB, such as '#8a6f4c'. Found where the photographs differ from
+            --background unless given; where neither tells it, the part is learned in any colour.
         near_m: Least distance of the part's origin along the optical axis, metres.
         far_m: Largest.
         upright: The part is only seen from above (z of the mesh is up, rolled by up to 45 degrees), not from any side.
@@ -127,6 +128,7 @@ class CaptureOptions(WorldOptions):
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
     background: Path | None = None
     backgrounds: Path | None = None
+    paint: str | None = None
     near_m: float = 0.3
     far_m: float = 1.0
     upright: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -184,7 +186,7 @@ class CaptureOptions(WorldOptions):
     def _refuse_with_plane(self) -> None:
         if self.background is None:
             raise UsageError(f"--plane {self.plane}: expected --background, a photograph of it without parts, as well")
-        if flags := self._flags_of(("backgrounds", "upright", "near_m", "far_m")):
+        if flags := self._flags_of(("backgrounds", "paint", "upright", "near_m", "far_m")):
             raise UsageError(f"{flags}: for a part in free space; leave it out, or --plane {self.plane}")
         if len({file.stem for file in self.mesh}) < len(self.mesh):
             raise UsageError(f"--mesh {' '.join(map(str, self.mesh))}: parts are named after their files: rename one")

@@ -1,0 +1,128 @@
+"""What colour a part has whose CAD file says none: where photographs of it differ from the empty scene's.
+
+No label is needed. Each photograph is brought to the plate's exposure and compared with it: what clearly differs is the
+part and its shadow, and what is merely darker than the plate, in the plate's own tint, is the shadow. A colour is
+believed where the photographs agree on it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from curio_train.camera import Intrinsics
+from curio_train.data.meshes import Mesh
+from curio_train.data.photographs import Photographs, read_frame, read_frames
+from curio_train.rendering.color import linear_from_srgb, srgb_from_linear
+
+_WIDTH_PX = 160
+_MOST_COMPARED = 64
+_FEWEST = 3
+_FEWEST_SHARE = 0.25  # of the photographs compared
+_LEAST_DIFFERENCE, _DEVIATIONS = 0.08, 6.0  # sRGB; what noise, vignettes and drifting light do not reach
+_CLEARLY = 0.5  # of the strongest difference: a shadow beside a part is weaker
+_LEAST_AREA, _LARGEST_AREA = 0.001, 0.4  # of the frame
+_SHADOW_TINT = 0.25  # how far the logarithms of a shadow's three ratios to the plate may lie apart
+_LEAST_UNSHADED = 0.2  # of all that differs; below it the part itself is a grey like a shadow
+_WELL_LIT = 0.9  # quantile of the photographs' values: shadows darken some, nothing makes paint lighter
+_LARGEST_SPREAD = 0.12  # of the photographs' tints, as shares of the largest channel
+
+
+@dataclass(frozen=True)
+class FoundColor:
+    """A part's colour.
+
+    Attributes:
+        hex: As in HTML, sRGB, such as #8a6f4c.
+        num_used: Photographs that show it.
+        num_compared: Photographs looked at.
+    """
+
+    hex: str
+    num_used: int
+    num_compared: int
+
+
+def is_unpainted(mesh: Mesh) -> bool:
+    """Its file says no colour."""
+    return mesh.texture is None and mesh.vertex_colors_srgb is None
+
+
+def find_color(photos: Path, plate: Path, camera: Intrinsics) -> FoundColor | None:
+    """The colour of what moves over a plate, or None where the photographs do not tell it.
+
+    What is found is the colour of its better lit half: paint of about this colour looks so in light of strength one.
+
+    Args:
+        photos: Folder; up to 64 photographs spread over it are read.
+        plate: The empty scene.
+        camera: That took both.
+
+    Raises:
+        DataError: One cannot be read, or is not of the camera's size.
+    """
+    paths = Photographs(photos).paths
+    chosen = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, _MOST_COMPARED).astype(int))]
+    height = max(1, round(_WIDTH_PX * camera.height / camera.width))
+    empty = cv2.resize(read_frame(plate, camera), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    frames = read_frames(chosen, camera, _WIDTH_PX, height).transpose(0, 2, 3, 1)
+    seen = [color for frame in frames if (color := _color_of_piece(frame, empty)) is not None]
+    if len(seen) < max(_FEWEST, _FEWEST_SHARE * len(chosen)):
+        return None
+    agreed = _agreed(seen)
+    return None if agreed is None else FoundColor(_hex(agreed), len(seen), len(chosen))
+
+
+def _agreed(colors: Sequence[np.ndarray]) -> np.ndarray | None:
+    """The median tint of linear colours, well lit, [3] sRGB, unless their tints are those of several parts."""
+    srgb = srgb_from_linear(torch.from_numpy(np.stack(colors))).numpy()
+    tints = srgb / srgb.max(axis=1, keepdims=True).clip(1e-3)
+    tint: np.ndarray = np.median(tints, axis=0)
+    if np.median(np.abs(tints - tint).max(axis=1)) > _LARGEST_SPREAD:
+        return None
+    return tint / tint.max() * np.quantile(srgb.max(axis=1), _WELL_LIT)
+
+
+def _color_of_piece(frame: np.ndarray, plate: np.ndarray) -> np.ndarray | None:
+    """Linear colour [3] of what two uint8 sRGB pictures [height, width, 3] differ in; None if nothing, or all."""
+    light, empty = (linear_from_srgb(torch.from_numpy(picture / 255.0)).numpy() for picture in (frame, plate))
+    ratio = (light + 1e-3) / (empty + 1e-3)
+    ratio /= np.median(ratio, axis=(0, 1))  # exposure and white balance drift between photographs
+    evened = srgb_from_linear(torch.from_numpy(empty * ratio)).numpy()
+    difference = np.abs(evened - plate / 255.0).max(axis=2)
+    level = np.median(difference)
+    noise = 1.4826 * np.median(np.abs(difference - level))
+    differs = difference > max(_LEAST_DIFFERENCE, level + _DEVIATIONS * noise)
+    if not differs.any():
+        return None
+    differs &= difference > _CLEARLY * np.quantile(difference[differs], 0.95)
+    logs = np.log(ratio.clip(1e-3))
+    shaded = (np.ptp(logs, axis=2) < _SHADOW_TINT) & (logs.mean(axis=2) < 0)
+    whole, part = _largest_piece(differs), _largest_piece(differs & ~shaded)
+    if part.sum() < _LEAST_UNSHADED * whole.sum():
+        part = whole
+    if not _LEAST_AREA < part.mean() < _LARGEST_AREA:
+        return None
+    pixels = light[part]
+    bright = pixels.sum(axis=1)
+    color: np.ndarray = pixels[bright >= np.median(bright)].mean(axis=0)
+    return color
+
+
+def _largest_piece(differs: np.ndarray) -> np.ndarray:
+    """The largest connected part of a mask [height, width] without its speckles and its soft edge."""
+    kernel = np.ones((3, 3), np.uint8)
+    opened = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, kernel)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+    if len(stats) < 2:
+        return np.zeros_like(differs)
+    whole = labels == 1 + np.argmax(stats[1:, cv2.CC_STAT_AREA])
+    inner = cv2.erode(whole.astype(np.uint8), kernel).astype(bool)
+    return inner if inner.any() else whole
+
+
+def _hex(srgb: np.ndarray) -> str:
+    return "#" + bytes((srgb.clip(0, 1) * 255).round().astype(np.uint8)).hex()
