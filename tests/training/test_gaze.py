@@ -1,5 +1,7 @@
 """The gaze: crops are what a turned camera would see, and what is read in them is turned back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -18,7 +20,7 @@ from curio_train.networks.look import Look
 from curio_train.networks.places import CANDIDATE_LOG_WEIGHTS, CANDIDATES, LOG_WEIGHTS, NUM_CANDIDATES, PLACES
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, index
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.gaze import ASSUMED_M, CROP_PX, FirstLook, GazeWorld, gaze_camera
+from curio_train.worlds.gaze import ASSUMED_M, CROP_PX, FirstLook, GazeWorld, SecondLook, gaze_camera
 from curio_train.worlds.single_object import EXPOSURE, Object
 from curio_train.worlds.surface import SurfaceMap
 from torch import Tensor, nn
@@ -279,3 +281,24 @@ def test_candidates_are_apart_and_the_likeliest_comes_first(world: GazeWorld) ->
     places[0, chosen[2]] = places[0, chosen[0]] + 0.01
     found, _ = network._candidates(places, weights)
     assert torch.equal(found[0, :2], places[0, chosen[[0, 3]]])
+
+
+def test_colours_differ_least_where_they_tell_most(thing: Object, world: GazeWorld) -> None:
+    """The first look, and all looks at a known scene, see milder light than the second look at an unknown one."""
+    first, second = world.looks
+    known = GazeWorld("capture", replace(thing, known_scene=True))
+    spread = {
+        name: float(look.sample(400, (1,))[EXPOSURE].log().std())
+        for name, look in {"whole": world, "first": first, "second": second, "known": known.looks[1]}.items()
+    }
+    assert spread["second"] > 1.3 * spread["first"]
+    assert spread["whole"] == pytest.approx(spread["first"], rel=0.1)
+    assert spread["known"] == pytest.approx(spread["first"], rel=0.1)
+    images = torch.rand(64, 3, 1, 1).expand(-1, -1, 64, 64).contiguous()
+
+    def moved(look: FirstLook | SecondLook) -> float:
+        return float((look.disturb(images, (1,)) - images).mean((2, 3)).abs().mean())
+
+    assert moved(second) > 1.3 * moved(first)
+    assert moved(first) > 1.2 * moved(known.looks[0])
+    assert moved(known.looks[0]) == pytest.approx(moved(known.looks[1]))

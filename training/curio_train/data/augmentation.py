@@ -1,77 +1,210 @@
 """What lies between a rendering and a photograph: light, exposure, colour, blur, noise, things in front (torch)."""
 
+import functools
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 LARGEST_OCCLUDER = 0.35  # of the image's side
-_LARGEST_SHADE = 0.45  # standard deviation of the logarithm of uneven light
-_SHADE_CELLS = (2, 5)  # of its grid, a side: from a gradient over the image to shadows of a third of it
-_LARGEST_GAMMA = 0.35  # as a logarithm
+_SHADE_CELLS = (2, 5)  # of uneven light's grid, a side: from a gradient over the image to shadows of a third of it
+_DARKEST, _LEAST = float(np.log(1e-4)), 1e-30  # values below are as black as that; the logarithm of black is finite
+_NOISE_PLACES = 2**20
+_VALUES_AT_ONCE = 2**17  # half a megabyte: what lies between two operations stays in the cache of a core
 
 
-def disturb(images: Float[Tensor, "batch 3 height width"], random: np.random.Generator) -> Tensor:
+@dataclass(frozen=True)
+class Disturbance:
+    """How much pictures are disturbed: each by amounts drawn evenly from these ranges.
+
+    Attributes:
+        occluded: Share of the images with something in front.
+        shade: Largest standard deviation of the logarithm of uneven light.
+        gamma: Largest logarithm, up or down, of the exponent on values.
+        saturation: Least and largest factor on colours' difference from grey.
+        exposure: Least and largest factor on values.
+        tint: Largest share by which a channel is lighter or darker than that.
+        contrast: Least and largest factor on values' difference from their mean.
+        offset: Largest that is then added or taken away.
+        blur: Largest weight of the image behind a Gaussian of one pixel, beside the sharp one.
+        noise: Largest standard deviation.
+    """
+
+    occluded: float
+    shade: float
+    gamma: float
+    saturation: tuple[float, float]
+    exposure: tuple[float, float]
+    tint: float
+    contrast: tuple[float, float]
+    offset: float
+    blur: float
+    noise: float
+
+
+UNKNOWN_SCENE = Disturbance(
+    occluded=0.5,
+    shade=0.45,
+    gamma=0.35,
+    saturation=(0.3, 1.6),
+    exposure=(0.5, 1.5),
+    tint=0.15,
+    contrast=(0.6, 1.3),
+    offset=0.1,
+    blur=1.0,
+    noise=0.05,
+)
+"""Any camera, any light: colours hardly count, shapes do."""
+
+WHOLE_FRAME = Disturbance(
+    occluded=0.5,
+    shade=0.25,
+    gamma=0.2,
+    saturation=(0.7, 1.3),
+    exposure=(0.7, 1.3),
+    tint=0.08,
+    contrast=(0.8, 1.2),
+    offset=0.1,
+    blur=1.0,
+    noise=0.05,
+)
+"""The same where an object is a few pixels in clutter: its colour is what tells it from other things."""
+
+KNOWN_SCENE = Disturbance(
+    occluded=0.25,
+    shade=0.15,
+    gamma=0.1,
+    saturation=(0.8, 1.2),
+    exposure=(0.8, 1.2),
+    tint=0.05,
+    contrast=(0.85, 1.15),
+    offset=0.05,
+    blur=1.0,
+    noise=0.03,
+)
+"""One camera before a scene whose picture is there: light drifts and something is put down now and then."""
+
+
+class _Amounts(NamedTuple):
+    """What is drawn for each image; the first axis of each is the batch's."""
+
+    light: Tensor  # [batch, 1, height, width], a logarithm
+    exponent: Tensor  # [batch, 1, 1, 1]
+    mixing: Tensor  # [batch, 3, 3], of channels
+    contrast: Tensor  # [batch, 1, 1]
+    offset: Tensor  # [batch, 1, 1]
+    blur: Tensor  # [batch, 1, 1, 1]
+    noise: Tensor  # [batch, 1, 1, 1]
+    noise_place: Tensor  # [batch]
+
+
+def disturb(
+    images: Float[Tensor, "batch 3 height width"], random: np.random.Generator, most: Disturbance
+) -> Float[Tensor, "batch 3 height width"]:
     """Pictures as a camera on a cluttered desk might take them; each is disturbed by amounts of its own.
 
     Args:
         images: sRGB in [0, 1].
         random: Draws every amount.
+        most: From which ranges.
 
     Returns:
         Images of the same shape, in [0, 1].
     """
-    images = _occlude(images, random)
-    images = _shade(images, random)
-    images = _recolor(images, random)
-    images = _blur(images, random)
-    noise = torch.randn(images.shape, generator=torch.Generator().manual_seed(int(random.integers(2**63)))).to(images)
-    return (images + noise * _amounts(images, random, 0.0, 0.05)).clamp(0, 1)
+    images = _occlude(images, random, most.occluded)
+    amounts = _draw(images, random, most)
+    at_once = max(1, _VALUES_AT_ONCE // images[0].numel())
+    for first in range(0, len(images), at_once):
+        part = slice(first, first + at_once)
+        images[part] = _disturbed(images[part], _Amounts._make(values[part] for values in amounts))
+    return images
 
 
-def _amounts(images: Tensor, random: np.random.Generator, low: float, high: float, channels: int = 1) -> Tensor:
-    values = random.uniform(low, high, (len(images), channels, 1, 1)).astype(np.float32)
-    return torch.from_numpy(values).to(images)
-
-
-def _shade(images: Tensor, random: np.random.Generator) -> Tensor:
-    """Light that falls unevenly, as next to other things, and a camera's response to it."""
-    cells = int(random.integers(*_SHADE_CELLS))
-    grid = torch.from_numpy(random.normal(size=(len(images), 1, cells, cells)).astype(np.float32)).to(images)
-    field = F.interpolate(grid, images.shape[-2:], mode="bicubic", align_corners=True)
-    lit = images * torch.exp(field * _amounts(images, random, 0.0, _LARGEST_SHADE))
-    return lit.clamp(1e-4, 1) ** torch.exp(_amounts(images, random, -_LARGEST_GAMMA, _LARGEST_GAMMA))
-
-
-def _recolor(images: Tensor, random: np.random.Generator) -> Tensor:
-    """Exposure, white balance, contrast and saturation."""
-    grey = images.mean(1, keepdim=True)
-    images = grey + (images - grey) * _amounts(images, random, 0.3, 1.6)
-    images = images * _amounts(images, random, 0.5, 1.5) * _amounts(images, random, 0.85, 1.15, channels=3)
-    middle = images.mean((1, 2, 3), keepdim=True)
-    return middle + (images - middle) * _amounts(images, random, 0.6, 1.3) + _amounts(images, random, -0.1, 0.1)
-
-
-def _blur(images: Tensor, random: np.random.Generator) -> Tensor:
-    """Mixes each image with its blurred self: from sharp to a Gaussian of about one pixel."""
-    # Shifted sums along one axis and then the other: several times faster on a CPU than a grouped convolution.
-    wide = F.pad(images, (2, 2, 2, 2), mode="replicate")
-    for axis in (-2, -1):
-        size = wide.shape[axis] - 4
-        taps = [wide.narrow(axis, start, size) for start in range(5)]
-        wide = (taps[0] + taps[4] + 4 * (taps[1] + taps[3]) + 6 * taps[2]) / 16
-    return torch.lerp(images, wide, _amounts(images, random, 0.0, 1.0))
-
-
-def _occlude(images: Tensor, random: np.random.Generator) -> Tensor:
-    """Half of the images get a piece of another image of the batch in front: a rotated rectangle."""
+def _draw(images: Tensor, random: np.random.Generator, most: Disturbance) -> _Amounts:
     count, _, height, width = images.shape
-    y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+
+    def even(low: float, high: float, *shape: int) -> Tensor:
+        return torch.from_numpy(random.uniform(low, high, (count, *shape))).to(images)
+
+    saturation = even(*most.saturation, 1, 1)
+    gain = even(*most.exposure, 1, 1) * even(1 - most.tint, 1 + most.tint, 3, 1)
+    cells = int(random.integers(*_SHADE_CELLS))
+    grid = torch.from_numpy(random.normal(size=(count, 1, cells, cells))).to(images) * even(0, most.shade, 1, 1, 1)
+    down, across = (_smooth(size, cells).to(images) for size in (height, width))
+    return _Amounts(
+        light=down @ grid @ across.T,
+        exponent=even(-most.gamma, most.gamma, 1, 1, 1).exp(),
+        mixing=gain * (saturation * torch.eye(3).to(images) + (1 - saturation) / 3),
+        contrast=even(*most.contrast, 1, 1),
+        offset=even(-most.offset, most.offset, 1, 1),
+        blur=even(0, most.blur, 1, 1, 1),
+        noise=even(-most.noise, most.noise, 1, 1, 1),
+        noise_place=torch.from_numpy(random.integers(_NOISE_PLACES, size=count)).to(images.device),
+    )
+
+
+def _disturbed(images: Tensor, by: _Amounts) -> Tensor:
+    # Uneven light and the camera's response to it, in the domain where one is a sum and the other a product.
+    lit = images.clamp(min=_LEAST).log_().add_(by.light).clamp_(_DARKEST, 0).mul_(by.exponent).exp_()
+    # Saturation, exposure, white balance, contrast: one matrix on the channels.
+    middle = (by.mixing @ lit.mean((2, 3))[..., None]).mean(1, keepdim=True)
+    bias = (1 - by.contrast) * middle + by.offset
+    colored = torch.baddbmm(bias, by.contrast * by.mixing, lit.flatten(2)).view_as(lit)
+    blurred = colored.mul(1 - by.blur).addcmul_(_gaussian(colored), by.blur)
+    return blurred.addcmul_(_noise(blurred, by.noise_place), by.noise).clamp_(0, 1)
+
+
+@functools.cache
+def _smooth(size: int, cells: int) -> Float[Tensor, "size cells"]:
+    """What each cell of a coarse line adds to each pixel of a fine one: bicubic, the corners are those of the line."""
+    return F.interpolate(torch.eye(cells)[None, :, :, None], (size, 1), mode="bicubic", align_corners=True)[0, ..., 0].T
+
+
+def _gaussian(images: Tensor) -> Tensor:
+    """Nearly a Gaussian of one pixel: binomial weights 1, 4, 6, 4, 1 along both axes."""
+    # Four sums of neighbours an axis: several times faster on a CPU than a grouped convolution.
+    wide = F.pad(images, (2, 2, 2, 2), mode="replicate")
+    for axis in (-2, -1) * 4:
+        size = wide.shape[axis] - 1
+        wide = wide.narrow(axis, 0, size) + wide.narrow(axis, 1, size)
+    return wide.mul_(1 / 256)
+
+
+def _noise(images: Tensor, places: Tensor) -> Tensor:
+    """Gaussian noise, each image's from another place of a long line: drawing it anew costs ten times as much."""
+    num_values = images[0].numel()
+    windows = _noise_line(num_values, images.device).unfold(0, num_values, 1)
+    return windows[places].view_as(images)
+
+
+@functools.cache
+def _noise_line(num_values: int, device: torch.device) -> Tensor:
+    values = np.random.default_rng(0).standard_normal(_NOISE_PLACES + num_values, dtype=np.float32)
+    return torch.from_numpy(values).to(device)
+
+
+def _occlude(images: Tensor, random: np.random.Generator, share: float) -> Tensor:
+    """A copy, in which some images have a piece of another image of the batch in front: a rotated rectangle."""
+    images, before = images.clone(), images
+    chosen = np.flatnonzero(random.random(len(images)) < share)
+    for image, mask in zip(
+        chosen.tolist(), _rectangles(len(chosen), images.shape[2], images.shape[3], random), strict=True
+    ):
+        torch.where(mask.to(images.device), before[image - 1].flip(-1), before[image], out=images[image])
+    return images
+
+
+def _rectangles(count: int, height: int, width: int, random: np.random.Generator) -> Bool[Tensor, "count height width"]:
+    """Where rectangles of any place, size and direction lie."""
     angle = random.uniform(0, np.pi, (count, 1, 1))
     center_x, center_y = random.uniform(-1, 1, (2, count, 1, 1))
-    across = (x - center_x) * np.cos(angle) + (y - center_y) * np.sin(angle)
-    along = (y - center_y) * np.cos(angle) - (x - center_x) * np.sin(angle)
-    half = random.uniform(0.05, LARGEST_OCCLUDER, (2, count, 1, 1)) * (random.random((count, 1, 1)) < 0.5)
-    mask = torch.from_numpy((np.abs(across) < half[0]) & (np.abs(along) < half[1]))[:, None].to(images.device)
-    return torch.where(mask, images.roll(1, dims=0).flip(-1), images)
+    half = random.uniform(0.05, LARGEST_OCCLUDER, (2, count, 1, 1)).astype(np.float32)
+    x, y = np.linspace(-1, 1, width) - center_x, np.linspace(-1, 1, height)[:, None] - center_y
+    cos, sin = np.cos(angle), np.sin(angle)
+    sides = ((x * cos, y * sin), (x * -sin, y * cos))
+    within = [np.abs(a.astype(np.float32) + b.astype(np.float32)) < h for (a, b), h in zip(sides, half, strict=True)]
+    return torch.from_numpy(within[0] & within[1])

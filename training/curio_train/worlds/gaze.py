@@ -27,6 +27,7 @@ from torch import Tensor, nn
 
 from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
+from curio_train.data.augmentation import WHOLE_FRAME, Disturbance
 from curio_train.data.backgrounds import Backgrounds
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.metrics.poses import ADD_THRESHOLD, symmetry_poses
@@ -35,19 +36,18 @@ from curio_train.networks.gaze import GazeNetwork, Optics
 from curio_train.networks.look import Look
 from curio_train.networks.places import LOG_WEIGHTS, PLACES, PlaceNetwork
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
-from curio_train.worlds.base import Camera, World
+from curio_train.worlds.base import Camera
 from curio_train.worlds.calibration import calibrate
 from curio_train.worlds.single_object import (
     Object,
     SingleObjectWorld,
-    paint,
     pose_layout,
     position_field,
     resized,
     scene,
 )
 from curio_train.worlds.surface import SurfaceMap
-from curio_train.worlds.views import lights, turned_towards
+from curio_train.worlds.views import MILD_EXPOSURE, Exposure, lights, turned_towards
 
 ASSUMED_M = "assumed_depth_m"
 """How far the first look says the object is [batch, 1]: known beside the code, never predicted."""
@@ -88,7 +88,7 @@ class GazeWorld(SingleObjectWorld):
         self._looks = FirstLook(thing, camera), SecondLook(thing)
 
     @property
-    def looks(self) -> tuple[World, ...]:
+    def looks(self) -> tuple["FirstLook", "SecondLook"]:
         """The whole frame and the crop."""
         return self._looks
 
@@ -96,6 +96,11 @@ class GazeWorld(SingleObjectWorld):
     def turns(self) -> tuple[int, ...]:
         """Two steps for the crop after each for the frame."""
         return TURNS
+
+    @property
+    def exposure(self) -> Exposure:
+        """That of the look which has to find the object."""
+        return self.looks[0].exposure
 
     def finish(self, network: nn.Module, cache: Path) -> None:
         """The confidence is calibrated."""
@@ -119,6 +124,16 @@ class FirstLook(SingleObjectWorld):
     def __init__(self, thing: Object, frame: Camera) -> None:
         camera = resized(thing.camera, frame.width // FIRST_LOOK_SHARE, frame.height // FIRST_LOOK_SHARE)
         super().__init__(thing, camera, Layout((position_field(thing),)))
+
+    @property
+    def disturbance(self) -> Disturbance:
+        """Little of colours: at a dozen pixels they are what tells the object from other things."""
+        return super().disturbance if self.object.known_scene else WHOLE_FRAME
+
+    @property
+    def exposure(self) -> Exposure:
+        """Little for the same reason."""
+        return MILD_EXPOSURE
 
     def network(self, config: NetworkConfig) -> PlaceNetwork:
         """Hypotheses on a grid."""
@@ -183,7 +198,7 @@ class SecondLook(SingleObjectWorld):
         place = torch.from_numpy(np.concatenate([offset * scale, scale], axis=1)).float()
         rotation = turned_towards(self._metres(place, assumed), self.object.views(count, random))
         code = scene(place, rotation, lights(count, random)) | {ASSUMED_M: assumed}
-        code |= paint(self.object, count, random)
+        code |= self.paint(count, random)
         code[CONFIDENCE] = torch.from_numpy(random.random((count, 1, 1)) >= ABSENT_SHARE).float()
         return code
 

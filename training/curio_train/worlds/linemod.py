@@ -8,7 +8,7 @@ Constants fixed before any training:
 
 * depth 0.5 to 1.5 m; the object's centre anywhere in the frame;
 * light from the camera's half space, of strength 0.2 to 2 over an ambient radiance of 0.4; the object's own colours
-  0.3 to 1.25 times as bright, and a little tinted.
+  0.3 to 1.25 times as bright, and tinted, in crops; 0.5 to 1.25 times, and a little tinted, in frames read by a gaze.
 """
 
 from pathlib import Path

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.camera import Intrinsics, scale_matrix
-from curio_train.data.augmentation import disturb
+from curio_train.data.augmentation import KNOWN_SCENE, UNKNOWN_SCENE, Disturbance, disturb
 from curio_train.data.backgrounds import Backgrounds
 from curio_train.data.meshes import Mesh
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
@@ -19,7 +19,18 @@ from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Batch, Camera, ImageSource, ObjectKind, Split, World, jitter_seed
 from curio_train.worlds.placement import colors
-from curio_train.worlds.views import AMBIENT, STRONGEST_LIGHT, exposures, lights, places, turned_towards, upper_views
+from curio_train.worlds.views import (
+    AMBIENT,
+    ANY_EXPOSURE,
+    MILD_EXPOSURE,
+    STRONGEST_LIGHT,
+    Exposure,
+    exposures,
+    lights,
+    places,
+    turned_towards,
+    upper_views,
+)
 
 Views = Callable[[int, np.random.Generator], Float[Tensor, "count 3 3"]]
 """Draws rotations cam_from_obj of objects on the optical axis."""
@@ -95,7 +106,7 @@ class SingleObjectWorld(World):
         random = np.random.default_rng(seed)
         translation = places(position_field(self.object), count, random)
         code = scene(translation, turned_towards(translation, self.object.views(count, random)), lights(count, random))
-        code |= paint(self.object, count, random)
+        code |= self.paint(count, random)
         return code | {CONFIDENCE: torch.ones(count, 1, 1)} if CONFIDENCE in self.layout else code
 
     def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
@@ -105,7 +116,23 @@ class SingleObjectWorld(World):
 
     def disturb(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
         """What real cameras and scenes do to a picture, see :func:`~curio_train.data.augmentation.disturb`."""
-        return disturb(images, np.random.default_rng(seed))
+        return disturb(images, np.random.default_rng(seed), self.disturbance)
+
+    @property
+    def disturbance(self) -> Disturbance:
+        """How much its images are disturbed."""
+        return KNOWN_SCENE if self.object.known_scene else UNKNOWN_SCENE
+
+    @property
+    def exposure(self) -> Exposure:
+        """How much the light on an object that has its own colours differs."""
+        return MILD_EXPOSURE if self.object.known_scene else ANY_EXPOSURE
+
+    def paint(self, count: int, random: np.random.Generator) -> dict[str, Tensor]:
+        """The entry of codes that says which colour an unpainted object has, [count, 1, 3] sRGB; others' exposure."""
+        if self.object.painted:
+            return {COLOR: self.object.paints(count, random)}
+        return {EXPOSURE: exposures(count, random, self.exposure)}
 
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> "RenderedStream":
         """An endless stream of renderings; the splits differ in poses and in backgrounds."""
@@ -164,13 +191,6 @@ def scene(translation: Tensor, rotation: Tensor, light: Tensor) -> dict[str, Ten
         ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None],
         LIGHT: light,
     }
-
-
-def paint(thing: Object, count: int, random: np.random.Generator) -> dict[str, Tensor]:
-    """The entry of codes that says which colour an unpainted object has, [count, 1, 3] sRGB; others' exposure."""
-    if thing.painted:
-        return {COLOR: thing.paints(count, random)}
-    return {EXPOSURE: exposures(count, random)}
 
 
 def position_field(thing: Object) -> Field:

@@ -1,5 +1,7 @@
 """Drawing poses and lights of one object in six degrees of freedom, as a camera on a table's side sees it."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -11,8 +13,26 @@ from curio_train.scene_code import Field
 LARGEST_ROLL_DEG = 45.0
 WEAKEST_LIGHT, STRONGEST_LIGHT = 0.2, 2.0
 AMBIENT = 0.4
-DARKEST_EXPOSURE, BRIGHTEST_EXPOSURE = 0.3, 1.25
-_TINT = 0.2
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What an object's own colours may be multiplied by.
+
+    Attributes:
+        darkest: Least factor.
+        brightest: Largest; those between are log-uniform.
+        tint: Standard deviation of the logarithm of what each channel is multiplied by beside that.
+    """
+
+    darkest: float
+    brightest: float
+    tint: float
+
+
+ANY_EXPOSURE = Exposure(0.3, 1.25, 0.2)
+MILD_EXPOSURE = Exposure(0.5, 1.25, 0.08)
+"""Where the scene is known, or colour is what an object is found by."""
 
 
 def upper_views(count: int, random: np.random.Generator) -> Float[Tensor, "count 3 3"]:
@@ -51,10 +71,10 @@ def lights(count: int, random: np.random.Generator) -> Float[Tensor, "count 3"]:
     return torch.from_numpy(direction * _log_uniform(WEAKEST_LIGHT, STRONGEST_LIGHT, (count, 1), random)).float()
 
 
-def exposures(count: int, random: np.random.Generator) -> Float[Tensor, "count 1 3"]:
+def exposures(count: int, random: np.random.Generator, most: Exposure) -> Float[Tensor, "count 1 3"]:
     """What an object's colours are multiplied by, as if it stood in more or less, and warmer or colder, light."""
-    tint = np.exp(_TINT * random.normal(size=(count, 1, 3)))
-    return torch.from_numpy(_log_uniform(DARKEST_EXPOSURE, BRIGHTEST_EXPOSURE, (count, 1, 1), random) * tint).float()
+    tint = np.exp(most.tint * random.normal(size=(count, 1, 3)))
+    return torch.from_numpy(_log_uniform(most.darkest, most.brightest, (count, 1, 1), random) * tint).float()
 
 
 def _log_uniform(low: float, high: float, shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:
