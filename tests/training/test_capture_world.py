@@ -144,6 +144,15 @@ def test_crops_of_a_plate_span_what_they_span_in_a_frame() -> None:
     assert PlateBackgrounds(ramp).of_crops(3.0, 4.0).draw(2, 30, 30, (0,)).shape == (2, 3, 30, 30), "larger than it"
 
 
+def test_crops_of_a_plate_are_darker_where_a_part_throws_its_shadow() -> None:
+    plate = PlateBackgrounds(np.full((300, 400, 3), 128, np.uint8))
+    crops, whole = plate.of_crops(0.2, 0.3).draw(100, 32, 32, (0,)), plate.draw(100, 32, 32, (0,))
+    middle, border = (slice(12, 20), slice(0, 2))
+    relative = [(v[..., middle, middle].mean() / v[..., border, :].mean()).item() for v in (crops, whole)]
+    assert relative[0] < 0.9
+    assert relative[1] == pytest.approx(1, abs=0.05)
+
+
 def test_a_mixture_draws_from_both() -> None:
     black, white = (PlateBackgrounds(np.full((30, 40, 3), value, np.uint8)) for value in (0, 255))
     mixed = MixedBackgrounds(black, white, 0.5).split(True).of_crops(0.5, 1)

@@ -2,7 +2,8 @@
 
 A detector that has seen the plate takes nothing in it for the object; one that has seen nothing else is lost when a
 tool lies there. So the plate is mixed with clutter, and no two views of it are alike: light drifts, shadows fall, and
-a tripod is touched now and then.
+a tripod is touched now and then. Crops show the dark spot that the part's own shadow leaves, which our renderer doesn't
+draw where no plane is known.
 """
 
 from pathlib import Path
@@ -23,6 +24,8 @@ _LARGEST_SHIFT = 0.04  # of the frame's width, and as much of its height
 _GAIN, _TINT = 0.2, 0.06
 _SHADOW = 0.1  # standard deviation of the light's unevenness
 _SHADOW_GRID = 4
+_CAST_REACH, _CAST_SIZES = 0.2, (0.08, 0.25)  # of a crop's side: where a part's own shadow may lie, and its half axes
+_DARKEST_CAST = 0.6
 
 
 class PlateBackgrounds(Backgrounds):
@@ -65,7 +68,10 @@ class PlateBackgrounds(Backgrounds):
         part = self._plate[top : top + rows, left : left + columns]
         smaller = cv2.INTER_AREA if columns >= width else cv2.INTER_LINEAR
         seen = cv2.resize(part, (width, height), interpolation=smaller).astype(np.float32) / 255
-        return np.clip(seen * _light(width, height, random), 0, 1)
+        light = _light(width, height, random)
+        if self._shares is not None:
+            light *= _cast(width, height, random)
+        return np.clip(seen * light, 0, 1)
 
     def _region(self, width: int, height: int, random: np.random.Generator) -> tuple[int, int]:
         """Rows and columns of the plate that a view spans."""
@@ -112,3 +118,14 @@ def _light(width: int, height: int, random: np.random.Generator) -> np.ndarray:
     grid = 1 + _SHADOW * random.normal(size=(_SHADOW_GRID, _SHADOW_GRID)).astype(np.float32)
     uneven = cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
     return (uneven[..., None] * gain).astype(np.float32)
+
+
+def _cast(width: int, height: int, random: np.random.Generator) -> np.ndarray:
+    """Factors [height, width, 1]: a soft dark blob about a crop's middle, where the part will throw its shadow."""
+    middle = np.array([width, height]) * (0.5 + random.uniform(-_CAST_REACH, _CAST_REACH, 2))
+    axes = width * random.uniform(*_CAST_SIZES, 2)
+    blob = np.zeros((height, width), np.float32)
+    corners = cv2.boxPoints((middle.tolist(), (2 * axes).tolist(), random.uniform(0, 180)))
+    cv2.fillConvexPoly(blob, corners.round().astype(np.int32), 1.0)
+    soft = cv2.GaussianBlur(blob, (0, 0), width * random.uniform(0.01, 0.06))
+    return (1 - _DARKEST_CAST * random.uniform() * soft)[..., None]
