@@ -3,8 +3,8 @@
     python benchmarks/own_part.py [--minutes 22] [--photos 200] [--tests 50] [--out runs/own_part] [--json]
 
 An unpainted STL, 200 path traced photographs of it on a table, a plate and a slightly wrong camera file are made first
-(see ``benchmarks/stand_ins.py``); what is there already is kept. Then the installed commands look at the files, train,
-export, and detect in 50 photographs that nothing has seen. The last line is the result, also in OUT/own_part.json:
+(see ``benchmarks/stand_ins.py``); what is there already is kept. Then the installed commands look at the files, train
+and export, and detect in 50 photographs that nothing has seen. The last line is the result, also in OUT/own_part.json:
 
 right       share of the unseen photographs in which ADD(-S) is below a tenth of the diameter
 add_median  of ADD(-S), in diameters
@@ -47,8 +47,7 @@ def main() -> None:
     out: Path = arguments.out
     make("part", out, Amount(arguments.photos, arguments.tests), _show)
     files = out / "part"
-    for earlier in ("run", "models"):
-        shutil.rmtree(out / earlier, ignore_errors=True)
+    shutil.rmtree(out / "run", ignore_errors=True)
     seconds = _as_typed(files, out, arguments.minutes)
     scored = _score(files, out / "poses.jsonl")
     machine = json.loads((out / "run" / "sittings.jsonl").read_text(encoding="utf-8").splitlines()[0])["machine"]
@@ -67,13 +66,12 @@ def _as_typed(files: Path, out: Path, minutes: float) -> dict[str, float]:
     given = ["--mesh", mesh, "--mesh-unit", "m", "--camera", camera, "--photos", str(files / "photos")]
     given += ["--background", str(files / "plates" / "a-0.png")]
     distances = ["--near-m", str(_NEAR_M), "--far-m", str(_FAR_M)]
-    run, models, poses = out / "run", out / "models", out / "poses.jsonl"
+    run, poses = out / "run", out / "poses.jsonl"
     poses.unlink(missing_ok=True)
     commands = {
         "look": ["curio-doctor", *given],
         "train": ["curio-train", "capture", *given, *distances, "--minutes", str(minutes), "--out", str(run)],
-        "export": ["curio-export", str(run), "--out", str(models)],
-        "detect": ["curio-detect", str(models / "bracket"), str(files / "test" / "a"), "--camera", camera],
+        "detect": ["curio-detect", str(run / "models" / "bracket"), str(files / "test" / "a"), "--camera", camera],
     }
     commands["detect"] += ["--out", str(poses), "--overlays", str(out / "overlays")]
     seconds: dict[str, float] = {}

@@ -1,6 +1,7 @@
 """A part of one's own: an STL, a camera file, photographs and a plate become a world that can be learned."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -231,16 +232,22 @@ def test_from_files_to_a_model_by_a_project_file(
     run = tmp_path / "run"
     monkeypatch.setattr(sys, "argv", ["curio-train", "capture", "--project", str(project)])
     assert call("--project", project, "--images", 12, "--cache", cache, "--out", run) == 0
-    assert f"curio-export {run}" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert f"curio-serve {run / 'models'}" in told
+    assert f"curio-detect {run / 'models' / 'bracket'} PHOTOS --camera {folder / 'camera.json'}" in told
+    assert (run / "models" / "bracket" / "1" / "model.onnx").is_file()
     config = RunFolder.open(run).config
     assert config.world == options(folder, upright=True)
     assert (config.images, config.recipe.batch_size) == (12, 4)
     assert 'id="photographs"' in (run / "report.html").read_text()
-    done = export(run, tmp_path / "models")
-    assert done.path == tmp_path / "models" / "bracket" / "1"
-    assert str(folder) not in (done.path.parent / "CARD.md").read_text()
+    assert str(folder) not in (run / "models" / "bracket" / "CARD.md").read_text()
     with pytest.raises(UsageError, match="run folder"):
-        load_subject(done.path)
+        load_subject(run / "models" / "bracket" / "1")
+    shutil.rmtree(run / "models")
+    (run / "models").write_text("in the way")
+    assert call("--resume", run, "--cache", cache) == 1
+    assert f"curio-export {run} --out {run / 'models'}" in capsys.readouterr().err
+    assert export(run, tmp_path / "models").path == tmp_path / "models" / "bracket" / "1", "nothing was lost"
 
 
 def test_project_files_that_cannot_be_used(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -129,6 +129,7 @@ def _unset(kind: type[WorldOptions]) -> WorldOptions:
 
 
 def _train(command: TrainCommand, interruption: Interruption) -> int:
+    from curio_train.ending import end
     from curio_train.learning.loop import Outcome
     from curio_train.learning.session import learn
     from curio_train.preparation import prepared
@@ -151,21 +152,10 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         if outcome is Outcome.INTERRUPTED:
             print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
         else:
-            _report(path, session.cache)
-            print(f"to serve it: curio-export {path} --out models/, then curio-serve models/", file=sys.stderr)
+            _tell(end(path, config, session.cache, _warn))
     if outcome is Outcome.INTERRUPTED and interruption.signum is not None:
         return 128 + interruption.signum
     return 0
-
-
-def _report(run: Path, cache: Path) -> None:
-    """Leave a report in the folder of a finished run, which has succeeded whatever becomes of the report."""
-    from curio_train.evaluation.report import report_training
-
-    try:
-        report_training(run, cache)
-    except CurioError as exc:
-        _warn(str(exc))
 
 
 def _warn(text: str) -> None:
