@@ -38,6 +38,9 @@ def test_a_fit_machine_and_good_files(tmp_path: Path, capsys: pytest.CaptureFixt
     assert findings["rendering"].startswith("good")
     assert findings["libLLVM"].startswith("good")
     assert "images a second" in findings["training time"]
+    assert "circles, spheres" in findings["training time"]
+    assert ": 48,000 images in" in findings["training time"]
+    assert "linemod, capture: 240,000 images in" in findings["training time"]
     assert "12 faces, 30 x 40 x 120 mm, diameter 130 mm" in findings["mesh"]
     assert "3 discrete" in findings["mesh symmetries"]
     assert "100x80 pixels, sees 53 by 44 degrees" in findings["camera"]

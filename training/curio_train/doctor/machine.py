@@ -10,10 +10,11 @@ from pathlib import Path
 
 import torch
 
-from curio_train.config import PRESETS
+from curio_train.config import preset_recipe
 from curio_train.doctor.finding import Finding
 from curio_train.errors import CurioError
 from curio_train.rendering.variant import check_llvm, optix_available
+from curio_train.worlds import WORLDS
 
 _ENOUGH_MEMORY_GIB = 3.0  # a run of the paper's networks takes about 1.5
 _ENOUGH_DISK_GIB = 2.0  # image sets, a run's checkpoints, exported models
@@ -123,6 +124,16 @@ def _training_time() -> Finding:
     speed, problem = _trial("images_per_second")
     if speed is None:
         return Finding("training time", "bad", f"a trial of training {problem}", fault="training")
-    images = PRESETS["laptop"].budget_images
-    text = f"about {speed:.0f} images a second on the CPU: the laptop preset's {images:,} take about "
-    return Finding("training time", "good", f"{text}{images / speed / 60:.0f} minutes for one object of 20,000 faces")
+    text = f"about {speed:.0f} images a second of one object of 20,000 faces on the CPU, drawn again to be compared; "
+    return Finding("training time", "good", f"{text}unless --minutes or --images say less: {_durations(speed)}")
+
+
+def _durations(speed: float) -> str:
+    """What the laptop preset's budgets take, and the worlds that have them."""
+    worlds: dict[int, list[str]] = {}
+    for name, kind in WORLDS.items():
+        worlds.setdefault(preset_recipe("laptop", kind).budget_images, []).append(name)
+    return "; ".join(
+        f"{', '.join(names)}: {images:,} images in {images / speed / 60:.0f} minutes"
+        for images, names in sorted(worlds.items())
+    )
