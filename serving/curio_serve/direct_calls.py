@@ -2,30 +2,32 @@
 
 grpcio's own server takes a call through a thread that listens and a thread of a pool that works, with some ten switches
 between them, and through half a thousand lines of Python. Around a model that answers in two milliseconds that is a
-quarter of the time. Here a few equal threads wait for gRPC's events themselves (leader/followers: Schmidt et al.,
-Pattern-Oriented Software Architecture 2, 2000): the one that hears of a message works on it there and then and sends
-the answer, while another listens. There is one thread more than there are slots, so one always does, and while all
-slots are taken it queues calls, or refuses them before their message is read.
+quarter of the time. Here the thread that hears of a message works on it there and then and sends the answer; whoever
+finds all slots taken queues the call, or refuses it before its message is read (:mod:`curio_serve.listeners`).
 
 Only the chosen methods come this way; health, reflection, streams and the rest stay with grpcio's server, whose ports,
 connections, limits and shutdown they share. Its Python layer offers no such thing, so this stands on the layer below it
 (``grpc._cython.cygrpc``), on the same few calls that ``grpc/_server.py`` makes.
+
+A call whose handling fails by a fault of ours ends.
 """
 
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from types import TracebackType
 from typing import Any, Protocol
 
 import grpc
 from google.protobuf.message import DecodeError, Message
 from grpc._cython import cygrpc  # type: ignore[attr-defined]
 
-from curio_serve.admission import Waiter, WorkQueue, hung_up_in_queue, passed_in_queue
+from curio_serve.admission import WorkQueue, hung_up_in_queue, passed_in_queue
 from curio_serve.errors import ArgumentError, CurioError, Overloaded, Unavailable
+from curio_serve.events import Events, Handler
+from curio_serve.listeners import Listeners
 from curio_serve.telemetry import LOGGER
 from curio_serve.wire import status_from_error, unreadable
 
@@ -64,6 +66,7 @@ class DirectCalls:
     def __init__(
         self,
         server: grpc.Server,
+        events: Events,
         work: WorkQueue,
         methods: Sequence[Method],
         max_calls: int,
@@ -73,32 +76,29 @@ class DirectCalls:
 
         Args:
             server: Whose ports they are called on.
+            events: The server's.
             work: Slots and queue.
             methods: Not answered by the server itself.
             max_calls: Most open calls, also of those whose message has not come yet.
             refuse_caller: Given a call's metadata, why it may not be made, if so.
         """
         self._server: Any = server._cy_server  # type: ignore[attr-defined]
-        self._work, self._methods = work, methods
+        self._events, self._work, self._methods = events, work, methods
         self._max_calls, self._refuse_caller = max_calls, refuse_caller
         self._open: set[_Call] = set()
         self.is_stopping, self._all_ended = False, threading.Event()
-        self._events = cygrpc.CompletionQueue()
-        self._server.register_completion_queue(self._events)
         for method in methods:
             self._server.register_method(method.path)
-        num_listeners = work.num_slots + 1
-        self._threads = [threading.Thread(target=self._listen, name="curio-direct") for _ in range(num_listeners)]
+        self._listeners = Listeners(events, work.num_slots, self.work_on, self.hand_over)
         # For calls that get the slot of a thread with other duties; see _Call.tell.
         self._spare = ThreadPoolExecutor(work.num_slots, thread_name_prefix="curio-spare")
 
     def start(self) -> None:
         """Begin to answer; the server must have been started."""
         for method in self._methods:
-            for _ in self._threads:
+            for _ in range(self._work.num_slots + 1):
                 self._expect(method)
-        for thread in self._threads:
-            thread.start()
+        self._listeners.start()
 
     def stop(self) -> None:
         """End the threads; the server must have been stopped.
@@ -108,39 +108,27 @@ class DirectCalls:
         self.is_stopping = True
         if self._open:
             self._all_ended.wait()
-        self._events.shutdown()
-        for thread in self._threads:
-            thread.join()
+        self._listeners.stop()
         self._spare.shutdown()
 
     def _expect(self, method: Method) -> None:
         """Have gRPC tell of one more call."""
         try:
-            self._server.request_registered_call(self._events, self._events, method.path, partial(self._begin, method))
+            self._server.request_registered_call(self._events, self._events, method.path, Handler(self._begin, method))
         except ValueError:  # the server is being stopped
             return
-
-    def _listen(self) -> None:
-        while True:
-            event = self._events.poll()
-            if event.completion_type == cygrpc.CompletionType.queue_shutdown:
-                return
-            try:
-                call = event.tag(event)
-            except Exception:  # noqa: BLE001 - of a fault of ours a call may die, no thread
-                LOGGER.exception("an event could not be handled")
-                call = None
-            del event  # it keeps its call alive
-            if call is not None:
-                self.work_on(call)
 
     def _begin(self, method: Method, event: Any) -> None:
         """A call has come, its message not yet."""
         if not event.success:  # the server is being stopped
             return
         self._expect(method)
-        call = _Call(self, method, event.call, event.call_details.deadline)
-        self._open.add(call)
+        with _Call(self, method, event.call, event.call_details.deadline) as call:
+            self._open.add(call)
+            self._admit(call, event)
+
+    def _admit(self, call: "_Call", event: Any) -> None:
+        """Ask for a call's message, if there may be a place for it."""
         if self.is_stopping:
             self.forget(call)
             return
@@ -154,42 +142,51 @@ class DirectCalls:
         except Overloaded as exc:
             call.refuse(exc)
             return
-        event.call.start_server_batch((cygrpc.ReceiveMessageOperation(_NO_FLAGS),), partial(self._received, call))
+        event.call.start_server_batch((cygrpc.ReceiveMessageOperation(_NO_FLAGS),), Handler(self._received, call))
 
     def _received(self, call: "_Call", event: Any) -> "_Call | None":
         """A call's message has come; the call, if it has a slot."""
-        data = event.batch_operations[0].message()
-        if data is None:
-            self._work.withdraw(call)
-            call.refuse(ArgumentError("the call ended before its message had come; expected one message"))
-            return None
-        call.data = data
-        # To hear of its end costs a call more than it saves where its turn comes soon.
-        if self._work.is_long:
-            call.watch()
-        try:
-            return call if self._work.enter(call) else None
-        except Overloaded as exc:
-            call.refuse(exc)
-            return None
+        with call:
+            data = event.batch_operations[0].message()
+            if data is None:
+                self._work.withdraw(call)
+                call.refuse(ArgumentError("the call ended before its message had come; expected one message"))
+                return None
+            call.data = data
+            # To hear of its end costs a call more than it saves where its turn comes soon.
+            if self._work.is_long:
+                call.watch()
+            try:
+                return call if self._work.enter(call) else None
+            except Overloaded as exc:
+                call.refuse(exc)
+                return None
 
     def work_on(self, call: "_Call") -> None:
         """Answer a call that has a slot, then those that get the slot after it."""
-        following: Waiter | None = call
-        while isinstance(following, _Call):
-            begun = time.monotonic()
-            try:
-                following.answer(begun)
-            except Exception:  # noqa: BLE001 - likewise
-                LOGGER.exception("a call could not be answered")
-                following.drop()
+        following: _Call | None = call
+        while following is not None:
+            self._listeners.watch_out()
+            following = self._listeners.look_up(self._finish(following))
+
+    def _finish(self, call: "_Call") -> "_Call | None":
+        """Answer a call and hand its slot on; the call that has it now, if this thread can work on that."""
+        begun = time.monotonic()
+        is_answered = False
+        try:
+            with call:
+                call.answer(begun)
+            is_answered = True
+        finally:
             following = self._work.leave(time.monotonic() - begun)
-        if following is not None:
-            following.tell()
+            if following is not None and not (is_answered and isinstance(following, _Call)):
+                following.tell()
+                following = None
+        return following if isinstance(following, _Call) else None
 
     def hand_over(self, call: "_Call") -> None:
         """Work on a call that has a slot, on another thread."""
-        self._spare.submit(self.work_on, call)
+        self._spare.submit(self.work_on, call).add_done_callback(_log_fault)
 
     def withdraw(self, call: "_Call") -> bool:
         """Take a call out of the queue; False if it is not there."""
@@ -200,6 +197,11 @@ class DirectCalls:
         self._open.discard(call)
         if self.is_stopping and not self._open:
             self._all_ended.set()
+
+
+def _log_fault(future: Future[None]) -> None:
+    if error := future.exception():
+        LOGGER.error("a call could not be answered", exc_info=error)
 
 
 class _Call:
@@ -213,6 +215,16 @@ class _Call:
         self._since = time.monotonic()
         self.data = b""
 
+    def __enter__(self) -> "_Call":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, _error: object, _traceback: TracebackType | None) -> None:
+        """End the call if a fault of ours has come up."""
+        if kind is not None:
+            self._calls.withdraw(self)
+            self._calls.forget(self)
+            self._call.cancel()
+
     def peer(self) -> str:
         address: bytes = self._call.peer()
         return address.decode()
@@ -224,7 +236,7 @@ class _Call:
     def watch(self) -> None:
         """Leave the queue when the client hangs up."""
         self._is_watched = True
-        self._call.start_server_batch((cygrpc.ReceiveCloseOnServerOperation(_NO_FLAGS),), self._closed)
+        self._call.start_server_batch((cygrpc.ReceiveCloseOnServerOperation(_NO_FLAGS),), Handler(self._closed))
 
     def _closed(self, event: Any) -> None:
         if event.batch_operations[0].cancelled() and self._calls.withdraw(self):
@@ -268,16 +280,11 @@ class _Call:
         code, details = status.code.value[0], status.details.encode()
         self._send(cygrpc.SendStatusFromServerOperation(status.trailing_metadata, code, details, _NO_FLAGS))
 
-    def drop(self) -> None:
-        """End the call in any case."""
-        self._calls.forget(self)
-        self._call.cancel()
-
     def _send(self, *operations: Any) -> None:
         operations = (cygrpc.SendInitialMetadataOperation(None, _NO_FLAGS), *operations)
         if not self._is_watched:
             operations += (cygrpc.ReceiveCloseOnServerOperation(_NO_FLAGS),)
-        self._call.start_server_batch(operations, self._sent)
+        self._call.start_server_batch(operations, Handler(self._sent))
 
     def _sent(self, _event: Any) -> None:
         self._calls.forget(self)

@@ -18,6 +18,7 @@ from curio_serve.admission import WorkQueue, num_cores
 from curio_serve.config import ServeConfig
 from curio_serve.direct_calls import DirectCalls
 from curio_serve.errors import ModelError, Unavailable, UsageError
+from curio_serve.events import share_events
 from curio_serve.inference_protocol import InferenceService
 from curio_serve.model import Runtime
 from curio_serve.model_check import ChildCheck
@@ -91,13 +92,15 @@ class PoseServer:
     def _build(self) -> tuple[grpc.Server, DirectCalls]:
         config = self.config
         tokens = Tokens(read_tokens(config.token_file) if config.token_file else ())
+        options = channel_options(config)
         server = grpc.server(
             # Threads are made as calls need them, so their number follows the load; one that waits takes 16 kB.
             ThreadPoolExecutor(config.max_calls, thread_name_prefix="curio-call"),
             interceptors=[TokenInterceptor(tokens)],
-            options=channel_options(config),
+            options=options,
             maximum_concurrent_rpcs=config.max_calls,
         )
+        events = share_events(server, options)
         limits = Limits(
             config.max_pixels,
             config.max_regions,
@@ -108,7 +111,7 @@ class PoseServer:
         )
         pose = PoseService(self._repository, self._work, limits, self._metrics)
         methods = [pose.direct, self._inference.direct]
-        direct = DirectCalls(server, self._work, methods, config.max_calls, tokens.refuse)
+        direct = DirectCalls(server, events, self._work, methods, config.max_calls, tokens.refuse)
         register(server, _POSE, pose, without=["Detect"])
         register(server, _INFERENCE, self._inference, without=["ModelInfer"])
         register(server, _HEALTH, self._health)

@@ -11,6 +11,8 @@ MAX_FILE_LINES = 350
 MAX_FUNCTION_LINES = 80
 VAGUE_NAMES = {"utils", "util", "helpers", "helper", "common", "misc"}
 BROAD = {"Exception", "BaseException"}
+# Where a call ends: of a fault of ours its caller shall hear, whatever it is.
+BROAD_PLACE = (Path("serving/curio_serve/service.py"), "attempt")
 # This file spells out what it forbids.
 EXEMPT = Path("tests/contract/test_tree_rules.py")
 MACHINE_PATH = re.compile(r"(?<![\w.*])/(home/\w+|root|Users/\w+|work)/|\bfile:///|(?<!\w)\.\./shared\b")
@@ -32,13 +34,6 @@ def lines_matching(texts: dict[Path, str], pattern: re.Pattern[str]) -> list[str
 def functions(tree: ast.Module) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
     """Every function and method."""
     return (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
-
-
-def swallows(handler: ast.ExceptHandler) -> bool:
-    """Whether it catches everything and doesn't write a traceback to the log."""
-    calls = (node.func for node in ast.walk(handler) if isinstance(node, ast.Call))
-    logged = any(ast.unparse(called) == "LOGGER.exception" for called in calls)
-    return is_broad(handler) and not logged
 
 
 def is_broad(handler: ast.ExceptHandler) -> bool:
@@ -70,13 +65,19 @@ def test_modules_are_named_after_what_they_hold(sources: dict[Path, str]) -> Non
 
 
 def test_no_error_is_swallowed_wholesale(trees: dict[Path, ast.Module]) -> None:
+    allowed = {
+        node
+        for function in functions(trees[BROAD_PLACE[0]])
+        if function.name == BROAD_PLACE[1]
+        for node in ast.walk(function)
+    }
     broad = [
         f"{path}:{node.lineno}"
         for path, tree in trees.items()
         for node in ast.walk(tree)
-        if isinstance(node, ast.ExceptHandler) and swallows(node)
+        if isinstance(node, ast.ExceptHandler) and is_broad(node) and node not in allowed
     ]
-    assert not broad, f"catch what you can name, or log it with its traceback where a thread must live on: {broad}"
+    assert not broad, f"catch what you can name: {broad}"
 
 
 @pytest.mark.parametrize("pattern", [UNFINISHED, REGISTRY_HOST], ids=["unfinished", "registry-host"])
