@@ -104,7 +104,7 @@ def test_objects_of_the_second_look_lie_where_its_code_says(world: GazeWorld) ->
     code = second.sample(40, (1,))
     assert 0 < (code[CONFIDENCE] == 0).sum() < 15
     code[CONFIDENCE][:] = 1
-    second.layout.check({name: value for name, value in code.items() if name not in (ASSUMED_M, EXPOSURE)})
+    second.layout.check({name: value for name, value in code.items() if name not in (ASSUMED_M, EXPOSURE, SURFACE)})
     drawn = second.render(code).amax(dim=1) > 0.02
     place = code[TRANSLATION][:, 0]
     pixels = project(place[:, None], torch.from_numpy(second.camera.matrix).float()[None])[:, 0]
@@ -118,13 +118,8 @@ def test_second_look_loss_is_least_at_the_truth_and_knows_what_looks_alike(world
     second = world.looks[1]
     true = second.sample(5, (2,))
     true[CONFIDENCE][:] = 1
-    side = CROP_PX // 4
-    points, seen = second._surface(
-        matrix_from_rotation_6d(true[ROTATION_6D][:, 0]),
-        second._metres(true[TRANSLATION][:, 0], true[ASSUMED_M]),
-        second._matrices(true, side),
-    )
-    surface = torch.cat([points, 20 * seen[:, None].float() - 10], dim=1)
+    points, seen = true[SURFACE].split((3, 1), dim=1)
+    surface = torch.cat([points, 20 * seen - 10], dim=1)
     perfect = float(second.code_loss({**true, SURFACE: surface}, true))
     assert perfect < 1e-3
     turned = dict(true)

@@ -7,7 +7,8 @@ that is stopped and resumed goes on as if uninterrupted.
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
 
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from curio_train.config import Recipe, RunConfig
 from curio_train.errors import TrainingError, UsageError
+from curio_train.learning.ahead import Ahead
 from curio_train.learning.checkpoint import RunFolder
 from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, gradient_penalty
 from curio_train.learning.interruption import Interruption
@@ -33,6 +35,9 @@ _SMOOTHING = 0.98  # of the image loss that convergence is judged by: a memory o
 _NUM_PAIRS = 8
 _NUM_REHEARSED = 32
 _ASLEEP = 1  # marks draws of sleep, so that they are not those of the data
+
+Dream = tuple[dict[str, Tensor], Tensor]
+"""Scene codes, and the disturbed images of them that are to be read."""
 
 
 class Outcome(Enum):
@@ -77,6 +82,7 @@ class Trainer:
         self._sources = sources
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
         self._share = ranks.share(self._num_micro)
+        self._ahead: Ahead[Dream] | None = None
 
     def step(self, rate: float) -> dict[str, float]:
         """One whole step: every micro-batch adds its gradients, then all networks move.
@@ -97,8 +103,7 @@ class Trainer:
             "sleep": recipe.sleep_weight,
             "label": 1.0,
         }
-        turns = self.world.turns
-        turn = turns[self.state.course.step % len(turns)]
+        turn = self._turn(self.state.course.step)
         world, source = self.world.looks[turn], self._sources[turn]
         network = self.state.looks[turn]
         groups = tuple(kind.slots for kind in world.objects)
@@ -111,10 +116,7 @@ class Trainer:
             losses: dict[str, Tensor] = {}
 
             # Awake: read the images, render what was read, compare one by one (image) and as a set (curiosity).
-            raw = None
-            if terms == {"sleep"}:
-                backgrounds = self._backgrounds(source, number)
-            else:
+            if terms != {"sleep"}:
                 batch = self._to_device(source.batch(number, recipe.micro_batch_size))
                 if recipe.swap_colors and world.colors_interchangeable:
                     batch = recolored(batch, (self.config.seed, number))
@@ -133,7 +135,11 @@ class Trainer:
 
             # Asleep: render codes of one's own making, read them back.
             if "sleep" in terms:
-                losses["sleep"] = self._dream(world, network, raw, backgrounds, number)
+                if terms == {"sleep"}:
+                    dream, dreamt = self._ahead.take(number) if self._ahead else self._dream(number)
+                else:
+                    dream, dreamt = self._dream_around(raw, backgrounds, number)
+                losses["sleep"] = world.code_loss(self._read(network, dreamt)[1], dream)
 
             torch.stack([weights[name] * loss for name, loss in losses.items()]).sum().div(self._num_micro).backward()
 
@@ -146,25 +152,51 @@ class Trainer:
                     critic_total = critic_total + weight * gradient_penalty(self._judge, images)
                 (critic_total / self._num_micro).backward()
 
-            of_look = f", {world.name}" if len(turns) > 1 else ""
+            of_look = f", {world.name}" if len(self.world.looks) > 1 else ""
             sums.update({name + of_look: loss.item() / self._num_micro for name, loss in losses.items()})
 
         means = self._add_up_over_ranks(sums)
         self._move(means, rate)
         return means
 
-    def _dream(
-        self, world: World, network: Look, raw: SceneCode | None, backgrounds: Tensor | None, number: int
-    ) -> Tensor:
-        """The loss of sleep: of codes around ``raw`` or, without, drawn by the world."""
+    def _turn(self, step: int) -> int:
+        """Which look a step teaches."""
+        turns = self.world.turns
+        return turns[step % len(turns)]
+
+    @torch.no_grad()
+    def _dream(self, number: int) -> Dream:
+        """Of codes drawn by the world: a function of seed and number alone."""
+        turn, size = self._turn(number // self._num_micro), self.config.recipe.micro_batch_size
+        world, seed = self.world.looks[turn], (self.config.seed, number)
+        backgrounds = self._sources[turn].backgrounds(number, size)
+        code = self._to_device_code(world.sample(size, (*seed, _ASLEEP)))
+        images = world.render(code, None if backgrounds is None else backgrounds.to(self.ranks.device))
+        return code, world.disturb(images, seed)
+
+    def _dream_around(self, raw: SceneCode, backgrounds: Tensor | None, number: int) -> Dream:
+        """Of codes around those that were read of data."""
         recipe, seed = self.config.recipe, (self.config.seed, number)
-        if raw is None:
-            dream = self._to_device_code(world.sample(recipe.micro_batch_size, (*seed, _ASLEEP)))
-        else:
-            dream = sleep_codes(world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
+        code = sleep_codes(self.world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
         with torch.no_grad():
-            dreamt = world.disturb(world.render(dream, backgrounds), seed)
-        return world.code_loss(self._read(network, dreamt)[1], dream)
+            return code, self.world.disturb(self.world.render(code, backgrounds), seed)
+
+    @contextmanager
+    def dreaming_ahead(self) -> Iterator[None]:
+        """Within it a method that only sleeps has the next images drawn in a thread, while the networks learn."""
+        if self.config.terms != {"sleep"}:
+            yield
+            return
+        with Ahead(self._dream, self.ranks.size) as self._ahead:
+            try:
+                yield
+            finally:
+                self._ahead = None
+
+    def settle(self) -> None:
+        """Wait for what is drawn ahead: of the renderer, one thread at a time makes use."""
+        if self._ahead is not None:
+            self._ahead.settle()
 
     @torch.no_grad()
     def rehearse(self) -> None:
@@ -184,10 +216,6 @@ class Trainer:
         rendered = look.render({**batch.given, **network(batch.images)}, batch.backgrounds)
         network.train()
         return batch.images, rendered
-
-    def _backgrounds(self, source: ImageSource, number: int) -> Tensor | None:
-        backgrounds = source.backgrounds(number, self.config.recipe.micro_batch_size)
-        return None if backgrounds is None else backgrounds.to(self.ranks.device)
 
     def _read(self, network: Look, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The network's raw outputs and scene codes; positions need float32, convolutions do not."""
@@ -273,17 +301,19 @@ def train(
     """
     config, course, ranks = trainer.config, trainer.state.course, trainer.ranks
     saved_at, clock = course.seconds, time.monotonic()
-    with interruption.deferred():
+    with interruption.deferred(), trainer.dreaming_ahead():
         while True:
             # All processes go by the slowest clock and by anyone's signal, so that they stop at the same step.
             seconds, signalled = ranks.largest(course.seconds, interruption.signum or 0)
             progress = config.progress(course.images, seconds)
             outcome = _outcome(config, course.image_loss, progress, bool(signalled))
-            if outcome and outcome is not Outcome.INTERRUPTED:
-                finish()
-            if reporter and (outcome or seconds - saved_at >= 60 * checkpoint_minutes):
-                run.save(trainer.state)
-                reporter.pictures(trainer.pairs())
+            if outcome or seconds - saved_at >= 60 * checkpoint_minutes:
+                trainer.settle()
+                if outcome and outcome is not Outcome.INTERRUPTED:
+                    finish()
+                if reporter:
+                    run.save(trainer.state)
+                    reporter.pictures(trainer.pairs())
                 saved_at = seconds
             if outcome:
                 return outcome

@@ -200,7 +200,9 @@ class SecondLook(SingleObjectWorld):
         code = scene(place, rotation, lights(count, random)) | {ASSUMED_M: assumed}
         code |= self.paint(count, random)
         code[CONFIDENCE] = torch.from_numpy(random.random((count, 1, 1)) >= ABSENT_SHARE).float()
-        return code
+        side = CROP_PX // SURFACE_SHARE
+        points, seen = self._surface(rotation, self._metres(place, assumed), self._matrices(code, side))
+        return code | {SURFACE: torch.cat([points, seen[:, None]], dim=1)}
 
     def backgrounds(self, cache: Path) -> Backgrounds:
         """Such parts of them as crops show."""
@@ -222,8 +224,8 @@ class SecondLook(SingleObjectWorld):
         """
         there = true[CONFIDENCE][:, 0, 0]
         found, wanted = (matrix_from_rotation_6d(code[ROTATION_6D][:, 0]) for code in (predicted, true))
-        alike = (wanted[:, None] @ self._turns)[:, :, None]  # [batch, symmetries, 1, 3, 3]
-        points = self._points[..., None]
+        alike = (wanted[:, None] @ self._turns.to(wanted))[:, :, None]  # [batch, symmetries, 1, 3, 3]
+        points = self._points.to(wanted)[..., None]
         between = ((found[:, None, None] @ points) - (alike @ points)).squeeze(-1)
         displaced = between.norm(dim=-1).mean(dim=-1).amin(dim=1)
         place, true_place = predicted[TRANSLATION][:, 0], true[TRANSLATION][:, 0]
@@ -242,11 +244,9 @@ class SecondLook(SingleObjectWorld):
 
     def _surface_loss(self, surface: Float[Tensor, "batch 4 side side"], true: SceneCode) -> Float[Tensor, ""]:
         """Whether each patch sees the object, and where it does, which point of it (mean absolute coordinate error)."""
-        place = self._metres(true[TRANSLATION][:, 0], true[ASSUMED_M])
-        rotation = matrix_from_rotation_6d(true[ROTATION_6D][:, 0])
-        points, seen = self._surface(rotation, place, self._matrices(true, surface.shape[-1]))
-        mask = seen[:, None, None].to(surface) * true[CONFIDENCE][:, :, :, None, None]
-        turned = torch.einsum("sij,bjvu->bsivu", self._turns.transpose(1, 2), points)
+        points, seen = true[SURFACE].split((3, 1), dim=1)
+        mask = (seen * true[CONFIDENCE][..., None])[:, None]  # [batch, 1, 1, side, side]
+        turned = torch.einsum("sij,bjvu->bsivu", self._turns.to(points).transpose(1, 2), points)
         errors = ((surface[:, None, :3] - turned).abs() * mask).sum((2, 3, 4)) / mask.sum((2, 3, 4)).clamp(min=1)
         return errors.amin(dim=1).mean() + F.binary_cross_entropy_with_logits(surface[:, 3], mask[:, 0, 0])
 
