@@ -1,6 +1,7 @@
 """Whether a server stays whole and small: what takes too long for the tests, which run the same with small numbers.
 
-    python benchmarks/endurance.py [--json] [--requests 50000] [--replacements 50] [--connections 10000] [--fuzz 100000]
+    python benchmarks/endurance.py [--json] [--out FILE]
+                                   [--requests 50000] [--replacements 50] [--connections 10000] [--fuzz 100000]
 
 rss_growth            memory after all requests over memory after a tenth of them, after the same pause; at most 1.05
 failed_calls          calls of clients with retries that failed while a model was replaced so many times; none may
@@ -9,18 +10,22 @@ connections_survived  so many connections opened with no, half and wrong beginni
 fuzzed                so many strange requests by ``tests/serving/test_fuzz.py``, each with a defined status and a good
                       answer after it; found failures stay in ``.hypothesis`` and belong into ``tests/serving/corpus``
 
-A part is left out with 0. Exit status 1: one of them does not hold.
+A part is left out with 0. Exit status 1: one of them does not hold. What has been reached is said on stderr. With
+``--out`` the figures are written to a file after each part and each 10,000 strange requests, and a run that was cut off
+goes on after the last of them; for another version of the server, take another file.
 """
 
 import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +42,7 @@ from serving import memory_mb, running_server, worker
 _ROOT = Path(__file__).parents[1]
 _OPENINGS = (b"", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n", bytes(range(64)))
 _NUM_FUZZ_TESTS = 4
+_FUZZ_ROUND, _FUZZ_LIMIT_S = 10_000, 3600.0
 _LARGEST_GROWTH = 1.05
 
 
@@ -46,6 +52,8 @@ class Arguments:
 
     json: bool = False
     """Print one JSON object on the last line instead of a table."""
+    out: Path | None = None
+    """Write the figures here as they come, and go on from those that are here already."""
     requests: int = 50_000
     """Frames sent between the two looks at memory and before them."""
     replacements: int = 50
@@ -60,18 +68,25 @@ def main() -> None:
     """Measures, prints, and leaves nothing behind but what the fuzzing found."""
     arguments = tyro.cli(Arguments)
     frames = make_frames(8)
-    figures: dict[str, Any] = {}
+    out = arguments.out
+    figures: dict[str, Any] = json.loads(out.read_text()) if out and out.exists() else {}
     with tempfile.TemporaryDirectory() as name:
         models = Path(name)
         write_model(models / MODEL, K, WIDTH)
-        if arguments.requests:
-            figures |= memory(models, frames, arguments.requests)
-        if arguments.connections:
-            figures |= connections(models, frames, arguments.connections)
-        if arguments.replacements:
-            figures |= replacements(models, frames, arguments.replacements)
-    if arguments.fuzz:
-        figures |= fuzzing(arguments.fuzz)
+        parts = (
+            ("rss_growth", memory, arguments.requests),
+            ("connections_survived", connections, arguments.connections),
+            ("failed_calls", replacements, arguments.replacements),
+        )
+        for figure, part, number in parts:
+            if number and figure not in figures:
+                figures |= part(models, frames, number)
+                _keep(figures, out)
+    while (num_left := arguments.fuzz - figures.get("fuzzed", 0)) >= _NUM_FUZZ_TESTS:
+        figures |= fuzzing(min(num_left, _FUZZ_ROUND), figures.get("fuzzed", 0))
+        _keep(figures, out)
+        if figures["fuzz_status"]:
+            break
     print(json.dumps(figures) if arguments.json else "\n".join(f"{k:22} {v}" for k, v in figures.items()))
     holds = (
         figures.get("rss_growth", 1.0) <= _LARGEST_GROWTH
@@ -81,22 +96,36 @@ def main() -> None:
     sys.exit(0 if holds else 1)
 
 
+def _keep(figures: dict[str, Any], out: Path | None) -> None:
+    _say(json.dumps(figures))
+    if out:
+        fresh = out.with_name(f"{out.name}.tmp")
+        fresh.write_text(f"{json.dumps(figures)}\n")
+        fresh.replace(out)
+
+
+def _say(text: str) -> None:
+    print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
+
+
 def memory(models: Path, frames: list[bytes], num_requests: int) -> dict[str, Any]:
     """Resident memory after a tenth of the requests and after all."""
     cores = sorted(os.sched_getaffinity(0))
     with running_server(models, cores) as (address, pid), worker(cores) as load:
         target = pose_target(address, frames)
-        codes = [load(closed_loop_of, target, 4, num_requests // 10)]
-        time.sleep(1)
-        early_mb, _ = memory_mb(pid)
-        codes.append(load(closed_loop_of, target, 4, num_requests - num_requests // 10))
-        time.sleep(1)
-        late_mb, _ = memory_mb(pid)
+        codes: Counter[str] = Counter()
+        sizes_mb = []
+        for tenth in range(10):
+            share = num_requests // 10 if tenth < 9 else num_requests - 9 * (num_requests // 10)
+            codes.update(load(closed_loop_of, target, 4, share))
+            time.sleep(1)
+            sizes_mb.append(memory_mb(pid)[0])
+            _say(f"{codes.total()} of {num_requests} requests, {sizes_mb[-1]} MB")
     return {
-        "rss_growth": round(late_mb / early_mb, 4),
-        "rss_early_mb": early_mb,
-        "rss_late_mb": late_mb,
-        "codes": {code: sum(counts.get(code, 0) for counts in codes) for counts in codes for code in counts},
+        "rss_growth": round(sizes_mb[-1] / sizes_mb[0], 4),
+        "rss_early_mb": sizes_mb[0],
+        "rss_late_mb": sizes_mb[-1],
+        "codes": dict(codes),
     }
 
 
@@ -142,6 +171,8 @@ def replacements(models: Path, frames: list[bytes], num_replacements: int) -> di
             for version in range(2, num_replacements + 2):
                 _put(models / MODEL / str(version), first.read_bytes())
                 _wait_until(lambda wanted=version: wanted in seen)
+                if version % 10 == 1:
+                    _say(f"{version - 1} of {num_replacements} replacements")
             _put(models / MODEL / str(num_replacements + 2), b"broken")
             time.sleep(2)
         finally:
@@ -171,12 +202,19 @@ def _wait_until(is_so: Any, limit_s: float = 120.0) -> None:
         time.sleep(0.02)
 
 
-def fuzzing(num_requests: int) -> dict[str, Any]:
-    """The fuzz tests with that many examples in all."""
-    environment = {**os.environ, "CURIO_FUZZ_EXAMPLES": str(max(1, num_requests // _NUM_FUZZ_TESTS))}
-    test = [sys.executable, "-m", "pytest", "-q", str(_ROOT / "tests" / "serving" / "test_fuzz.py")]
-    status = subprocess.run(test, cwd=_ROOT, env=environment, check=False, stdout=sys.stderr).returncode
-    return {"fuzzed": num_requests // _NUM_FUZZ_TESTS * _NUM_FUZZ_TESTS, "fuzz_status": status}
+def fuzzing(num_requests: int, num_before: int) -> dict[str, Any]:
+    """The fuzz tests with that many examples in all, others than before. A round that fails does not count."""
+    environment = {**os.environ, "CURIO_FUZZ_EXAMPLES": str(num_requests // _NUM_FUZZ_TESTS)}
+    tests = str(_ROOT / "tests" / "serving" / "test_fuzz.py")
+    call = [sys.executable, "-m", "pytest", "-q", f"--hypothesis-seed={num_before}", tests]
+    process = subprocess.Popen(call, cwd=_ROOT, env=environment, stdout=sys.stderr)
+    try:
+        status = process.wait(_FUZZ_LIMIT_S)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGINT)  # it ends its server then
+        status = process.wait(60) or 1
+    done = 0 if status else num_requests // _NUM_FUZZ_TESTS * _NUM_FUZZ_TESTS
+    return {"fuzzed": num_before + done, "fuzz_status": status}
 
 
 if __name__ == "__main__":
