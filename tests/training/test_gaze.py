@@ -192,21 +192,36 @@ def test_first_look_reads_the_likeliest_place(world: GazeWorld) -> None:
     assert 0.5 <= found[TRANSLATION][0, 0, 2] <= 1.5
 
 
-def test_first_look_loss_rewards_one_right_hypothesis(world: GazeWorld) -> None:
+def test_first_look_loss_rewards_right_hypotheses(world: GazeWorld) -> None:
     first: FirstLook = world.looks[0]
     true = first.sample(3, (1,))
+    right = slice(4, 4 + first.num_shown)
     places = torch.tensor([0.5, 0.4, 1.2]).expand(3, 10, 3).clone()
-    places[:, 4] = true[TRANSLATION][:, 0]
+    places[:, right] = true[TRANSLATION]
     even = torch.full((3, 10), 0.1).log()
     certain = even.clone()
-    certain[:, 4] = 2.0
+    certain[:, right] = 2.0
     losses = [
         float(first.code_loss({PLACES: places, LOG_WEIGHTS: weights.log_softmax(-1)}, true))
         for weights in (even, certain)
     ]
     assert losses[1] < losses[0] < 2.4  # log 10 where one of ten is right
-    places[:, 4] += 0.3
-    assert float(first.code_loss({PLACES: places, LOG_WEIGHTS: even}, true)) > losses[0] + 1
+    places[:, 4] += 0.3  # of one object nothing is known any more
+    assert float(first.code_loss({PLACES: places, LOG_WEIGHTS: even}, true)) > losses[0] + 0.3
+
+
+def test_first_look_sees_several_under_one_light(world: GazeWorld) -> None:
+    first: FirstLook = world.looks[0]
+    code = first.sample(4, (1,))
+    assert code[TRANSLATION].shape == (4, first.num_shown, 3)
+    assert code[LIGHT].shape == (4, 3)
+    background = torch.zeros(4, 3, first.camera.height, first.camera.width)
+    seen = first.render(code, background).sum(1) > 0
+    matrix = torch.from_numpy(first.camera.matrix).float()
+    pixels = project(code[TRANSLATION].flatten(0, 1), matrix)
+    for number, (u, v) in enumerate(pixels.round().int().tolist()):
+        patch = seen[number // first.num_shown, max(v - 4, 0) : v + 5, max(u - 4, 0) : u + 5]
+        assert patch.any(), (number, u, v)
 
 
 def test_gradients_reach_every_weight_of_both_looks(world: GazeWorld, tmp_path) -> None:
@@ -297,3 +312,11 @@ def test_colours_differ_least_where_they_tell_most(thing: Object, world: GazeWor
     assert moved(second) > 1.3 * moved(first)
     assert moved(first) > 1.2 * moved(known.looks[0])
     assert moved(known.looks[0]) == pytest.approx(moved(known.looks[1]))
+
+
+def test_light_of_a_known_scene_tells_faces_apart(thing: Object) -> None:
+    for known, weakest in ((False, 0.2), (True, 0.5)):
+        for look in GazeWorld("capture", replace(thing, known_scene=known)).looks:
+            strength = look.sample(400, (1,))[LIGHT].norm(dim=-1)
+            assert weakest <= strength.min() < 1.1 * weakest
+            assert strength.max() <= 2

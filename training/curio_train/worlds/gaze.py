@@ -47,7 +47,7 @@ from curio_train.worlds.single_object import (
     scene,
 )
 from curio_train.worlds.surface import SurfaceMap
-from curio_train.worlds.views import MILD_EXPOSURE, Exposure, lights, turned_towards
+from curio_train.worlds.views import MILD_EXPOSURE, Exposure, turned_towards
 
 ASSUMED_M = "assumed_depth_m"
 """How far the first look says the object is [batch, 1]: known beside the code, never predicted."""
@@ -120,6 +120,7 @@ class FirstLook(SingleObjectWorld):
     """Whole frames at low resolution, of which only the place is read."""
 
     name = "first look"
+    num_shown = 3
 
     def __init__(self, thing: Object, frame: Camera) -> None:
         camera = resized(thing.camera, frame.width // FIRST_LOOK_SHARE, frame.height // FIRST_LOOK_SHARE)
@@ -135,23 +136,29 @@ class FirstLook(SingleObjectWorld):
         """Little for the same reason."""
         return MILD_EXPOSURE
 
+    def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:
+        """Several of the object in a frame, under one light: each teaches a place, and the frame is paid for once."""
+        code = super().sample(count * self.num_shown, seed)
+        light = code.pop(LIGHT)[:count]
+        return {name: value.reshape(count, self.num_shown, -1) for name, value in code.items()} | {LIGHT: light}
+
     def network(self, config: NetworkConfig) -> PlaceNetwork:
         """Hypotheses on a grid."""
         assert self.camera.matrix is not None
         return PlaceNetwork(self.layout[TRANSLATION], self.camera.matrix, self.camera.width, self.camera.height)
 
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
-        """Negative log likelihood of the true place among the weighted hypotheses (a mixture density, Bishop 1994).
+        """Negative log likelihood of the true places among the weighted hypotheses (a mixture density, Bishop 1994).
 
         A hypothesis that is near is made nearer and more certain; those far away only lose weight. So no cell has to be
         named as the right one, and a second red thing in the picture gets a hypothesis of its own instead of pulling a
         mean between the two.
         """
-        places, place = predicted[PLACES], true[TRANSLATION]
+        places, place = predicted[PLACES][:, None], true[TRANSLATION][:, :, None]  # [batch, objects, cells, 3]
         slope = places[..., :2] / places[..., 2:] - place[..., :2] / place[..., 2:]
         depth = places[..., 2].log() - place[..., 2].log()
         distance = slope.norm(dim=-1) / self._slope_scale + depth.abs() / _DEPTH_SCALE
-        return -(predicted[LOG_WEIGHTS] - distance).logsumexp(dim=-1).mean()
+        return -(predicted[LOG_WEIGHTS][:, None] - distance).logsumexp(dim=-1).mean()
 
     @property
     def _slope_scale(self) -> float:
@@ -197,7 +204,7 @@ class SecondLook(SingleObjectWorld):
         assumed = torch.from_numpy(random.uniform(self.object.near_m, self.object.far_m, (count, 1))).float()
         place = torch.from_numpy(np.concatenate([offset * scale, scale], axis=1)).float()
         rotation = turned_towards(self._metres(place, assumed), self.object.views(count, random))
-        code = scene(place, rotation, lights(count, random)) | {ASSUMED_M: assumed}
+        code = scene(place, rotation, self.lights(count, random)) | {ASSUMED_M: assumed}
         code |= self.paint(count, random)
         code[CONFIDENCE] = torch.from_numpy(random.random((count, 1, 1)) >= ABSENT_SHARE).float()
         side = CROP_PX // SURFACE_SHARE

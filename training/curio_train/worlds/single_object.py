@@ -24,6 +24,8 @@ from curio_train.worlds.views import (
     ANY_EXPOSURE,
     MILD_EXPOSURE,
     STRONGEST_LIGHT,
+    WEAKEST_KNOWN_LIGHT,
+    WEAKEST_LIGHT,
     Exposure,
     exposures,
     lights,
@@ -88,9 +90,11 @@ class SingleObjectWorld(World):
     Attributes:
         object: What is looked for.
         given: Entries of its codes that are known of every image and never predicted.
+        num_shown: How many of the object an image shows.
     """
 
     given: tuple[str, ...] = ()
+    num_shown: int = 1
 
     def __init__(self, thing: Object, camera: Camera, layout: Layout) -> None:
         self.object, self.camera, self.layout = thing, camera, layout
@@ -105,7 +109,8 @@ class SingleObjectWorld(World):
         """Poses anywhere in the frame, light from the camera's side."""
         random = np.random.default_rng(seed)
         translation = places(position_field(self.object), count, random)
-        code = scene(translation, turned_towards(translation, self.object.views(count, random)), lights(count, random))
+        rotation = turned_towards(translation, self.object.views(count, random))
+        code = scene(translation, rotation, self.lights(count, random))
         code |= self.paint(count, random)
         return code | {CONFIDENCE: torch.ones(count, 1, 1)} if CONFIDENCE in self.layout else code
 
@@ -117,6 +122,10 @@ class SingleObjectWorld(World):
     def disturb(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
         """What real cameras and scenes do to a picture, see :func:`~curio_train.data.augmentation.disturb`."""
         return disturb(images, np.random.default_rng(seed), self.disturbance)
+
+    def lights(self, count: int, random: np.random.Generator) -> Tensor:
+        """Light of any strength, or, in a known scene, as a place where things are looked at is lit, [count, 3]."""
+        return lights(count, random, WEAKEST_KNOWN_LIGHT if self.object.known_scene else WEAKEST_LIGHT)
 
     @property
     def disturbance(self) -> Disturbance:
@@ -145,7 +154,8 @@ class SingleObjectWorld(World):
 
     @cached_property
     def _renderer(self) -> Renderer:
-        return Renderer([self.object.mesh], [0], self.camera.width, self.camera.height, ambient=AMBIENT)
+        kinds = [0] * self.num_shown
+        return Renderer([self.object.mesh], kinds, self.camera.width, self.camera.height, ambient=AMBIENT)
 
     def _image(self, code: SceneCode, translation_m: Tensor, matrix: np.ndarray, backgrounds: Tensor | None) -> Tensor:
         size = (len(translation_m), 3, self.camera.height, self.camera.width)

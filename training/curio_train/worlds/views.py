@@ -12,6 +12,8 @@ from curio_train.scene_code import Field
 
 LARGEST_ROLL_DEG = 45.0
 WEAKEST_LIGHT, STRONGEST_LIGHT = 0.2, 2.0
+WEAKEST_KNOWN_LIGHT = 0.5
+"""Where the scene is known: enough over the ambient light to tell one face from another, as a lamp or a window is."""
 AMBIENT = 0.4
 
 
@@ -63,12 +65,12 @@ def places(field: Field, count: int, random: np.random.Generator) -> Float[Tenso
     return torch.from_numpy(position).float()
 
 
-def lights(count: int, random: np.random.Generator) -> Float[Tensor, "count 3"]:
+def lights(count: int, random: np.random.Generator, weakest: float) -> Float[Tensor, "count 3"]:
     """Light from the camera's half space: towards it, camera frame; its length is the strength, log-uniform."""
     direction = random.normal(size=(count, 3))
     direction[:, 2] = -np.abs(direction[:, 2])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return torch.from_numpy(direction * _log_uniform(WEAKEST_LIGHT, STRONGEST_LIGHT, (count, 1), random)).float()
+    return torch.from_numpy(direction * _log_uniform(weakest, STRONGEST_LIGHT, (count, 1), random)).float()
 
 
 def exposures(count: int, random: np.random.Generator, most: Exposure) -> Float[Tensor, "count 1 3"]:
