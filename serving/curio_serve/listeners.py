@@ -43,6 +43,7 @@ class Listeners(Generic[Call]):
         self._work_on, self._hand_over = work_on, hand_over
         self._waiting: set[int] = set()  # threads that wait for an event
         self._all_work, self._num_looks = threading.Event(), 0
+        self._looking = threading.Lock()  # of two, one would take calls that the other is free for
         self._is_stopping = False
         self._threads = ThreadPoolExecutor(num_threads + 1, thread_name_prefix="curio-direct")
 
@@ -73,7 +74,7 @@ class Listeners(Generic[Call]):
         Returns:
             The same, or else what has come.
         """
-        if self._waiting:
+        if self._waiting or not self._looking.acquire(blocking=False):
             return following
         self._num_looks += 1
         is_over = False
@@ -84,12 +85,16 @@ class Listeners(Generic[Call]):
                     break
                 call = event.tag(event)
                 del event
-                if following is None:
+                if call is not None and following is None:
                     following = call
-                elif call is not None:
+                    break  # who is free hears the rest
+                if call is not None:
                     self._hand_over(call)
+                if self._waiting:
+                    break
             is_over = True
         finally:
+            self._looking.release()
             if not is_over and following is not None:
                 self._hand_over(following)
         return following
