@@ -17,6 +17,7 @@ from curio_train.data import backgrounds
 from curio_train.data.plate import MixedBackgrounds, PlateBackgrounds
 from curio_train.doctor.before_training import refuse_unfit
 from curio_train.errors import CameraError, DataError, MeshError, UsageError
+from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.subject import load_subject
 from curio_train.export import export
 from curio_train.geometry import matrix_from_rotation_6d
@@ -166,6 +167,9 @@ def test_photographs_come_in_the_canonical_size_without_distortion(world: Captur
     found = world.photographs(5)
     assert found.shape == (5, 3, world.camera.height, world.camera.width)
     assert world.photographs(100).shape[0] == 12
+    plate = world.plate()
+    assert plate is not None
+    assert (found[0] == plate).all(dim=0).float().mean() > 0.9, "but for a square that differs"
     straight = cv2.undistort(
         cv2.cvtColor(cv2.imread(str(world._images / "00.png")), cv2.COLOR_BGR2RGB),
         world.object.camera.matrix,
@@ -239,7 +243,9 @@ def test_from_files_to_a_model_by_a_project_file(
     config = RunFolder.open(run).config
     assert config.world == options(folder, upright=True)
     assert (config.images, config.recipe.batch_size) == (12, 4)
-    assert 'id="photographs"' in (run / "report.html").read_text()
+    report = (run / "report.html").read_text()
+    assert 'id="photographs"' in report
+    assert "what was found covers what differs from the plate" in report
     assert str(folder) not in (run / "models" / "bracket" / "CARD.md").read_text()
     with pytest.raises(UsageError, match="run folder"):
         load_subject(run / "models" / "bracket" / "1")
@@ -248,6 +254,11 @@ def test_from_files_to_a_model_by_a_project_file(
     assert call("--resume", run, "--cache", cache) == 1
     assert f"curio-export {run} --out {run / 'models'}" in capsys.readouterr().err
     assert export(run, tmp_path / "models").path == tmp_path / "models" / "bracket" / "1", "nothing was lost"
+    config_file = run / "config.json"
+    config_file.write_text(config_file.read_text().replace(str(folder / "photos"), str(tmp_path / "gone")))
+    warnings: list[str] = []
+    assert evaluate(run, num_images=4, cache=cache, warn=warnings.append)["metrics"], "scores need no photographs"
+    assert ["gone" in warning for warning in warnings] == [True, True]
 
 
 def test_project_files_that_cannot_be_used(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

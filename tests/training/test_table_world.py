@@ -135,6 +135,10 @@ def test_true_codes_score_better_than_wrong_ones(folder: Path, world: Table) -> 
         assert right.metrics[name] < wrong.metrics[name]
         assert right.metrics[name] < right.metrics[name.replace("view_", "view_plate_")]
     assert right.metrics["better_than_plate"] == 1
+    for name, least in (("own_view_overlap", 0.75), ("own_view_inside", 0.75)):
+        assert wrong.metrics[name] + 0.2 < right.metrics[name]
+        assert right.metrics[name] > least
+    assert f"overlap by {right.metrics['own_view_overlap']:.2f}" in right.verdict
     assert right.verdict.startswith("Trust it: in 100% of 12")
     assert wrong.verdict.startswith("Do not trust it")
     assert [*right.columns][2:] == ["photograph, second camera", "prediction, second camera"]

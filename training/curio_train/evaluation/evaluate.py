@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from curio_train.errors import CheckpointError, ReportError, UsageError
+from curio_train.errors import CheckpointError, DataError, ReportError, UsageError
 from curio_train.evaluation.photographed import judge
 from curio_train.evaluation.real_frames import evaluate_real_frames
 from curio_train.evaluation.refinement import refined
@@ -68,7 +68,8 @@ def evaluate(
         refine: Score the poses once more after :class:`~curio_train.evaluation.refinement.Refinement`.
         cache: Where worlds keep their image sets.
         progress: Told what is being done.
-        warn: Told why a report could not be written, for which no evaluation is thrown away.
+        warn: Told why photographs could not be judged by, or a report not written: no evaluation is thrown away for
+            either.
 
     Returns:
         What was evaluated, ``metrics`` by name, the same of the network before its first step as ``untrained``, and
@@ -101,8 +102,11 @@ def evaluate(
         result["refined"] = {"metrics": _scored(better.world, better.predict, held_out)[1]}
         if data is not None:
             result["refined"]["real"] = evaluate_real_frames(better, data, bop_results, "-refined")
-    if (judgement := judge(subject.world, subject.predict)) is not None:
-        result["photographs"] = judgement.summary
+    try:
+        if (judgement := judge(subject.world, subject.predict)) is not None:
+            result["photographs"] = judgement.summary
+    except DataError as exc:  # photographs that have moved since; the scores need none
+        warn(f"not judged by photographs: {exc}")
     if (path / CONFIG_FILE).exists():
         _keep(path, result)
         progress("the report")

@@ -14,7 +14,7 @@ import torch
 from jinja2 import Environment, PackageLoader, TemplateError
 from torch import Tensor
 
-from curio_train.errors import ReportError
+from curio_train.errors import DataError, ReportError
 from curio_train.evaluation import report_figures as figures
 from curio_train.evaluation.photographed import Judgement, judge
 from curio_train.evaluation.subject import Subject, load_subject
@@ -24,7 +24,6 @@ from curio_train.learning.configuration import world_name
 from curio_train.learning.progress import read_history
 from curio_train.learning.provenance import Sitting, sittings
 from curio_train.metrics.images import dssim
-from curio_train.scene_code import CONFIDENCE
 from curio_train.worlds.base import Split
 
 REPORT_FILE = "report.html"
@@ -70,6 +69,8 @@ def write_report(
         draft = run / (REPORT_FILE + ".tmp")
         draft.write_text(html, encoding="utf-8")
         draft.replace(run / REPORT_FILE)
+    except DataError as exc:
+        raise ReportError(f"{run / REPORT_FILE} could not be written ({exc}); the run itself is whole") from exc
     except (OSError, LookupError, RuntimeError, TemplateError, TypeError, ValueError, MemoryError) as exc:
         raise ReportError(
             f"{run / REPORT_FILE} could not be written ({type(exc).__name__}: {exc}); the run itself is whole, and "
@@ -102,7 +103,6 @@ def _page(
         split=split,
         num_images=evaluation["num_images"] if evaluation else len(batch.images),
         samples=figures.samples([column[:_NUM_SAMPLES] for column in columns]),
-        photographs=_photographs(subject),
         judgement=judgement,
         judged=None if judgement is None else _judged(judgement),
         curves=figures.curves(read_history(run)),
@@ -112,21 +112,10 @@ def _page(
     )
 
 
-def _photographs(subject: Subject) -> str:
-    """Photographs beside what was found in them, the least certain first; empty where the world has none."""
-    images = subject.world.photographs(_NUM_PHOTOGRAPHS)
-    if images is None:
-        return ""
-    code = subject.predict((images * 255).round().byte())
-    order = code[CONFIDENCE].flatten().argsort() if CONFIDENCE in code else torch.arange(len(images))
-    drawn = subject.world.render(code | {CONFIDENCE: torch.ones(len(images), 1, 1)}, images).clamp(0, 1)
-    return figures.samples((images[order], drawn[order]), ("photograph", "what was found, drawn over it"))
-
-
 def _judged(judgement: Judgement) -> str:
-    """Photographs and what was found in them from each camera, the worst scenes first."""
+    """Photographs and what was found in them from each camera, the worst first, with their figures."""
     columns = [column[:_NUM_PHOTOGRAPHS] for column in judgement.columns.values()]
-    return figures.samples(columns, tuple(judgement.columns))
+    return figures.samples(columns, tuple(judgement.columns), judgement.captions[:_NUM_PHOTOGRAPHS])
 
 
 def _facts(subject: Subject, made: list[Sitting]) -> dict[str, str]:

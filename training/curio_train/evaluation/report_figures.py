@@ -15,12 +15,13 @@ HEADINGS = ("input", "prediction", "novel view")
 _NOT_LOSSES = ("step", "images", "seconds")
 
 
-def samples(columns: Sequence[Tensor], headings: Sequence[str] = HEADINGS) -> str:
+def samples(columns: Sequence[Tensor], headings: Sequence[str] = HEADINGS, captions: Sequence[str] = ()) -> str:
     """A grid with a row an image, such as input, re-rendering, the predicted scene from the novel view.
 
     Args:
         columns: Each [num, 3, height, width] in [0, 1].
         headings: One a column.
+        captions: One a row, written to its left, or none.
     """
     num = len(columns[0])
     figure = Figure(figsize=(6, 2 * num), layout="constrained")
@@ -30,6 +31,8 @@ def samples(columns: Sequence[Tensor], headings: Sequence[str] = HEADINGS) -> st
         for panel, image in zip(panels[:, number], column, strict=True):
             panel.imshow(image.permute(1, 2, 0).cpu().numpy(), interpolation="nearest")
             panel.set_axis_off()
+    for panel, caption in zip(panels[:, 0], captions, strict=False):
+        panel.text(-0.05, 0.5, caption, transform=panel.transAxes, ha="right", va="center")
     return _uri(figure)
 
 

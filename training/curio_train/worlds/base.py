@@ -249,6 +249,14 @@ class World(ABC):
         """
         return None
 
+    def plate(self) -> Tensor | None:
+        """The empty scene of :meth:`photographs`, [3, height, width] in [0, 1], where it is known.
+
+        Raises:
+            DataError: It cannot be read, or is not of the camera's size.
+        """
+        return None
+
     def novel_view(self, code: SceneCode) -> Tensor:
         """Scenes as scored by the paper's image error: from 90° round their centre, where a world has such a view."""
         return self.render(code)

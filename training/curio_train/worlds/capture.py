@@ -10,6 +10,7 @@ Images are rendered without end, as for LineMOD; what a data set's authors publi
 * light is that of LineMOD: from the camera's half space, over an ambient radiance of 0.4.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -38,16 +39,23 @@ from curio_train.worlds.views import upper_views
 class Capture(GazeWorld):
     """One part before the camera that took a folder of photographs."""
 
-    def __init__(self, thing: Object, images: Path) -> None:
+    def __init__(self, thing: Object, images: Path, background: Path | None = None) -> None:
         """Nothing of the photographs is read before they are asked for."""
         super().__init__("capture", thing)
-        self._images = images
+        self._images, self._background = images, background
 
     def photographs(self, count: int) -> Tensor:
         """Spread over the folder, without the lens's distortion, in the canonical size."""
         paths = Photographs(self._images).paths
         chosen = [paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))]
-        frames = read_frames(chosen, self.object.camera, self.camera.width, self.camera.height)
+        return self._read(chosen)
+
+    def plate(self) -> Tensor | None:
+        """What ``--background`` shows, as the photographs come."""
+        return None if self._background is None else self._read([self._background])[0]
+
+    def _read(self, paths: Sequence[Path]) -> Tensor:
+        frames = read_frames(paths, self.object.camera, self.camera.width, self.camera.height)
         return torch.from_numpy(frames).float() / 255
 
 
@@ -83,7 +91,7 @@ def build(options: CaptureOptions) -> World:
         paints=any_paint if options.paint is None else paints_like(options.paint),
         known_scene=options.background is not None,
     )
-    return Capture(thing, options.photos)
+    return Capture(thing, options.photos, options.background)
 
 
 def _refuse_collision(options: CaptureOptions, mesh: Mesh) -> None:
