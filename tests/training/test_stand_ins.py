@@ -6,9 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from curio_train.camera import load_intrinsics
 from curio_train.capture import stand_in_scenes as scenes
 from curio_train.capture.sensor import Sensor
+from curio_train.capture.stand_in_boards import calibrated, photograph_boards
 from curio_train.capture.stand_ins import Amount, make
 from curio_train.data.meshes import load_mesh
 from curio_train.errors import DataError, UsageError
@@ -47,9 +47,17 @@ def test_cameras_stand_a_quarter_apart_and_are_known_but_for_small_errors(captur
     assert angle == pytest.approx(90, abs=1)
     off = Rotation.from_matrix(a[:3, :3] @ scenes.cam_from_world(0)[:3, :3].T).magnitude()
     assert 0 < np.degrees(off) < 1
-    camera = load_intrinsics(capture / "camera.json")
-    assert camera.matrix[0, 0] != scenes.FOCAL_PX
-    assert camera.matrix[0, 0] == pytest.approx(scenes.FOCAL_PX, rel=0.02)
+
+
+@pytest.mark.parametrize("name", scenes.NAMES)
+def test_cameras_are_calibrated_from_photographs_of_a_board(name: str, tmp_path: Path) -> None:
+    true, size = scenes.camera_matrix(name), scenes.frame_size(name)
+    photograph_boards(tmp_path, true, size, scenes.NAMES.index(name))
+    camera = calibrated(tmp_path)
+    assert (camera.width, camera.height) == size
+    off = np.abs(camera.matrix - true)
+    assert 0 < off[0, 0] < 0.02 * true[0, 0]
+    assert 0 < off[:2, 2].max() < 0.015 * size[0]
 
 
 def test_training_files_hold_no_labels(capture: Path) -> None:

@@ -7,7 +7,8 @@ directions 90° apart.
 * ``sphere_real``: three spheres, position and colour; cameras on tripods.
 * ``bunny``: one bunny-like figure, turned freely; the camera moves on an arc of 90° in ten steps.
 * ``shapes``: five to twelve capsules, boxes and cones that stand upright and are turned about their vertical axis.
-* ``part``: what a user would bring: one unpainted bracket that lies any way, one camera on a tripod.
+* ``part``: what a user would bring: one unpainted bracket that lies any way, one camera on a tripod, of more pixels
+  than the paper's networks see.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from curio_train.data.meshes import Mesh
 from curio_train.data.shapes import box, capsule, cone, sphere
 from curio_train.geometry import camera_looking_at
 
-WIDTH, HEIGHT, FOCAL_PX = 256, 192, 300.0
+FOCAL_WIDTHS = 300 / 256  # the focal length, in widths of a frame
 DISTANCE_M, ELEVATION_DEG = 0.75, 40.0
 NUM_STATIONS = 10
 _REACH_M = (0.2, 0.14)
@@ -162,9 +163,16 @@ def _free_place(taken: list[tuple[np.ndarray, float]], radius: float, random: np
     return None
 
 
-def camera_matrix() -> np.ndarray:
-    """The true K [3, 3], of an ideal lens."""
-    return np.array([[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1]])
+def frame_size(name: str) -> tuple[int, int]:
+    """Width and height of a scene's photographs, pixels."""
+    return (640, 480) if name == "part" else (256, 192)
+
+
+def camera_matrix(name: str) -> np.ndarray:
+    """The true K [3, 3] of a scene, of an ideal lens."""
+    width, height = frame_size(name)
+    focal = FOCAL_WIDTHS * width
+    return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
 
 
 def cam_from_world(azimuth_deg: float) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 ::
 
-    OUT/NAME/camera.json        as calibrated: focal length and centre are a little off
+    OUT/NAME/calibration/*.png  a chessboard held before the camera
+             camera.json        as calibrated from them: all of it a little off
              meshes/*.stl       metres, no colours
              photos/*.png       for training, from the first camera
              plates/a-*.png     the empty table from each place of the first camera; plates/b.png from the second
@@ -27,16 +28,16 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from curio_train.camera import Intrinsics
 from curio_train.capture import stand_in_scenes as scenes
 from curio_train.capture.camera_json import save_intrinsics
 from curio_train.capture.sensor import Sensor
+from curio_train.capture.stand_in_boards import calibrated, photograph_boards
 from curio_train.errors import DataError, UsageError
 from curio_train.rendering.standin import StandinScene, Thing
 
 _TABLE_M = 2.4
 _APERTURE_M = 0.005
-_FOCAL_ERROR, _CENTRE_ERROR_PX, _TURN_ERROR_DEG, _SHIFT_ERROR_M = 0.004, 0.8, 0.15, 0.001
+_TURN_ERROR_DEG, _SHIFT_ERROR_M = 0.15, 0.001
 _EXPOSURE = 0.9
 SECOND_CAMERA_DEG = 90.0
 
@@ -125,8 +126,8 @@ class _Taker:
             [Thing(mesh, scenes.colour(slot)) for slot, mesh in enumerate(meshes)],
             scenes.table_look(),
             _TABLE_M,
-            scenes.camera_matrix(),
-            (scenes.WIDTH, scenes.HEIGHT),
+            scenes.camera_matrix(name),
+            scenes.frame_size(name),
             focus_m=scenes.DISTANCE_M,
             aperture_m=_APERTURE_M,
             samples_per_pixel=samples_per_pixel,
@@ -145,16 +146,15 @@ class _Taker:
 
 def _describe(name: str, root: Path, shots: list[_Shot]) -> None:
     """Everything but the pictures; cheap enough to be written each time."""
-    for folder in ("meshes", "photos", "plates", "test/a", "test/b", "labels"):
+    for folder in ("calibration", "meshes", "photos", "plates", "test/a", "test/b", "labels"):
         (root / folder).mkdir(parents=True, exist_ok=True)
     for kind in scenes.kinds(name):
         shape = trimesh.Trimesh(kind.mesh.vertices_m, kind.mesh.faces, process=False)
         shape.export(root / "meshes" / f"{kind.name}.stl")
-    random = np.random.default_rng(scenes.NAMES.index(name))
-    calibrated = scenes.camera_matrix()
-    calibrated[[0, 1], [0, 1]] *= 1 + random.normal(0, _FOCAL_ERROR)
-    calibrated[:2, 2] += random.normal(0, _CENTRE_ERROR_PX, 2)
-    save_intrinsics(root / "camera.json", Intrinsics(calibrated, scenes.WIDTH, scenes.HEIGHT))
+    seed = scenes.NAMES.index(name)
+    photograph_boards(root / "calibration", scenes.camera_matrix(name), scenes.frame_size(name), seed)
+    save_intrinsics(root / "camera.json", calibrated(root / "calibration"))
+    random = np.random.default_rng(seed)
     measured = {azimuth: _measured(azimuth, random) for azimuth in dict.fromkeys(shot.azimuth_deg for shot in shots)}
     plates = {shot.azimuth_deg: shot.file for shot in shots if shot.scene_seed is None}
     views = {
@@ -180,7 +180,7 @@ def _measured(azimuth_deg: float, random: np.random.Generator) -> list[list[floa
 def _labels(name: str, shots: list[_Shot]) -> dict[str, Any]:
     """The true camera, and of each photograph the things in it with their poses cam_from_obj [4, 4], metres."""
     names = [kind.name for kind in scenes.kinds(name) for _ in range(kind.count)]
-    labels: dict[str, Any] = {"camera_matrix": scenes.camera_matrix().tolist(), "photographs": {}}
+    labels: dict[str, Any] = {"camera_matrix": scenes.camera_matrix(name).tolist(), "photographs": {}}
     for shot in shots:
         camera = scenes.cam_from_world(shot.azimuth_deg)
         labels["photographs"][shot.file] = [
