@@ -1,23 +1,30 @@
 """Image in, poses out: one loaded model over the regions of a frame. No gRPC here."""
 
-from collections.abc import Iterator, Sequence
-from itertools import chain
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from curio_proto.v1.detector_pb2 import (
     REGION_STATUS_DETECTED,
     REGION_STATUS_NO_OBJECT,
     REGION_STATUS_OUTSIDE_FRAME,
+    DetectResponse,
     RegionResult,
 )
 
 from curio_serve.camera import PinholeCamera
 from curio_serve.errors import ArgumentError, CameraMissing, ImageError
-from curio_serve.model import Model, Outputs, Slot
+from curio_serve.model import Model, Slot
 from curio_serve.rotation import quaternion_xyzw
 from curio_serve.view import FlatFrame, PinholeFrame, Region, View
 
+if TYPE_CHECKING:
+    from google.protobuf.internal.containers import RepeatedCompositeFieldContainer
+
+    Results = RepeatedCompositeFieldContainer[RegionResult]
+
 Array = np.ndarray
+Values = Mapping[str, Any]  # outputs of one image by name, as plain numbers
 _REDUCTIONS = (8, 4, 2)
 _MAX_BATCH = 8
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -38,7 +45,8 @@ class Detector:
         min_confidence: float = 0.0,
         max_detections: int | None = None,
         reduction: int = 1,
-    ) -> list[RegionResult]:
+        results: "Results | None" = None,
+    ) -> "Results":
         """Poses in one frame.
 
         Args:
@@ -48,6 +56,7 @@ class Detector:
             min_confidence: Detections below are left out; 0 … 1.
             max_detections: Most detections a region; None: all.
             reduction: How much smaller than the frame the pixels were decoded.
+            results: Those of an answer, to which these are added; None: of an answer that has none yet.
 
         Returns:
             One result a region, in order; detections most confident first.
@@ -61,26 +70,29 @@ class Detector:
         """
         _check_arguments(pixels, regions, min_confidence)
         frame = self._frame(pixels, camera, reduction)
-        looks = regions or [Region(0, 0, frame.width, frame.height)]
-        views = [frame.look(region) if region.overlaps(frame.width, frame.height) else None for region in looks]
-        answers = self._answers([view.image for view in views if view is not None])
-        results = []
+        views = [
+            frame.look(region) if region.overlaps(frame.width, frame.height) else None
+            for region in regions or [Region(0, 0, frame.width, frame.height)]
+        ]
+        answers = iter(self._answers([view.image for view in views if view is not None]))
+        results = DetectResponse().results if results is None else results
         for index, view in enumerate(views):
-            result = RegionResult(model=self.model.name, model_version=self.model.version, region=index)
+            result = results.add(model=self.model.name, model_version=self.model.version, region=index)
             if view is None:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
                 _fill(result, view, self.model.slots, next(answers), min_confidence, max_detections)
-            results.append(result)
         return results
 
-    def _answers(self, images: list[Array]) -> Iterator[Outputs]:
-        """The network's outputs for each image, computed a few at a time: memory stays flat however many there are."""
+    def _answers(self, images: list[Array]) -> list[Values]:
+        """What the network says of each image, computed a few at a time: memory stays flat however many there are."""
+        answers: list[Values] = []
         for start in range(0, len(images), _MAX_BATCH):
             batch = images[start : start + _MAX_BATCH]
             outputs = self.model.run(batch[0][None] if len(batch) == 1 else np.stack(batch))
-            for row in range(len(outputs["translation_m"])):
-                yield {name: value[row] for name, value in outputs.items()}
+            rows = zip(*(value.tolist() for value in outputs.values()), strict=True)
+            answers += [dict(zip(outputs, row, strict=True)) for row in rows]
+        return answers
 
     def reduction(self, camera: PinholeCamera | None, width: int, height: int) -> int:
         """How much smaller a frame may be decoded (1, 2, 4, 8) without going below the model's own resolution.
@@ -131,49 +143,40 @@ def _fill(
     result: RegionResult,
     view: View,
     slots: Sequence[Slot],
-    outputs: Outputs,
+    values: Values,
     min_confidence: float,
     max_detections: int | None,
 ) -> None:
     """Turn one image's outputs back into the frame's camera; write down the most confident, best first."""
-    values = {name: output.tolist() for name, output in outputs.items()}
     if "light" in values:
-        result.light.extend(view.turn(values["light"]))
-    confidences = (
-        [min(max(c, 0.0), 1.0) for c in values["confidence"]] if "confidence" in values else [1.0] * len(slots)
-    )
-    confident = [row for row in range(len(slots)) if confidences[row] >= min_confidence]
+        result.light.extend(view.turn([[value] for value in values["light"]]))
+    confidences = [min(max(c, 0.0), 1.0) for c in values.get("confidence", [1.0] * len(slots))]
+    confident = [row for row, confidence in enumerate(confidences) if confidence >= min_confidence]
     if not confident:
         result.status = REGION_STATUS_NO_OBJECT
         return
     result.status = REGION_STATUS_DETECTED
-    for row in sorted(confident, key=lambda row: -confidences[row])[:max_detections]:
+    confident.sort(key=confidences.__getitem__, reverse=True)
+    for row in confident[:max_detections]:
         translation = view.translation(values["translation_m"][row])
-        rotation = view.turn(list(chain.from_iterable(values["rotation"][row]))) if "rotation" in values else None
+        rotation = view.turn(values["rotation"][row]) if "rotation" in values else ()
         result.detections.add(
             object=slots[row].object,
             confidence=confidences[row],
             translation_m=translation,
+            rotation_6d=[*rotation[0::3], *rotation[1::3]],
+            rotation=rotation,
+            quaternion_xyzw=quaternion_xyzw(rotation) if rotation else (),
             color=values["color"][row] if "color" in values else (),
-            box_px=view.project(_placed(slots[row].box_corners, rotation, translation)),
-            **({} if rotation is None else _rotation_fields(rotation)),
+            box_px=view.project(_placed(slots[row].box_corners, rotation or _UPRIGHT, translation)),
         )
 
 
-def _rotation_fields(rows: Sequence[float]) -> dict[str, Sequence[float]]:
-    """A rotation, row after row, as the messages have it: so, as its first two columns, as a quaternion."""
-    return {
-        "rotation": rows,
-        "rotation_6d": [*rows[0::3], *rows[1::3]],
-        "quaternion_xyzw": quaternion_xyzw(rows),
-    }
-
-
 def _placed(
-    points: Sequence[Sequence[float]], rotation: Sequence[float] | None, translation: Sequence[float]
+    points: Sequence[Sequence[float]], rotation: Sequence[float], translation: Sequence[float]
 ) -> Sequence[Sequence[float]]:
     """An object's points in the frame's camera."""
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation or _UPRIGHT
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation
     x, y, z = translation
     return [
         (xx * a + xy * b + xz * c + x, yx * a + yy * b + yz * c + y, zx * a + zy * b + zz * c + z) for a, b, c in points

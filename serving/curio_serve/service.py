@@ -6,7 +6,6 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import TypeVar
@@ -103,7 +102,7 @@ class PoseService(PoseDetectorServicer):
     def _answer(
         self, request: messages.DetectRequest, caller: Caller, waited_s: float
     ) -> messages.DetectResponse | CurioError:
-        body = partial(self._detect, request, nullcontext(waited_s))
+        body = partial(self._detect_at_once, request, waited_s)
         return self._guard.attempt("Detect", request.request_id[:_MAX_ID_LENGTH], caller, body)
 
     def DetectStream(
@@ -123,7 +122,7 @@ class PoseService(PoseDetectorServicer):
     def _frame_of_stream(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
         """One frame's answer, or why it has none; only what ends the call ends the stream."""
         request_id = request.request_id[:_MAX_ID_LENGTH]
-        body = partial(self._detect, request, self._work.slot(context, always=True))
+        body = partial(self._detect_in_turn, request, context)
         answer = self._guard.attempt("DetectStream.frame", request_id, context, body)
         if isinstance(answer, CallEnded):
             context.abort_with_status(wire.status_from_error(answer))
@@ -155,17 +154,50 @@ class PoseService(PoseDetectorServicer):
         model = self._repository.get(request.model.name, request.model.version)
         return messages.GetModelResponse(spec=model.spec, version=model.version)
 
-    def _detect(self, request: messages.DetectRequest, slot: AbstractContextManager[float]) -> messages.DetectResponse:
-        self._check(request)
-        detectors = [Detector(self._repository.get(m.name, m.version)) for m in request.models]
-        with slot as waited_s:
-            answer = detect_frame(request, detectors, self._limits, waited_s)
+    def _detect_in_turn(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
+        detectors = self._detectors(request)
+        with self._work.slot(context, always=True) as waited_s:
+            return self._detect(request, detectors, waited_s)
+
+    def _detect_at_once(self, request: messages.DetectRequest, waited_s: float) -> messages.DetectResponse:
+        return self._detect(request, self._detectors(request), waited_s)
+
+    def _detect(
+        self, request: messages.DetectRequest, detectors: list[Detector], waited_s: float
+    ) -> messages.DetectResponse:
+        """Decode a request's frame and run the models on it.
+
+        Raises:
+            RequestError: The image, the camera or a region is not acceptable.
+            InternalError: A network failed.
+        """
+        begun = time.perf_counter()
+        limits = self._limits
+        camera = wire.camera_from_message(request.camera) if request.HasField("camera") else None
+        frame, camera = _decode(request, camera, detectors, limits)
+        decoded = time.perf_counter()
+        regions = list(map(wire.region_from_message, request.regions))
+        answer = messages.DetectResponse(
+            request_id=request.request_id or new_request_id(), width=frame.width, height=frame.height
+        )
+        for detector in detectors:
+            detector.detect(
+                frame.pixels,
+                camera,
+                regions=regions,
+                min_confidence=request.min_confidence if request.HasField("min_confidence") else limits.min_confidence,
+                max_detections=request.max_detections or None,
+                reduction=frame.reduction,
+                results=answer.results,
+            )
+        inferred = time.perf_counter()
         spent = answer.milliseconds
-        self._metrics.phases.observe(spent.queue / 1e3, spent.decode / 1e3, spent.inference / 1e3)
+        spent.queue, spent.decode, spent.inference = waited_s * 1e3, (decoded - begun) * 1e3, (inferred - decoded) * 1e3
+        self._metrics.phases.observe(waited_s, decoded - begun, inferred - decoded)
         return answer
 
-    def _check(self, request: messages.DetectRequest) -> None:
-        """Refuse what can be refused without work."""
+    def _detectors(self, request: messages.DetectRequest) -> list[Detector]:
+        """The models that a request names; refuses what can be refused without work."""
         limits = self._limits
         if not 1 <= len(request.models) <= limits.max_models:
             raise ArgumentError(
@@ -179,45 +211,12 @@ class PoseService(PoseDetectorServicer):
             raise ArgumentError(f"request_id has {len(request.request_id)} characters; at most {_MAX_ID_LENGTH}")
         if request.HasField("max_detections") and not request.max_detections:
             raise ArgumentError("max_detections is 0; leave it out for no limit, or give at least 1")
+        return [Detector(self._repository.get(model.name, model.version)) for model in request.models]
 
 
 def new_request_id() -> str:
     """32 hexadecimal digits, of this process and this request alone."""
     return f"{_ID_PREFIX}{next(_ID_NUMBERS):016x}"
-
-
-def detect_frame(
-    request: messages.DetectRequest, detectors: list[Detector], limits: Limits, waited_s: float
-) -> messages.DetectResponse:
-    """Decode a request's frame and run the models on it.
-
-    Raises:
-        RequestError: The image, the camera or a region is not acceptable.
-        InternalError: A network failed.
-    """
-    begun = time.perf_counter()
-    camera = wire.camera_from_message(request.camera) if request.HasField("camera") else None
-    frame, camera = _decode(request, camera, detectors, limits)
-    decoded = time.perf_counter()
-    regions = [wire.region_from_message(region) for region in request.regions]
-    answer = messages.DetectResponse(
-        request_id=request.request_id or new_request_id(), width=frame.width, height=frame.height
-    )
-    for detector in detectors:
-        answer.results.extend(
-            detector.detect(
-                frame.pixels,
-                camera,
-                regions=regions,
-                min_confidence=request.min_confidence if request.HasField("min_confidence") else limits.min_confidence,
-                max_detections=request.max_detections or None,
-                reduction=frame.reduction,
-            )
-        )
-    answer.milliseconds.queue = waited_s * 1e3
-    answer.milliseconds.decode = (decoded - begun) * 1e3
-    answer.milliseconds.inference = (time.perf_counter() - decoded) * 1e3
-    return answer
 
 
 def _decode(
@@ -237,6 +236,6 @@ def _decode(
         max_reduction=min(reductions),
         apply_exif_rotation=request.apply_exif_rotation,
     )
-    if camera is not None:
+    if camera is not None and frame.quarter_turns:
         camera = camera.turned(frame.quarter_turns, header.width, header.height)
     return frame, camera

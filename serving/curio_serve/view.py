@@ -25,6 +25,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -37,8 +38,7 @@ Array = np.ndarray
 _MIN_RAY_DEPTH = 0.05  # cosine to the optical axis: 87 degrees
 
 
-@dataclass(frozen=True)
-class Region:
+class Region(NamedTuple):
     """A rectangle in pixels of the full-size frame; x = 0, width = 640 covers exactly a frame 640 pixels wide."""
 
     x: float
@@ -100,8 +100,8 @@ class View(ABC):
         """A position (3) of the model as a position in the frame's camera (or widths of the frame)."""
 
     @abstractmethod
-    def turn(self, found: Sequence[float]) -> Sequence[float]:
-        """A matrix of three rows, row after row, in the frame's camera: a rotation (9), or a light (3)."""
+    def turn(self, found: Sequence[Sequence[float]]) -> Sequence[float]:
+        """A matrix of three rows in the frame's camera, row after row: a rotation (9), or a light (3)."""
 
     @abstractmethod
     def project(self, points: Sequence[Sequence[float]]) -> Sequence[float]:
@@ -118,11 +118,11 @@ class PinholeView(View):
         self._camera = camera
 
     def translation(self, found: Sequence[float]) -> Sequence[float]:
-        return self.turn(found)
+        x, y, z = found
+        return [a * x + b * y + c * z for a, b, c in self._cam_from_canonical]
 
-    def turn(self, found: Sequence[float]) -> Sequence[float]:
-        width = len(found) // 3
-        columns = list(zip(found[:width], found[width : 2 * width], found[2 * width :], strict=True))
+    def turn(self, found: Sequence[Sequence[float]]) -> Sequence[float]:
+        columns = list(zip(*found, strict=True))
         return [a * x + b * y + c * z for a, b, c in self._cam_from_canonical for x, y, z in columns]
 
     def project(self, points: Sequence[Sequence[float]]) -> Sequence[float]:
@@ -145,8 +145,8 @@ class FlatView(View):
         y = region.y + region.height * (found[1] * canonical_width / canonical_height + 0.5)
         return (x - width / 2) / width, (y - height / 2) / width, 0.0
 
-    def turn(self, found: Sequence[float]) -> Sequence[float]:
-        return found
+    def turn(self, found: Sequence[Sequence[float]]) -> Sequence[float]:
+        return [value for row in found for value in row]
 
     def project(self, points: Sequence[Sequence[float]]) -> Sequence[float]:
         width, height = self._frame_size

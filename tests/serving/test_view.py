@@ -80,7 +80,7 @@ def test_poses_come_back(region: Region) -> None:
         np.testing.assert_allclose(view.translation((turn @ position).tolist()), position, atol=1e-12)
     rotations = np.stack([np.eye(3), smallest_rotation(np.array([0, 0, 1.0]), np.array([0.6, 0, 0.8]))])
     for rotation in rotations:
-        np.testing.assert_allclose(view.turn((turn @ rotation).ravel().tolist()), rotation.ravel(), atol=1e-12)
+        np.testing.assert_allclose(view.turn((turn @ rotation).tolist()), rotation.ravel(), atol=1e-12)
 
 
 def test_a_region_brings_its_centre_to_the_middle() -> None:
