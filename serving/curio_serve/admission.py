@@ -93,9 +93,10 @@ class WorkQueue:
             Overloaded: There is none.
         """
         with self._lock:
-            self._drop_old_promises()
-            if len(self._promised) + len(self._waiting) >= self._max_waiting + self._num_free:
-                self._refuse()
+            if not self._has_place():
+                self._drop_old_promises()
+                if not self._has_place():
+                    self._refuse()
             self._promised[waiter] = time.monotonic()
 
     def enter(self, waiter: Waiter, *, always: bool = False) -> bool:
@@ -177,6 +178,9 @@ class WorkQueue:
         if is_told:
             raise hung_up_in_queue()
         raise passed_in_queue(remaining_s or 0.0)
+
+    def _has_place(self) -> bool:
+        return len(self._promised) + len(self._waiting) < self._max_waiting + self._num_free
 
     def _drop_old_promises(self) -> None:
         end = time.monotonic() - _PROMISE_S

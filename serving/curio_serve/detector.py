@@ -90,7 +90,7 @@ class Detector:
         for start in range(0, len(images), _MAX_BATCH):
             batch = images[start : start + _MAX_BATCH]
             outputs = self.model.run(batch[0][None] if len(batch) == 1 else np.stack(batch))
-            rows = zip(*(value.tolist() for value in outputs.values()), strict=True)
+            rows = zip(*[value.tolist() for value in outputs.values()], strict=True)
             answers += [dict(zip(outputs, row, strict=True)) for row in rows]
         return answers
 

@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Protocol
 
 import grpc
@@ -83,21 +82,22 @@ class DirectCalls:
             refuse_caller: Given a call's metadata, why it may not be made, if so.
         """
         self._server: Any = server._cy_server  # type: ignore[attr-defined]
-        self._events, self._work, self._methods = events, work, methods
+        self._events, self._work = events, work
+        self._begun = {method.path: Handler(self._begin, method) for method in methods}
         self._max_calls, self._refuse_caller = max_calls, refuse_caller
         self._open: set[_Call] = set()
         self.is_stopping, self._all_ended = False, threading.Event()
-        for method in methods:
-            self._server.register_method(method.path)
+        for path in self._begun:
+            self._server.register_method(path)
         self._listeners = Listeners(events, work.num_slots, self.work_on, self.hand_over)
         # For calls that get the slot of a thread with other duties; see _Call.tell.
         self._spare = ThreadPoolExecutor(work.num_slots, thread_name_prefix="curio-spare")
 
     def start(self) -> None:
         """Begin to answer; the server must have been started."""
-        for method in self._methods:
+        for path in self._begun:
             for _ in range(self._work.num_slots + 1):
-                self._expect(method)
+                self._expect(path)
         self._listeners.start()
 
     def stop(self) -> None:
@@ -111,10 +111,10 @@ class DirectCalls:
         self._listeners.stop()
         self._spare.shutdown()
 
-    def _expect(self, method: Method) -> None:
+    def _expect(self, path: str) -> None:
         """Have gRPC tell of one more call."""
         try:
-            self._server.request_registered_call(self._events, self._events, method.path, Handler(self._begin, method))
+            self._server.request_registered_call(self._events, self._events, path, self._begun[path])
         except ValueError:  # the server is being stopped
             return
 
@@ -122,10 +122,14 @@ class DirectCalls:
         """A call has come, its message not yet."""
         if not event.success:  # the server is being stopped
             return
-        self._expect(method)
-        with _Call(self, method, event.call, event.call_details.deadline) as call:
-            self._open.add(call)
+        self._expect(method.path)
+        call = _Call(self, method, event.call, event.call_details.deadline)
+        self._open.add(call)
+        try:
             self._admit(call, event)
+        except BaseException:
+            call.break_off()
+            raise
 
     def _admit(self, call: "_Call", event: Any) -> None:
         """Ask for a call's message, if there may be a place for it."""
@@ -146,7 +150,7 @@ class DirectCalls:
 
     def _received(self, call: "_Call", event: Any) -> "_Call | None":
         """A call's message has come; the call, if it has a slot."""
-        with call:
+        try:
             data = event.batch_operations[0].message()
             if data is None:
                 self._work.withdraw(call)
@@ -161,6 +165,9 @@ class DirectCalls:
             except Overloaded as exc:
                 call.refuse(exc)
                 return None
+        except BaseException:
+            call.break_off()
+            raise
 
     def work_on(self, call: "_Call") -> None:
         """Answer a call that has a slot, then those that get the slot after it."""
@@ -174,9 +181,11 @@ class DirectCalls:
         begun = time.monotonic()
         is_answered = False
         try:
-            with call:
-                call.answer(begun)
+            call.answer(begun)
             is_answered = True
+        except BaseException:
+            call.break_off()
+            raise
         finally:
             following = self._work.leave(time.monotonic() - begun)
             if following is not None and not (is_answered and isinstance(following, _Call)):
@@ -215,15 +224,11 @@ class _Call:
         self._since = time.monotonic()
         self.data = b""
 
-    def __enter__(self) -> "_Call":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, _error: object, _traceback: TracebackType | None) -> None:
-        """End the call if a fault of ours has come up."""
-        if kind is not None:
-            self._calls.withdraw(self)
-            self._calls.forget(self)
-            self._call.cancel()
+    def break_off(self) -> None:
+        """End the call because a fault of ours has come up."""
+        self._calls.withdraw(self)
+        self._calls.forget(self)
+        self._call.cancel()
 
     def peer(self) -> str:
         address: bytes = self._call.peer()

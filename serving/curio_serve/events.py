@@ -24,6 +24,8 @@ _ENDS = (cygrpc.CompletionType.queue_timeout, cygrpc.CompletionType.queue_shutdo
 class Handler(partial[Any]):
     """What is called with an event that is ours: the tag of everything that we ask gRPC to do."""
 
+    __slots__ = ()
+
 
 class Events(cygrpc.CompletionQueue):
     """The one queue of a server's events."""
