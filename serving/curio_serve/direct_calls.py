@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from types import TracebackType
 from typing import Any, Protocol
 
 import grpc
@@ -123,13 +124,9 @@ class DirectCalls:
         if not event.success:  # the server is being stopped
             return
         self._expect(method.path)
-        call = _Call(self, method, event.call, event.call_details.deadline)
-        self._open.add(call)
-        try:
+        with _Call(self, method, event.call, event.call_details.deadline) as call:
+            self._open.add(call)
             self._admit(call, event)
-        except BaseException:
-            call.break_off()
-            raise
 
     def _admit(self, call: "_Call", event: Any) -> None:
         """Ask for a call's message, if there may be a place for it."""
@@ -150,7 +147,7 @@ class DirectCalls:
 
     def _received(self, call: "_Call", event: Any) -> "_Call | None":
         """A call's message has come; the call, if it has a slot."""
-        try:
+        with call:
             data = event.batch_operations[0].message()
             if data is None:
                 self._work.withdraw(call)
@@ -165,9 +162,6 @@ class DirectCalls:
             except Overloaded as exc:
                 call.refuse(exc)
                 return None
-        except BaseException:
-            call.break_off()
-            raise
 
     def work_on(self, call: "_Call") -> None:
         """Answer a call that has a slot, then those that get the slot after it."""
@@ -183,10 +177,9 @@ class DirectCalls:
         try:
             call.answer(begun)
             is_answered = True
-        except BaseException:
-            call.break_off()
-            raise
         finally:
+            if not is_answered:
+                call.break_off()
             following = self._work.leave(time.monotonic() - begun)
             if following is not None and not (is_answered and isinstance(following, _Call)):
                 following.tell()
@@ -223,6 +216,13 @@ class _Call:
         self._is_watched = False
         self._since = time.monotonic()
         self.data = b""
+
+    def __enter__(self) -> "_Call":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, _error: object, _traceback: TracebackType | None) -> None:
+        if kind is not None:
+            self.break_off()
 
     def break_off(self) -> None:
         """End the call because a fault of ours has come up."""
