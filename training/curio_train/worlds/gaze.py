@@ -29,7 +29,7 @@ from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
 from curio_train.data.augmentation import WHOLE_FRAME, Disturbance
 from curio_train.data.backgrounds import Backgrounds
-from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.metrics.poses import ADD_THRESHOLD, symmetry_poses
 from curio_train.networks.crop import SURFACE, SURFACE_SHARE, CropNetwork
 from curio_train.networks.gaze import GazeNetwork, Optics
@@ -64,6 +64,8 @@ _PLACE_SCALE_PX = 2.0  # of the first look's pixels: what counts as near
 _DEPTH_SCALE = 0.1  # of the logarithm
 _NUM_POINTS = 128
 _DEPTH_WEIGHT = 3.0  # a share of the distance is several diameters: what ADD fails on first
+_NUMBERS_WEIGHT = 0.5
+_SURFACE_WEIGHT = 3.0  # it teaches what the rotation is read from
 _LIGHT_WEIGHT = 0.05
 _COLOR_WEIGHT = 0.1  # light and exposure leave it uncertain
 _CONFIDENCE_WEIGHT = 0.2
@@ -227,19 +229,22 @@ class SecondLook(SingleObjectWorld):
         """How far the model's points are displaced by the rotation, in diameters, beside offset, scale and light.
 
         Of poses that look alike the one nearest to the prediction is the true one. Where there is no object only
-        confidence and the surface count.
+        confidence and the surface count. The six numbers of the rotation count as they are, too: while nothing is
+        known of it no rotation displaces less than another, but numbers near zero do err less than others.
         """
         there = true[CONFIDENCE][:, 0, 0]
         found, wanted = (matrix_from_rotation_6d(code[ROTATION_6D][:, 0]) for code in (predicted, true))
         alike = (wanted[:, None] @ self._turns.to(wanted))[:, :, None]  # [batch, symmetries, 1, 3, 3]
         points = self._points.to(wanted)[..., None]
         between = ((found[:, None, None] @ points) - (alike @ points)).squeeze(-1)
-        displaced = between.norm(dim=-1).mean(dim=-1).amin(dim=1)
+        displaced, nearest = between.norm(dim=-1).mean(dim=-1).min(dim=1)
+        wanted_6d = rotation_6d_from_matrix(alike[torch.arange(len(nearest)), nearest, 0])
+        numbers = (predicted[ROTATION_6D][:, 0] - wanted_6d).square().sum(dim=-1)
         place, true_place = predicted[TRANSLATION][:, 0], true[TRANSLATION][:, 0]
         offset = (place[:, :2] / place[:, 2:] - true_place[:, :2] / true_place[:, 2:]).norm(dim=-1)
         scale = (place[:, 2].log() - true_place[:, 2].log()).abs()
         light = (predicted[LIGHT] - true[LIGHT]).norm(dim=-1)
-        pose = displaced + offset + _DEPTH_WEIGHT * scale + _LIGHT_WEIGHT * light
+        pose = displaced + _NUMBERS_WEIGHT * numbers + offset + _DEPTH_WEIGHT * scale + _LIGHT_WEIGHT * light
         if COLOR in self.layout:
             pose = pose + _COLOR_WEIGHT * (predicted[COLOR] - true[COLOR])[:, 0].abs().mean(dim=-1)
         shift = self._metres(place, true[ASSUMED_M]) - self._metres(true_place, true[ASSUMED_M])
@@ -247,7 +252,8 @@ class SecondLook(SingleObjectWorld):
         right = (add < ADD_THRESHOLD).to(there) * there
         sure = F.binary_cross_entropy(predicted[CONFIDENCE][:, 0, 0].clamp(1e-6, 1 - 1e-6), right)
         pose_loss = (pose * there).sum() / there.sum().clamp(min=1)
-        return pose_loss + _CONFIDENCE_WEIGHT * sure + self._surface_loss(predicted[SURFACE], true)
+        surface = self._surface_loss(predicted[SURFACE], true)
+        return pose_loss + _CONFIDENCE_WEIGHT * sure + _SURFACE_WEIGHT * surface
 
     def _surface_loss(self, surface: Float[Tensor, "batch 4 side side"], true: SceneCode) -> Float[Tensor, ""]:
         """Whether each patch sees the object, and where it does, which point of it (mean absolute coordinate error)."""
