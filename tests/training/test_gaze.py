@@ -159,10 +159,9 @@ def test_surface_points_project_to_the_patches_that_see_them(world: GazeWorld) -
     place = second._metres(code[TRANSLATION][:, 0], code[ASSUMED_M])
     matrices = second._matrices(code, 32)
     points, seen = surface_map(rotation, place, matrices)
-    inside = -torch.nn.functional.max_pool2d(-seen[:, None].float(), 3, 1, 1)[:, 0] > 0  # edges mix with the void
-    assert inside.sum() > 400
+    assert seen.sum() > 500
     for image in range(8):
-        v, u = torch.nonzero(inside[image], as_tuple=True)
+        v, u = torch.nonzero(seen[image], as_tuple=True)  # those at the rim, too
         metres = points[image][:, v, u].T * surface_map.half_extent_m + torch.from_numpy(surface_map.center_m).float()
         camera = metres @ rotation[image].T + place[image]
         pixels = project(camera[None], torch.from_numpy(matrices[image]).float()[None])[0]

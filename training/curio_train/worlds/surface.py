@@ -13,7 +13,7 @@ from curio_train.rendering.renderer import Renderer, linear_from_srgb
 _MIDDLE, _REACH = 0.55, 0.4
 """Coordinates are stored as linear colours from 0.15 to 0.95: never 0, which is where nothing is seen."""
 
-_LEAST_SEEN = 0.1
+_LEAST_SEEN = 0.5  # of a patch's area
 
 
 class SurfaceMap:
@@ -47,19 +47,24 @@ class SurfaceMap:
             matrices: K of each image, [batch, 3, 3], in patches.
 
         Returns:
-            Coordinates in half extents from the middle of the box, −1 to 1; where the object is not seen they mean
-            nothing.
+            Coordinates in half extents from the middle of the box, −1 to 1, of what a patch sees of the object however
+            little that is; where it is not seen they mean nothing. And where it fills half of a patch or more.
         """
+        over_black, over_white = (self._draw(rotation, translation_m, matrices, shade) for shade in (0.0, 1.0))
+        share = (1 - (over_white - over_black).mean(dim=1, keepdim=True)).clamp(min=1e-3)
+        linear = linear_from_srgb((over_black / share).clamp(0, 1))
+        return (linear - _MIDDLE) / _REACH, share[:, 0] >= _LEAST_SEEN
+
+    def _draw(self, rotation: Tensor, translation_m: Tensor, matrices: np.ndarray, shade: float) -> Tensor:
         count = len(rotation)
-        image = self._renderer(
+        return self._renderer(
             rotation[:, None],
             translation_m[:, None],
             camera_matrix=matrices,
-            backgrounds=translation_m.new_zeros(count, 3, self._side, self._side),
+            backgrounds=translation_m.new_full((count, 3, self._side, self._side), shade),
             light=translation_m.new_tensor([[0.0, 0.0, -1e-6]]).expand(count, 3),
+            seed=0,  # both pictures have their samples in the same places
         )
-        linear = linear_from_srgb(image)
-        return (linear - _MIDDLE) / _REACH, linear.amin(dim=1) > _LEAST_SEEN
 
 
 def _srgb_from_linear(linear: np.ndarray) -> np.ndarray:
