@@ -69,15 +69,17 @@ def errors(found: SceneCode, true: SceneCode) -> np.ndarray:
     return np.array(add_errors(poses(found), poses(true), MESH.vertices_m, ModelInfo(MESH.diameter_m)))
 
 
-def test_estimates_come_at_least_half_way_to_the_truth(
+def test_most_estimates_come_most_of_the_way_to_the_truth(
     refinement: Refinement, scenes: tuple[Tensor, Tensor, SceneCode]
 ) -> None:
+    """One of six may end in another pose that explains as much: the search is a local one."""
     images, _, true = scenes
     estimate = off(true)
     found = refinement(images, estimate)
     before, after = errors(estimate, true), errors(found, true)
     assert before.min() > 0.1
-    assert after.mean() < 0.5 * before.mean(), (before, after)
+    assert np.median(after) < 0.25 * np.median(before), (before, after)
+    assert (after < before).sum() >= NUM - 1, (before, after)
     rotation = matrix_from_rotation_6d(found[ROTATION_6D][:, 0])
     assert torch.allclose(rotation @ rotation.transpose(1, 2), torch.eye(3).expand(NUM, 3, 3), atol=1e-5)
     assert all(torch.equal(found[name], estimate[name]) for name in estimate.keys() - {TRANSLATION, ROTATION_6D})
