@@ -1,8 +1,6 @@
 """What colour a part has whose CAD file says none: where photographs of it differ from the empty scene's.
 
-No label is needed. Each photograph is brought to the plate's exposure and compared with it: what clearly differs is the
-part and its shadow, and what is merely darker than the plate, in the plate's own tint, is the shadow. A colour is
-believed where the photographs agree on it.
+No label is needed (:mod:`~curio_train.data.plate_difference`). A colour is believed where the photographs agree on it.
 """
 
 from collections.abc import Sequence
@@ -16,16 +14,15 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.data.meshes import Mesh
 from curio_train.data.photographs import Photographs, read_frame, read_frames
+from curio_train.data.plate_difference import compare
 from curio_train.rendering.color import linear_from_srgb, srgb_from_linear
 
 _WIDTH_PX = 160
 _MOST_COMPARED = 64
 _FEWEST = 3
 _FEWEST_SHARE = 0.25  # of the photographs compared
-_LEAST_DIFFERENCE, _DEVIATIONS = 0.08, 6.0  # sRGB; what noise, vignettes and drifting light do not reach
 _CLEARLY = 0.5  # of the strongest difference: a shadow beside a part is weaker
 _LEAST_AREA, _LARGEST_AREA = 0.001, 0.4  # of the frame
-_SHADOW_TINT = 0.25  # how far the logarithms of a shadow's three ratios to the plate may lie apart
 _LEAST_UNSHADED = 0.2  # of all that differs; below it the part itself is a grey like a shadow
 _WELL_LIT = 0.9  # quantile of the photographs' values: shadows darken some, nothing makes paint lighter
 _LARGEST_SPREAD = 0.12  # of the photographs' tints, as shares of the largest channel
@@ -88,25 +85,17 @@ def _agreed(colors: Sequence[np.ndarray]) -> np.ndarray | None:
 
 def _color_of_piece(frame: np.ndarray, plate: np.ndarray) -> np.ndarray | None:
     """Linear colour [3] of what two uint8 sRGB pictures [height, width, 3] differ in; None if nothing, or all."""
-    light, empty = (linear_from_srgb(torch.from_numpy(picture / 255.0)).numpy() for picture in (frame, plate))
-    ratio = (light + 1e-3) / (empty + 1e-3)
-    ratio /= np.median(ratio, axis=(0, 1))  # exposure and white balance drift between photographs
-    evened = srgb_from_linear(torch.from_numpy(empty * ratio)).numpy()
-    difference = np.abs(evened - plate / 255.0).max(axis=2)
-    level = np.median(difference)
-    noise = 1.4826 * np.median(np.abs(difference - level))
-    differs = difference > max(_LEAST_DIFFERENCE, level + _DEVIATIONS * noise)
+    photograph, empty = (torch.from_numpy(picture / 255.0).permute(2, 0, 1) for picture in (frame, plate))
+    difference, differs, shaded = (found[0].numpy() for found in compare(photograph[None], empty))
     if not differs.any():
         return None
     differs &= difference > _CLEARLY * np.quantile(difference[differs], 0.95)
-    logs = np.log(ratio.clip(1e-3))
-    shaded = (np.ptp(logs, axis=2) < _SHADOW_TINT) & (logs.mean(axis=2) < 0)
     whole, part = _largest_piece(differs), _largest_piece(differs & ~shaded)
     if part.sum() < _LEAST_UNSHADED * whole.sum():
         part = whole
     if not _LEAST_AREA < part.mean() < _LARGEST_AREA:
         return None
-    pixels = light[part]
+    pixels = linear_from_srgb(photograph).permute(1, 2, 0).numpy()[part]
     bright = pixels.sum(axis=1)
     color: np.ndarray = pixels[bright >= np.median(bright)].mean(axis=0)
     return color

@@ -25,9 +25,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from curio_train.data.plate_difference import compare
 from curio_train.evaluation.refinement import filled_in
 from curio_train.metrics.images import blurred
-from curio_train.rendering.color import linear_from_srgb, srgb_from_linear
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
 
@@ -36,9 +36,6 @@ _AROUND = 12 / 256  # of the frame's width: how far around the silhouette; 6 / 2
 _SCALE = 0.2  # sRGB difference that counts half; 0.1 told less
 _GAINS = (0.5, 2.0)
 _DARKEST = 0.02  # of a rendering's pixels that a gain is read from
-_LEAST_DIFFERENCE, _DEVIATIONS = 0.08, 6.0  # these three as in part_color.py, where they are explained
-_SHADOW_TINT = 0.25
-_LEAST_LIGHT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,26 +123,11 @@ def overlap(silhouette: Tensor, differing: Tensor) -> Float[Tensor, " num"]:
 def differing(photographs: Tensor, plate: Tensor) -> Bool[Tensor, "num height width"]:
     """Where photographs clearly differ from the empty scene, shadows on it and speckles left out.
 
-    As in :mod:`~curio_train.data.part_color`, of which it keeps all pieces: each photograph is brought to the plate's
-    exposure, and what is merely darker in the plate's own tint is shadow.
-
     Args:
         photographs: [num, 3, height, width], sRGB in [0, 1].
         plate: [3, height, width], likewise.
     """
-    light, empty = linear_from_srgb(photographs), linear_from_srgb(plate)
-    ratio = (light + _LEAST_LIGHT) / (empty + _LEAST_LIGHT)
-    ratio = ratio / ratio.flatten(2).median(dim=2).values[..., None, None]
-    difference = (srgb_from_linear(empty * ratio) - plate).abs().amax(dim=1)
-    level = _median(difference)
-    limit = (level + _DEVIATIONS * 1.4826 * _median((difference - level).abs())).clamp(min=_LEAST_DIFFERENCE)
-    logs = ratio.clamp(min=_LEAST_LIGHT).log()
-    shaded = (logs.amax(dim=1) - logs.amin(dim=1) < _SHADOW_TINT) & (logs.mean(dim=1) < 0)
-    masks = ((difference > limit) & ~shaded).numpy().astype(np.uint8)
+    found = compare(photographs, plate)
+    masks = (found.differs & ~found.shaded).numpy().astype(np.uint8)
     opened = [cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) for mask in masks]
     return torch.from_numpy(np.stack(opened)).bool()
-
-
-def _median(images: Tensor) -> Float[Tensor, "num 1 1"]:
-    """Of each image."""
-    return images.flatten(1).median(dim=1).values[:, None, None]
