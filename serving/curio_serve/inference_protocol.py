@@ -55,7 +55,8 @@ class InferenceService(GRPCInferenceServiceServicer):
     def direct(self) -> Method:
         """``ModelInfer``, for :mod:`curio_serve.direct_calls`."""
         refused = partial(self._guard.refused, "ModelInfer", "")
-        return Method("/inference.GRPCInferenceService/ModelInfer", messages.ModelInferRequest, self._answer, refused)
+        kind = messages.ModelInferRequest
+        return Method("/inference.GRPCInferenceService/ModelInfer", kind, kind.FromString, self._answer, refused)
 
     def _answer(
         self, request: messages.ModelInferRequest, caller: Caller, _waited_s: float
