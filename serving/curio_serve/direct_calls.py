@@ -50,14 +50,12 @@ class Method:
     Attributes:
         path: As gRPC knows it: ``/package.Service/Method``.
         request: Type of its message.
-        read: Parses it; what comes of it is given to ``answer``. Raises ``DecodeError``.
-        answer: Called with that, who sent it and the seconds it waited, on a thread that holds a slot.
+        answer: Called with the message, who sent it and the seconds it waited, on a thread that holds a slot.
         refused: Told of calls that end without having been answered.
     """
 
     path: str
     request: type[Message]
-    read: Callable[[bytes], Any]
     answer: Callable[[Any, Caller, float], Message | CurioError]
     refused: Callable[[CurioError, Caller], None]
 
@@ -262,10 +260,11 @@ class _Call:
         if time.time() >= self._deadline:
             self.refuse(passed_in_queue(now - self._since))
             return
+        kind = self._method.request
         try:
-            request = self._method.read(self.data)
+            request = kind.FromString(self.data)
         except DecodeError:
-            self.send_error(unreadable(self._method.request, len(self.data)))
+            self.send_error(unreadable(kind, len(self.data)))
             return
         self.data = b""
         answer = self._method.answer(request, self, now - self._since)

@@ -61,7 +61,7 @@ def check_size(width: int, height: int, max_pixels: int = MAX_PIXELS) -> None:
         )
 
 
-def open_header(data: bytes | memoryview, max_pixels: int = MAX_PIXELS) -> Header:
+def open_header(data: bytes, max_pixels: int = MAX_PIXELS) -> Header:
     """Header of an encoded image that is fit to be decoded.
 
     Raises:
@@ -75,7 +75,7 @@ def open_header(data: bytes | memoryview, max_pixels: int = MAX_PIXELS) -> Heade
 
 
 def decode(
-    data: bytes | memoryview,
+    data: bytes,
     *,
     header: Header | None = None,
     max_pixels: int = MAX_PIXELS,
@@ -121,7 +121,7 @@ def _reduction(header: Header, max_reduction: int) -> int:
     return next(fitting, 1)
 
 
-def _decode_pixels(data: bytes | memoryview, header: Header, reduction: int) -> np.ndarray:
+def _decode_pixels(data: bytes, header: Header, reduction: int) -> np.ndarray:
     buffer = np.frombuffer(data, np.uint8)
     try:
         pixels = cv2.imdecode(buffer, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)

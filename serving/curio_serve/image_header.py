@@ -4,7 +4,6 @@ A decoder told to open a file of 140 kB may allocate 432 MB; so size, colour mod
 are read here first, and what is not acceptable never reaches the decoder.
 """
 
-import re
 import struct
 from dataclasses import dataclass
 from typing import Literal
@@ -17,7 +16,6 @@ _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _EXIF_ORIENTATION = 0x0112
 _SOF_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _PROGRESSIVE = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
-_JPEG_END = b"\xff\xd9"
 _BARE_MARKERS = frozenset(range(0xD0, 0xD8)) | {0x01}
 MAX_JPEG_SCANS = 64
 
@@ -41,8 +39,8 @@ class Header:
     orientation: int = 1
 
 
-def read_header(data: bytes | memoryview) -> Header:
-    """Read the declared size and kind of an encoded image and check that its end is there; nothing large is copied.
+def read_header(data: bytes) -> Header:
+    """Read the declared size and kind of an encoded image and check that its end is there.
 
     Raises:
         ImageError: Empty, none of JPEG, PNG and WebP, damaged, or cut short.
@@ -63,7 +61,7 @@ def read_header(data: bytes | memoryview) -> Header:
     )
 
 
-def _read_jpeg(data: bytes | memoryview) -> Header:
+def _read_jpeg(data: bytes) -> Header:
     """Walk the marker segments up to the first scan (ITU-T T.81, annex B)."""
     size: tuple[int, int, int] | None = None
     is_progressive, orientation, position = False, 1, 2
@@ -76,7 +74,7 @@ def _read_jpeg(data: bytes | memoryview) -> Header:
         if marker == 0xD9:
             raise ImageError("the JPEG has no picture data: its end marker comes before a scan")
         (length,) = struct.unpack_from(">H", data, position)
-        segment = bytes(data[position + 2 : position + length])
+        segment = data[position + 2 : position + length]
         if length < 2 or len(segment) != length - 2:
             raise ImageError(f"the JPEG ends inside a header segment ({len(data)} bytes); send the whole file")
         if marker in _SOF_MARKERS:
@@ -96,7 +94,7 @@ def _read_jpeg(data: bytes | memoryview) -> Header:
     return Header("jpeg", *size, orientation)
 
 
-def _next_marker(data: bytes | memoryview, position: int) -> tuple[int, int]:
+def _next_marker(data: bytes, position: int) -> tuple[int, int]:
     if data[position] != 0xFF:
         raise ImageError(f"the JPEG is damaged: no marker at byte {position}; send the file again")
     while data[position] == 0xFF:
@@ -104,26 +102,26 @@ def _next_marker(data: bytes | memoryview, position: int) -> tuple[int, int]:
     return data[position], position + 1
 
 
-def _check_jpeg_end(data: bytes | memoryview, first_scan: int) -> None:
+def _check_jpeg_end(data: bytes, first_scan: int) -> None:
     """Refuse a picture without its end: decoders fill in grey.
 
     In entropy-coded data 0xFF is followed by 0 or a restart marker alone, so this byte pair is a true marker there.
     """
-    if data[-2:] != _JPEG_END and not re.compile(_JPEG_END).search(data, first_scan):
+    if data.rfind(b"\xff\xd9", first_scan) < 0:
         raise ImageError(f"the JPEG is cut short: no end marker in its {len(data)} bytes; send the whole file")
 
 
-def _check_jpeg_scans(data: bytes | memoryview, first_scan: int) -> None:
+def _check_jpeg_scans(data: bytes, first_scan: int) -> None:
     """Refuse absurdly many scans, each of which costs a pass over the picture.
 
     Decoders read further scans only in files that are progressive or whose first scan has not all components.
     """
-    num_scans = 1 + bytes(data[first_scan:]).count(b"\xff\xda")
+    num_scans = 1 + data.count(b"\xff\xda", first_scan)
     if num_scans > MAX_JPEG_SCANS:
         raise ImageError(f"the JPEG has {num_scans} scans; at most {MAX_JPEG_SCANS} are accepted: save it as baseline")
 
 
-def _read_png(data: bytes | memoryview) -> Header:
+def _read_png(data: bytes) -> Header:
     """Walk the chunks to IEND (W3C PNG, section 5)."""
     width, height, _depth, color_type = struct.unpack_from(">IIBB", data, 16)
     if data[12:16] != b"IHDR":
@@ -135,24 +133,24 @@ def _read_png(data: bytes | memoryview) -> Header:
     orientation, position, num_data_bytes = 1, 8, 0
     while position + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, position)
-        kind = bytes(data[position + 4 : position + 8])
+        kind = data[position + 4 : position + 8]
         if kind == b"IEND":
             if not num_data_bytes:
                 raise ImageError("the PNG has no picture data (no IDAT chunk); the file is damaged")
             return Header("png", width, height, num_channels, orientation)
         num_data_bytes += length if kind == b"IDAT" else 0
         if kind == b"eXIf":
-            orientation = exif_orientation(bytes(data[position + 8 : position + 8 + length]))
+            orientation = exif_orientation(data[position + 8 : position + 8 + length])
         position += 12 + length
     raise ImageError(f"the PNG is cut short: no end chunk in its {len(data)} bytes; send the whole file")
 
 
-def _read_webp(data: bytes | memoryview) -> Header:
+def _read_webp(data: bytes) -> Header:
     """Read the first image chunk of a RIFF container (RFC 9649, section 2)."""
     (riff_length,) = struct.unpack_from("<I", data, 4)
     if len(data) < riff_length + 8:
         raise ImageError(f"the WebP is cut short: {len(data)} of {riff_length + 8} bytes; send the whole file")
-    kind = bytes(data[12:16])
+    kind = data[12:16]
     if kind == b"VP8X":
         flags = data[20]
         if flags & 0x02:
@@ -168,12 +166,12 @@ def _read_webp(data: bytes | memoryview) -> Header:
     raise ImageError(f"the WebP is damaged: its first chunk is {kind!r}; send the file again")
 
 
-def _webp_orientation(data: bytes | memoryview) -> int:
+def _webp_orientation(data: bytes) -> int:
     position = 12
     while position + 8 <= len(data):
         (length,) = struct.unpack_from("<I", data, position + 4)
         if data[position : position + 4] == b"EXIF":
-            return exif_orientation(bytes(data[position + 8 : position + 8 + length]).removeprefix(b"Exif\x00\x00"))
+            return exif_orientation(data[position + 8 : position + 8 + length].removeprefix(b"Exif\x00\x00"))
         position += 8 + length + (length & 1)
     return 1
 

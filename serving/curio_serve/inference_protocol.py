@@ -55,8 +55,7 @@ class InferenceService(GRPCInferenceServiceServicer):
     def direct(self) -> Method:
         """``ModelInfer``, for :mod:`curio_serve.direct_calls`."""
         refused = partial(self._guard.refused, "ModelInfer", "")
-        kind = messages.ModelInferRequest
-        return Method("/inference.GRPCInferenceService/ModelInfer", kind, kind.FromString, self._answer, refused)
+        return Method("/inference.GRPCInferenceService/ModelInfer", messages.ModelInferRequest, self._answer, refused)
 
     def _answer(
         self, request: messages.ModelInferRequest, caller: Caller, _waited_s: float

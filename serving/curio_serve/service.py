@@ -97,14 +97,13 @@ class PoseService(PoseDetectorServicer):
     def direct(self) -> Method:
         """``Detect``, for :mod:`curio_serve.direct_calls`."""
         refused = partial(self._guard.refused, "Detect", "")
-        kind, read = messages.DetectRequest, wire.FrameRequest.parse
-        return Method("/curio.v1.PoseDetector/Detect", kind, read, self._answer, refused)
+        return Method("/curio.v1.PoseDetector/Detect", messages.DetectRequest, self._answer, refused)
 
     def _answer(
-        self, request: wire.FrameRequest, caller: Caller, waited_s: float
+        self, request: messages.DetectRequest, caller: Caller, waited_s: float
     ) -> messages.DetectResponse | CurioError:
         body = partial(self._detect_at_once, request, waited_s)
-        return self._guard.attempt("Detect", request.message.request_id[:_MAX_ID_LENGTH], caller, body)
+        return self._guard.attempt("Detect", request.request_id[:_MAX_ID_LENGTH], caller, body)
 
     def DetectStream(
         self, request_iterator: Iterator[messages.DetectRequest], context: Context
@@ -158,12 +157,14 @@ class PoseService(PoseDetectorServicer):
     def _detect_in_turn(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
         detectors = self._detectors(request)
         with self._work.slot(context, always=True) as waited_s:
-            return self._detect(wire.FrameRequest.of(request), detectors, waited_s)
+            return self._detect(request, detectors, waited_s)
 
-    def _detect_at_once(self, request: wire.FrameRequest, waited_s: float) -> messages.DetectResponse:
-        return self._detect(request, self._detectors(request.message), waited_s)
+    def _detect_at_once(self, request: messages.DetectRequest, waited_s: float) -> messages.DetectResponse:
+        return self._detect(request, self._detectors(request), waited_s)
 
-    def _detect(self, framed: wire.FrameRequest, detectors: list[Detector], waited_s: float) -> messages.DetectResponse:
+    def _detect(
+        self, request: messages.DetectRequest, detectors: list[Detector], waited_s: float
+    ) -> messages.DetectResponse:
         """Decode a request's frame and run the models on it.
 
         Raises:
@@ -171,9 +172,9 @@ class PoseService(PoseDetectorServicer):
             InternalError: A network failed.
         """
         begun = time.perf_counter()
-        limits, request = self._limits, framed.message
+        limits = self._limits
         camera = wire.camera_from_message(request.camera) if request.HasField("camera") else None
-        frame, camera = _decode(framed, camera, detectors, limits)
+        frame, camera = _decode(request, camera, detectors, limits)
         decoded = time.perf_counter()
         regions = list(map(wire.region_from_message, request.regions))
         answer = messages.DetectResponse(
@@ -219,20 +220,21 @@ def new_request_id() -> str:
 
 
 def _decode(
-    request: wire.FrameRequest, camera: PinholeCamera | None, detectors: list[Detector], limits: Limits
+    request: messages.DetectRequest, camera: PinholeCamera | None, detectors: list[Detector], limits: Limits
 ) -> tuple[image.Frame, PinholeCamera | None]:
-    message, data = request.message, request.encoded
-    if message.HasField("raw"):
-        return wire.frame_from_raw(message.raw, limits.max_pixels), camera
-    if data is None:
+    kind = request.WhichOneof("image")
+    if kind is None:
         raise ImageError("the request has no image; set encoded (JPEG, PNG, WebP) or raw")
+    if kind == "raw":
+        return wire.frame_from_raw(request.raw, limits.max_pixels), camera
+    data = request.encoded  # each look at the field copies it
     header = image.open_header(data, limits.max_pixels)
     reductions = [1 if limits.full_decode else d.reduction(camera, header.width, header.height) for d in detectors]
     frame = image.decode(
         data,
         header=header,
         max_reduction=min(reductions),
-        apply_exif_rotation=message.apply_exif_rotation,
+        apply_exif_rotation=request.apply_exif_rotation,
     )
     if camera is not None and frame.quarter_turns:
         camera = camera.turned(frame.quarter_turns, header.width, header.height)

@@ -1,18 +1,10 @@
 """Errors and requests as they travel: exceptions to gRPC status, messages to the detector's arguments."""
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import grpc
 import numpy as np
-from curio_proto.v1.detector_pb2 import (
-    PIXEL_FORMAT_BGR8,
-    PIXEL_FORMAT_GRAY8,
-    PIXEL_FORMAT_RGB8,
-    DetectRequest,
-    FrameError,
-    RawImage,
-)
+from curio_proto.v1.detector_pb2 import PIXEL_FORMAT_BGR8, PIXEL_FORMAT_GRAY8, PIXEL_FORMAT_RGB8, FrameError, RawImage
 from curio_proto.v1.detector_pb2 import Camera as CameraMessage
 from curio_proto.v1.detector_pb2 import Region as RegionMessage
 from google.protobuf.any_pb2 import Any as AnyMessage
@@ -24,7 +16,6 @@ from grpc_status import rpc_status
 from curio_serve.camera import PinholeCamera
 from curio_serve.errors import ArgumentError, CameraError, CurioError, ImageError, Overloaded, status_of
 from curio_serve.image import Frame, RawFormat, from_raw
-from curio_serve.large_field import take_out
 from curio_serve.view import Region
 
 DOMAIN = "curio-pose"
@@ -65,33 +56,6 @@ def frame_error(error: CurioError) -> FrameError:
     """The same for one frame of a stream that goes on."""
     code = grpc.StatusCode[status_of(error)].value[0]
     return FrameError(code=code, reason=type(error).__name__, message=str(error)[:MAX_TEXT])
-
-
-@dataclass(frozen=True, slots=True)
-class FrameRequest:
-    """A request, and its encoded image where it has one, which the message may lack."""
-
-    message: DetectRequest
-    encoded: bytes | memoryview | None
-
-    @classmethod
-    def of(cls, message: DetectRequest) -> "FrameRequest":
-        """What a message says."""
-        return cls(message, message.encoded if message.HasField("encoded") else None)
-
-    @classmethod
-    def parse(cls, data: bytes) -> "FrameRequest":
-        """The same of a serialized message, without copying its image.
-
-        Raises:
-            google.protobuf.message.DecodeError: It is no ``DetectRequest``.
-        """
-        if parts := take_out(data, DetectRequest.ENCODED_FIELD_NUMBER):
-            rest, encoded = parts
-            message = DetectRequest.FromString(rest)
-            if not message.HasField("raw"):  # of both, the later counts
-                return cls(message, encoded)
-        return cls.of(DetectRequest.FromString(data))
 
 
 def camera_from_message(message: CameraMessage) -> PinholeCamera:

@@ -49,9 +49,7 @@ def _served(work: Work) -> Iterator[PoseDetectorStub]:
     server = grpc.server(ThreadPoolExecutor(1), options=options)
     events = share_events(server, options)
     waiting = WorkQueue(1, MAX_WAITING, Metrics(CollectorRegistry()))
-    method = Method(
-        "/curio.v1.PoseDetector/Detect", pb.DetectRequest, pb.DetectRequest.FromString, work.answer, lambda *_: None
-    )
+    method = Method("/curio.v1.PoseDetector/Detect", pb.DetectRequest, work.answer, lambda *_: None)
     direct = DirectCalls(server, events, waiting, [method], 8, refuse)
     port = server.add_insecure_port("127.0.0.1:0")
     server.start()
