@@ -19,9 +19,9 @@ from curio_train.evaluation.linemod_markdown import markdown
 from curio_train.evaluation.linemod_sheet import write_sheet
 from curio_train.evaluation.linemod_table import REFINED, Candidate, candidates, is_current, load_table, make_row
 from curio_train.evaluation.real_frames import evaluate_real_frames
-from curio_train.evaluation.refinement import refined
 from curio_train.evaluation.results import Results, Row, save_results
 from curio_train.evaluation.subject import load_subject
+from curio_train.worlds.refinement import refined
 
 COMMAND = "python benchmarks/linemod.py"
 

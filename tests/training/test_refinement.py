@@ -12,13 +12,13 @@ from curio_train.data.bop import ModelInfo
 from curio_train.data.shapes import chair
 from curio_train.errors import UsageError
 from curio_train.evaluation.evaluate import evaluate
-from curio_train.evaluation.refinement import Refinement, filled_in, rotation_from_vector
 from curio_train.evaluation.scores import add_errors
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, poses
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.circles import Circles
 from curio_train.worlds.gaze import GazeWorld
+from curio_train.worlds.refinement import Refinement, filled_in, rotation_from_vector
 from curio_train.worlds.single_object import Object
 from scipy.spatial.transform import Rotation
 from torch import Tensor

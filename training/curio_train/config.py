@@ -107,6 +107,9 @@ class Recipe:
             worlds of which that makes nothing else.
         sleep_drawn: Share of sleep codes drawn from the world's known range instead of around own predictions; all are
             with --method sleep, which makes no predictions of the data.
+        self_training: Share of the second look's images that are photographs, with the poses that the network has read
+            in them and render-and-compare has refined, in the last two fifths of a run that sleeps; 0: none. Only where
+            a world has photographs.
         gradient_clip: Largest L2 norm of a step's gradient, of the network and of the critic each.
         precision: Of the convolutions; everything else is in float32.
         budget_images: Images to show where neither --minutes nor --images is given.
@@ -127,6 +130,7 @@ class Recipe:
     sleep_noise: float = 0.5
     swap_colors: bool = False
     sleep_drawn: float = 0.5
+    self_training: float = 0.0
     gradient_clip: float = 0.5
     precision: Literal["float32", "bfloat16"] = "float32"
     budget_images: int = 6_400_000
@@ -143,6 +147,8 @@ class Recipe:
         ):
             if getattr(self, name) <= 0:
                 raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected more than 0")
+        if not 0 <= self.self_training < 1:
+            raise UsageError(f"--self-training {self.self_training}: expected 0 or more, and less than 1")
         if self.batch_size % self.micro_batch_size or self.micro_batch_size < 2:
             raise UsageError(
                 f"--batch-size {self.batch_size} cannot be cut into micro-batches of {self.micro_batch_size}; "

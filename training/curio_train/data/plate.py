@@ -21,6 +21,8 @@ PLATE_SHARE = 0.85
 """Of backgrounds that are the plate where it is mixed with others, which are the rare case in use."""
 
 _LARGEST_SHIFT = 0.04  # of the frame's width, and as much of its height
+_SHORTEST_SIDE = 128  # of a plate that is halved once more
+_LEAST_SHRUNK = 1.5  # a view is shrunk by as much from a level of the plate, to look smooth
 _GAIN, _TINT = 0.2, 0.06
 _SHADOW = 0.1  # standard deviation of the light's unevenness
 _SHADOW_GRID = 4
@@ -38,7 +40,9 @@ class PlateBackgrounds(Backgrounds):
             plate: [height, width, 3] uint8 sRGB, without distortion.
             shares: Of its width that a view spans, least and largest; None: all of it.
         """
-        self._plate, self._shares = plate, shares
+        self._levels, self._shares = [plate], shares
+        while min(self._levels[-1].shape[:2]) >= _SHORTEST_SIDE:  # to shrink much takes long, and views are many
+            self._levels.append(cv2.resize(self._levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
     @classmethod
     def read(cls, path: Path, camera: Intrinsics) -> "PlateBackgrounds":
@@ -54,7 +58,7 @@ class PlateBackgrounds(Backgrounds):
         return self
 
     def of_crops(self, least: float, largest: float) -> "PlateBackgrounds":
-        return PlateBackgrounds(self._plate, (least, largest))
+        return PlateBackgrounds(self._levels[0], (least, largest))
 
     def draw(self, count: int, width: int, height: int, seed: tuple[int, ...]) -> Tensor:
         random = np.random.default_rng(seed)
@@ -65,7 +69,9 @@ class PlateBackgrounds(Backgrounds):
         rows, columns = self._region(width, height, random)
         top = int(random.integers(self._size[0] - rows + 1))
         left = int(random.integers(self._size[1] - columns + 1))
-        part = self._plate[top : top + rows, left : left + columns]
+        level = min(len(self._levels) - 1, max(0, int(np.log2(columns / (_LEAST_SHRUNK * width)))))
+        top, left, rows, columns = (number >> level for number in (top, left, rows, columns))
+        part = self._levels[level][top : top + rows, left : left + columns]
         smaller = cv2.INTER_AREA if columns >= width else cv2.INTER_LINEAR
         seen = cv2.resize(part, (width, height), interpolation=smaller).astype(np.float32) / 255
         light = _light(width, height, random)
@@ -85,7 +91,7 @@ class PlateBackgrounds(Backgrounds):
 
     @property
     def _size(self) -> tuple[int, int]:
-        return self._plate.shape[0], self._plate.shape[1]
+        return self._levels[0].shape[0], self._levels[0].shape[1]
 
 
 class MixedBackgrounds(Backgrounds):

@@ -6,7 +6,7 @@
                       frames: […], images_seen, training_seconds, preset, seed, commit, machine}}}
 
 Beside each method stands the same followed by ``, refined``: its poses after render-and-compare, see
-:mod:`~curio_train.evaluation.refinement`. ``frames`` are single frames of a second data set, each with its errors. A
+:mod:`~curio_train.worlds.refinement`. ``frames`` are single frames of a second data set, each with its errors. A
 row is kept as long as weights, number of renderings and real labels are those that it was made of.
 """
 

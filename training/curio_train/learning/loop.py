@@ -25,6 +25,7 @@ from curio_train.learning.losses import image_loss, supervised_loss
 from curio_train.learning.parallel import Ranks
 from curio_train.learning.progress import Reporter
 from curio_train.learning.recoloring import recolored
+from curio_train.learning.self_training import SelfTraining
 from curio_train.learning.sleep import sleep_codes
 from curio_train.learning.state import TrainState
 from curio_train.networks.look import Look
@@ -83,6 +84,7 @@ class Trainer:
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
         self._share = ranks.share(self._num_micro)
         self._ahead: Ahead[Dream] | None = None
+        self._self_training = SelfTraining(self.state.pose.network, world, config.recipe.self_training, ranks.device)
 
     def step(self, rate: float) -> dict[str, float]:
         """One whole step: every micro-batch adds its gradients, then all networks move.
@@ -172,7 +174,15 @@ class Trainer:
         backgrounds = self._sources[turn].backgrounds(number, size)
         code = self._to_device_code(world.sample(size, (*seed, _ASLEEP)))
         images = world.render(code, None if backgrounds is None else backgrounds.to(self.ranks.device))
-        return code, world.disturb(images, seed)
+        images = world.disturb(images, seed)
+        is_last = turn == len(self.world.looks) - 1
+        return self._self_training.among(code, images, (*seed, _ASLEEP)) if is_last else (code, images)
+
+    def study(self, progress: float) -> None:
+        """Read photographs for self-training, if it is time to after this share of the budget; raises DataError."""
+        if self._self_training.is_due(progress):
+            self.settle()
+            self._self_training.study(progress)
 
     def _dream_around(self, raw: SceneCode, backgrounds: Tensor | None, number: int) -> Dream:
         """Of codes around those that were read of data."""
@@ -317,6 +327,7 @@ def train(
                 saved_at = seconds
             if outcome:
                 return outcome
+            trainer.study(progress)
             losses = trainer.step(learning_rate_factor(config.recipe, course.step, progress))
             course.seconds, clock = course.seconds + time.monotonic() - clock, time.monotonic()
             if reporter:

@@ -17,6 +17,9 @@ from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSL
 
 _EVIDENCE = "evidence"
 _NUM_CLEAREST = 16  # of 256 patches
+SCALES, _MIDDLE = (1 / 1.18, 1.0, 1.18), 1
+"""Of the distance that the last crops are placed by."""
+
 _OVERSAMPLING = 2  # a crop is sampled at so many points a pixel and side, then averaged: no aliasing of near objects
 
 
@@ -45,7 +48,8 @@ class GazeNetwork(nn.Module):
     """Whole frame to scene code, all in one graph.
 
     A glance at each of the likeliest places. Where the first look's weight and what the second look sees of the object
-    together say that it is, the second looks once more, at a crop placed by its own answer.
+    together say that it is, the second looks once more, at crops placed by its own answer as if that were a little
+    nearer or farther, too: each errs in its own way, so the position is their mean.
 
     Attributes:
         first: Reads places from frames at low resolution.
@@ -67,7 +71,7 @@ class GazeNetwork(nn.Module):
         seen = self.first(F.avg_pool2d(images, self._optics.first_look_share))
         glances = self._glance(images, seen[CANDIDATES])
         likeliest = _likeliest(glances[TRANSLATION], glances[_EVIDENCE], seen[CANDIDATE_LOG_WEIGHTS])
-        code = self._glance(images, likeliest)
+        code = _position_of_all(self._glance(images, likeliest * likeliest.new_tensor(SCALES)[:, None]))
         del code[_EVIDENCE]
         slope, offset = self.calibration
         return code | {CONFIDENCE: torch.sigmoid(slope * torch.logit(code[CONFIDENCE], 1e-6) + offset)}
@@ -100,6 +104,19 @@ class GazeNetwork(nn.Module):
             CONFIDENCE: code[CONFIDENCE],
             LIGHT: (back @ code[LIGHT][..., None])[..., 0],
         }
+
+
+def _position_of_all(glances: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Of the last glances at each image the middle one, at the mean of all positions.
+
+    The rotation stays as one of them reads it: an object's symmetric poses have no mean.
+    """
+    by_image = {name: value.unflatten(0, (-1, len(SCALES))) for name, value in glances.items()}
+    code = {name: value[:, _MIDDLE] for name, value in by_image.items()}
+    position = by_image[TRANSLATION]  # [batch, glances, 1, 3]
+    depth = position[..., 2:].log().mean(dim=1).exp()
+    slope = (position[..., :2] / position[..., 2:]).mean(dim=1)
+    return code | {TRANSLATION: torch.cat([slope * depth, depth], dim=-1)}
 
 
 def _likeliest(

@@ -4,7 +4,7 @@ A new world is one file: a subclass of :class:`World` and a line in ``worlds/__i
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -25,6 +25,7 @@ from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, 
 
 if TYPE_CHECKING:
     from curio_train.data.meshes import Mesh
+    from curio_train.worlds.lessons import Lessons
 
 Split = Literal["train", "validation", "test"]
 
@@ -231,6 +232,17 @@ class World(ABC):
     def compared(self, images: Tensor) -> Tensor:
         """What image loss and critic see of images and of renderings: all of them, in most worlds."""
         return images
+
+    def lessons(self, predict: Callable[[Tensor], SceneCode]) -> "Lessons | None":
+        """Photographs for self-training: read, refined, and cut for the last look; None in most worlds.
+
+        Args:
+            predict: Reads images [batch, 3, height, width] in [0, 1].
+
+        Raises:
+            DataError: A photograph cannot be read, or is not of the camera's size.
+        """
+        return None
 
     def views(self) -> tuple["View", ...]:
         """Unlabelled photographs to judge by: from the own camera, and of the same scenes from a second one.

@@ -10,7 +10,7 @@ Images are rendered without end, as for LineMOD; what a data set's authors publi
 * light is that of LineMOD: from the camera's half space, over an ambient radiance of 0.4.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -27,13 +27,18 @@ from curio_train.data.plate import PLATE_SHARE, MixedBackgrounds, PlateBackgroun
 from curio_train.data.symmetries import find_symmetries
 from curio_train.errors import UsageError
 from curio_train.geometry import random_rotations
+from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import ObjectKind, World
 from curio_train.worlds.gaze import LARGEST_LOG_SCALE, GazeWorld
+from curio_train.worlds.lessons import Lessons
 from curio_train.worlds.options import CaptureOptions
 from curio_train.worlds.paints import paints_like
 from curio_train.worlds.single_object import Object, any_paint
 from curio_train.worlds.table_files import build_table
 from curio_train.worlds.views import upper_views
+
+MOST_LESSONS = 300
+"""Photographs for self-training: they are kept in memory, and each takes a sixth of a second to be refined."""
 
 
 class Capture(GazeWorld):
@@ -46,17 +51,22 @@ class Capture(GazeWorld):
 
     def photographs(self, count: int) -> Tensor:
         """Spread over the folder, without the lens's distortion, in the canonical size."""
-        paths = Photographs(self._images).paths
-        chosen = [paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))]
-        return self._read(chosen)
+        return self._spread(count).float() / 255
+
+    def lessons(self, predict: Callable[[Tensor], SceneCode]) -> Lessons | None:
+        """Of :data:`MOST_LESSONS` photographs at most, spread over the folder."""
+        return Lessons.of_own_reading(self, self._spread(MOST_LESSONS), predict)
 
     def plate(self) -> Tensor | None:
         """What ``--background`` shows, as the photographs come."""
-        return None if self._background is None else self._read([self._background])[0]
+        return None if self._background is None else self._read([self._background])[0].float() / 255
+
+    def _spread(self, count: int) -> Tensor:
+        paths = Photographs(self._images).paths
+        return self._read([paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))])
 
     def _read(self, paths: Sequence[Path]) -> Tensor:
-        frames = read_frames(paths, self.object.camera, self.camera.width, self.camera.height)
-        return torch.from_numpy(frames).float() / 255
+        return torch.from_numpy(read_frames(paths, self.object.camera, self.camera.width, self.camera.height))
 
 
 def build(options: CaptureOptions) -> World:

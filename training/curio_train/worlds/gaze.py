@@ -209,8 +209,39 @@ class SecondLook(SingleObjectWorld):
         code = scene(place, rotation, self.lights(count, random)) | {ASSUMED_M: assumed}
         code |= self.paint(count, random)
         code[CONFIDENCE] = torch.from_numpy(random.random((count, 1, 1)) >= ABSENT_SHARE).float()
-        side = CROP_PX // SURFACE_SHARE
-        points, seen = self._surface(rotation, self._metres(place, assumed), self._matrices(code, side))
+        return self._with_surface(code, rotation, self._metres(place, assumed))
+
+    def mistaken(self, position_m: Float[Tensor, "count 3"], random: np.random.Generator) -> Float[Tensor, "count 3"]:
+        """Where a first look that errs may take objects at these positions in the frame's camera to be, metres."""
+        count = len(position_m)
+        offset = random.uniform(-LARGEST_OFFSET, LARGEST_OFFSET, (count, 2)) * self.object.kind.diameter_m
+        scale = np.exp(random.uniform(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE, (count, 1)))
+        shift = np.concatenate([offset * scale, np.zeros((count, 1))], axis=1)
+        return (position_m - torch.from_numpy(shift).to(position_m)) / torch.from_numpy(scale).to(position_m)
+
+    def labelled(
+        self,
+        seen: SceneCode,
+        position_m: Float[Tensor, "count 3"],
+        rotation: Float[Tensor, "count 3 3"],
+        assumed_m: Float[Tensor, "count 1"],
+    ) -> dict[str, Tensor]:
+        """The codes of crops that show the object.
+
+        Args:
+            seen: The object's colour, if it has one to be read, and the light, in the crops' cameras.
+            position_m: In the crops' cameras.
+            rotation: crop_from_obj.
+            assumed_m: How far the object was taken to be.
+        """
+        place = torch.cat([position_m[:, :2] / self.object.kind.diameter_m, position_m[:, 2:] / assumed_m], dim=1)
+        code = scene(place, rotation, seen[LIGHT]) | {ASSUMED_M: assumed_m}
+        code |= {name: seen[name] for name in (COLOR,) if name in self.layout}
+        code[CONFIDENCE] = torch.ones(len(place), 1, 1)
+        return self._with_surface(code, rotation, position_m)
+
+    def _with_surface(self, code: dict[str, Tensor], rotation: Tensor, position_m: Tensor) -> dict[str, Tensor]:
+        points, seen = self._surface(rotation, position_m, self._matrices(code, CROP_PX // SURFACE_SHARE))
         return code | {SURFACE: torch.cat([points, seen[:, None]], dim=1)}
 
     def backgrounds(self, cache: Path) -> Backgrounds:

@@ -95,7 +95,8 @@ class CaptureOptions(WorldOptions):
         mesh: Mesh file: STL, OBJ, PLY, GLB, glTF or OFF; on a plane as many as there are kinds of parts.
         camera: Camera file of the photographs: camera JSON, or BOP's camera.json.
         photos: Folder of unlabelled photographs. They are checked against the camera, tell the part's colour, and the
-            report shows what was found in them; only on a plane anything else is learned from them.
+            report shows what was found in them. Towards the end of training they are learned from, with the poses that
+            the network itself reads in them (--self-training); on a plane from the beginning.
         mesh_unit: Unit of the mesh file's coordinates; the file's own, or metres, unless given.
         background: Photograph of the empty scene, taken as the others were.
         backgrounds: Folder of photographs to see the part in front of, where the scene changes; clutter is rendered
@@ -120,7 +121,7 @@ class CaptureOptions(WorldOptions):
     """
 
     default_method: ClassVar[Method] = "sleep"
-    default_recipe: ClassVar[Mapping[str, Any]] = _GAZE_RECIPE
+    default_recipe: ClassVar[Mapping[str, Any]] = {**_GAZE_RECIPE, "self_training": 0.5}
 
     mesh: tuple[Path, ...]
     camera: Path

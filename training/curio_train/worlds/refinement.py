@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from curio_train.camera import gaze_at, sampling_grid
@@ -80,14 +80,18 @@ class Refinement:
         self._renderer = Renderer([world.object.mesh], [0], CROP_PX, CROP_PX, ambient=AMBIENT)
 
     def __call__(self, images: Tensor, code: SceneCode) -> dict[str, Tensor]:
-        """Better poses, where they are found.
+        """Better poses, where they are found; all else as in :meth:`judged`."""
+        return self.judged(images, code)[0]
+
+    def judged(self, images: Tensor, code: SceneCode) -> tuple[dict[str, Tensor], Bool[Tensor, " batch"]]:
+        """Better poses, and where they are found.
 
         Args:
             images: uint8 sRGB [batch, 3, height, width].
             code: What was read in them; metres and 6D rotation in the camera's frame.
 
         Returns:
-            The code with positions and rotations refined; everything else as it was.
+            The code with positions and rotations refined, everything else as it was; and which were.
         """
         view = self._view(images, code)
         start = _Moves.none(len(images), code[LIGHT])
@@ -175,8 +179,10 @@ class Refinement:
         return image * contrast + brightness
 
     @torch.no_grad()
-    def _accepted(self, view: "_View", start: "_Moves", moves: "_Moves", code: SceneCode) -> dict[str, Tensor]:
-        """The code with the poses that may replace the estimates."""
+    def _accepted(
+        self, view: "_View", start: "_Moves", moves: "_Moves", code: SceneCode
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """The code with the poses that may replace the estimates, and which do."""
         before, after = (view.missed(self._rendered(view, m, self._response(view, m))) for m in (start, moves))
         silhouette, _ = self._object(view, moves)
         seen = (view.missed(view.behind) - after).clamp(min=0).sum((1, 2, 3))
@@ -185,13 +191,14 @@ class Refinement:
         near &= moves.across.norm(dim=1) < LARGEST_SHIFT
         near &= moves.log_depth[:, 0].abs() < LARGEST_LOG_DEPTH
         near &= seen > _LEAST_SEEN * silhouette.sum((1, 2, 3))
-        taken = (near & (view.share(after) < view.share(before)))[:, None, None]
+        taken = near & (view.share(after) < view.share(before))
         back = view.crop_from_cam.transpose(1, 2)
         found = {
             TRANSLATION: (back @ translation_m[..., None]).transpose(1, 2),
             ROTATION_6D: rotation_6d_from_matrix(back @ rotation)[:, None],
         }
-        return dict(code) | {name: torch.where(taken, value, code[name]) for name, value in found.items()}
+        better = {name: torch.where(taken[:, None, None], value, code[name]) for name, value in found.items()}
+        return dict(code) | better, taken
 
 
 @dataclass(frozen=True, eq=False)

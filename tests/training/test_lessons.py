@@ -1,0 +1,162 @@
+"""What a gaze is taught of photographs agrees with what they show, and nothing is taught of what was not found."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from curio_train.camera import Intrinsics
+from curio_train.config import Recipe
+from curio_train.data.backgrounds import ClutterBackgrounds
+from curio_train.data.shapes import chair
+from curio_train.errors import UsageError
+from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
+from curio_train.learning.self_training import STUDIES, SelfTraining
+from curio_train.networks.crop import SURFACE
+from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
+from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.gaze import ASSUMED_M, CROP_PX, LARGEST_LOG_SCALE, LARGEST_OFFSET, GazeWorld
+from curio_train.worlds.lessons import Lessons
+from curio_train.worlds.single_object import Object
+from scipy.spatial.transform import Rotation
+from torch import Tensor, nn
+
+K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
+MESH = chair(0.12)
+NUM = 6
+
+
+@pytest.fixture(scope="module")
+def world() -> GazeWorld:
+    kind = ObjectKind("chair", (0,), MESH.diameter_m, MESH.box_corners_m, MESH.sha256)
+    pool = np.full((2, 480, 640, 3), 128, np.uint8)
+    thing = Object(kind, MESH, Intrinsics(K, 640, 480), 0.5, 1.0, lambda _: ClutterBackgrounds(pool))
+    return GazeWorld("linemod", thing)
+
+
+@pytest.fixture(scope="module")
+def truth(world: GazeWorld) -> SceneCode:
+    code = world.sample(NUM, (1,))
+    code[TRANSLATION][..., :2] *= 0.5
+    return code
+
+
+@pytest.fixture(scope="module")
+def behind(world: GazeWorld) -> Tensor:
+    return world.backgrounds(Path()).draw(NUM, 640, 480, (2,))
+
+
+@pytest.fixture(scope="module")
+def frames(world: GazeWorld, truth: SceneCode, behind: Tensor) -> Tensor:
+    return (world.render(truth, behind).clamp(0, 1) * 255).round().byte()
+
+
+def roughly(code: SceneCode) -> dict[str, Tensor]:
+    """The code as a network might read it: turned by six degrees, 3 % too far."""
+    turn = torch.from_numpy(Rotation.from_rotvec(np.radians([6.0, 0, 0])).as_matrix()).float()
+    rotation = rotation_6d_from_matrix(turn @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0]))[:, None]
+    return dict(code) | {TRANSLATION: code[TRANSLATION] * 1.03, ROTATION_6D: rotation}
+
+
+def test_crops_look_like_what_their_codes_render(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+    look = world.looks[1]
+    code, crops = Lessons(world, frames, truth).draw(16, (3,))
+    assert crops.shape == (16, 3, CROP_PX, CROP_PX)
+    rendered = look.render(code | {"exposure": torch.ones(16, 1, 3)}, torch.full_like(crops, 128 / 255))
+    shifted = look.render(
+        code | {TRANSLATION: code[TRANSLATION] + torch.tensor([0.1, 0, 0])}, torch.full_like(crops, 128 / 255)
+    )
+    # The frames' exposure is not in the code, so shapes are compared, not shades.
+    seen, drawn, wrong = ((image - 128 / 255).abs().mean(1) > 0.03 for image in (crops, rendered, shifted))
+    overlap = (seen & drawn).sum() / (seen | drawn).sum()
+    assert overlap > 0.85
+    assert (seen & wrong).sum() / (seen | wrong).sum() < overlap - 0.15
+
+
+def test_codes_are_those_of_a_first_look_that_errs(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+    code, _ = Lessons(world, frames, truth).draw(64, (4,))
+    slope = (code[TRANSLATION][..., :2] / code[TRANSLATION][..., 2:]).abs()
+    assert 0.7 * LARGEST_OFFSET < slope.max() < 1.15 * LARGEST_OFFSET  # the crop's camera is turned, too
+    logs = code[TRANSLATION][..., 2].log()
+    assert logs.min() < -0.7 * LARGEST_LOG_SCALE
+    assert logs.max() > 0.7 * LARGEST_LOG_SCALE
+    assert logs.abs().max() < 1.1 * LARGEST_LOG_SCALE
+    expected = {TRANSLATION, ROTATION_6D, LIGHT, CONFIDENCE, ASSUMED_M, SURFACE}
+    assert set(code) == expected
+    assert (code[CONFIDENCE] == 1).all()
+    strength = truth[LIGHT].norm(dim=1)
+    assert ((code[LIGHT].norm(dim=1)[:, None] - strength).abs().min(1).values < 1e-4).all()
+
+
+def test_the_same_seed_gives_the_same_crops(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+    lessons = Lessons(world, frames, truth)
+    assert torch.equal(lessons.draw(4, (5,))[1], lessons.draw(4, (5,))[1])
+    assert not torch.equal(lessons.draw(4, (5,))[1], lessons.draw(4, (6,))[1])
+
+
+def test_what_is_read_is_refined_before_it_is_taught(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+    read = roughly(truth)
+    lessons = Lessons.of_own_reading(world, frames, lambda images: {n: v[: len(images)] for n, v in read.items()})
+    assert lessons is not None
+    assert len(lessons) >= NUM - 1
+    code, _ = lessons.draw(32, (7,))
+    taught = matrix_from_rotation_6d(lessons._code[ROTATION_6D][:, 0])
+    nearest = rotation_angle_deg(
+        taught[:, None].expand(-1, NUM, 3, 3),
+        matrix_from_rotation_6d(truth[ROTATION_6D][:, 0]).expand(len(lessons), NUM, 3, 3),
+    ).min(dim=1)
+    assert nearest.values.median() < 2
+    assert all(value.isfinite().all() for value in code.values())
+
+
+def test_nothing_is_learned_of_photographs_without_the_object(
+    world: GazeWorld, truth: SceneCode, behind: Tensor
+) -> None:
+    empty = (behind * 255).byte()
+    assert Lessons.of_own_reading(world, empty, lambda _: dict(truth)) is None
+
+
+class Remembering(nn.Module):
+    """Answers with a code, and counts how often it was asked."""
+
+    def __init__(self, code: SceneCode) -> None:
+        super().__init__()
+        self.code, self.calls = code, 0
+
+    def forward(self, images: Tensor) -> dict[str, Tensor]:
+        assert not self.training
+        self.calls += 1
+        return {name: value[: len(images)] for name, value in self.code.items()}
+
+
+def test_photographs_make_up_their_share_once_they_are_read(
+    world: GazeWorld, truth: SceneCode, frames: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(world, "lessons", lambda predict: Lessons.of_own_reading(world, frames, predict))
+    network = Remembering(roughly(truth)).train()
+    training = SelfTraining(network, world, 0.25, torch.device("cpu"))
+    look = world.looks[1]
+    code = look.sample(8, (1,))
+    images = look.render(code)
+    before, same = training.among(code, images, (2,))
+    assert torch.equal(same, images)
+    assert set(before) == set(code)
+
+    assert not training.is_due(STUDIES[0] - 0.01)
+    assert training.is_due(STUDIES[0])
+    training.study(STUDIES[0])
+    assert network.calls == 1
+    assert network.training
+    assert not training.is_due(STUDIES[1] - 0.01)
+    assert training.is_due(STUDIES[1])
+
+    mixed, crops = training.among(code, images, (2,))
+    assert torch.equal(crops[:6], images[2:])
+    assert not torch.equal(crops[6:], images[:2])
+    assert torch.equal(mixed[TRANSLATION][:6], code[TRANSLATION][2:])
+    look.code_loss({name: value.clone() for name, value in mixed.items()}, mixed)
+
+
+def test_a_share_of_all_is_refused() -> None:
+    with pytest.raises(UsageError, match="--self-training"):
+        Recipe(self_training=1.0)

@@ -1,0 +1,96 @@
+"""Self-training: a gaze learns from photographs that nobody labelled, with the poses that it reads in them itself.
+
+What a network reads in a photograph is rough, and render-and-compare makes it far better (:mod:`refinement`), but needs
+mesh and renderer, which no server has. So while training goes on, photographs are read and refined, and crops of them
+join the renderings of the second look with those poses for labels (pseudo-labels, Lee 2013; of poses by
+render-and-compare as in Wang et al. 2020, "Self6D"). That shows it what renderings don't: this camera, this light, this
+part. No label of a photograph is used.
+"""
+
+from collections.abc import Callable
+from typing import Self
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import UInt8
+from torch import Tensor
+
+from curio_train.camera import gaze_at, sampling_grid
+from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode
+from curio_train.worlds.gaze import CROP_PX, FILL, GazeWorld
+from curio_train.worlds.refinement import Refinement
+
+_OVERSAMPLING = 2  # points a pixel and side at which a crop is sampled, as the network samples its own
+_READ_AT_ONCE = 20
+
+
+class Lessons:
+    """Photographs with the poses that were read in them, as crops for the second look."""
+
+    def __init__(self, world: GazeWorld, frames: UInt8[Tensor, "num 3 height width"], code: SceneCode) -> None:
+        """Teach these.
+
+        Args:
+            world: The gaze's.
+            frames: Photographs as the world's camera takes them, sRGB.
+            code: What they show.
+        """
+        assert world.camera.matrix is not None  # a gaze has a pinhole camera
+        self._look, self._frames, self._code = world.looks[1], frames, code
+        self._matrix = torch.from_numpy(np.asarray(world.camera.matrix)).float()[None]
+
+    @classmethod
+    @torch.no_grad()
+    def of_own_reading(
+        cls, world: GazeWorld, frames: UInt8[Tensor, "num 3 height width"], predict: Callable[[Tensor], SceneCode]
+    ) -> Self | None:
+        """Read photographs and refine what was read, twice.
+
+        Args:
+            world: The gaze's.
+            frames: Photographs as the world's camera takes them, sRGB.
+            predict: Reads images [batch, 3, height, width] in [0, 1].
+
+        Returns:
+            What can be learned of those whose refined pose is nearer to the picture; None if there is none.
+        """
+        refine = Refinement(world)
+        codes, kept = [], []
+        for chunk in frames.split(_READ_AT_ONCE):
+            with torch.enable_grad():
+                once, taken = refine.judged(chunk, predict(chunk.float() / 255))
+                twice, taken_again = refine.judged(chunk, once)
+            codes.append(twice)
+            kept.append(taken | taken_again)
+        chosen = torch.cat(kept)
+        code = {name: torch.cat([part[name] for part in codes])[chosen] for name in codes[0]}
+        return cls(world, frames[chosen], code) if chosen.any() else None
+
+    def __len__(self) -> int:
+        """How many photographs teach."""
+        return len(self._frames)
+
+    @torch.no_grad()
+    def draw(self, count: int, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:
+        """Crops as a first look that errs leaves them, each of a photograph chosen at random.
+
+        Returns:
+            Codes of the second look, and images [count, 3, CROP_PX, CROP_PX] in [0, 1].
+        """
+        random = np.random.default_rng(seed)
+        chosen = torch.from_numpy(random.integers(len(self), size=count))
+        code = {name: value[chosen] for name, value in self._code.items()}
+        position_m, matrix = code[TRANSLATION][:, 0], self._matrix.expand(count, 3, 3)
+        place = self._look.mistaken(position_m, random)
+        assumed = place.norm(dim=1)
+        side = _OVERSAMPLING * CROP_PX
+        gaze = gaze_at(place, FILL * side * assumed / self._look.object.kind.diameter_m, side, matrix)
+        height, width = self._frames.shape[2:]
+        grid = sampling_grid(gaze, matrix, side, width, height)
+        fine = F.grid_sample(self._frames[chosen].float() / 255, grid, padding_mode="border", align_corners=False)
+        turned = (gaze.rotation @ position_m[..., None])[..., 0]
+        rotation = gaze.rotation @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
+        code[LIGHT] = (gaze.rotation @ code[LIGHT][..., None])[..., 0]
+        return self._look.labelled(code, turned, rotation, assumed[:, None]), F.avg_pool2d(fine, _OVERSAMPLING)
