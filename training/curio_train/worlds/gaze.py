@@ -63,7 +63,6 @@ TURNS = (0, 1, 1)
 _PLACE_SCALE_PX = 2.0  # of the first look's pixels: what counts as near
 _DEPTH_SCALE = 0.1  # of the logarithm
 _NUM_POINTS = 128
-_DEPTH_WEIGHT = 3.0  # a share of the distance is several diameters: what ADD fails on first
 _NUMBERS_WEIGHT = 0.5
 _SURFACE_WEIGHT = 3.0  # it teaches what the rotation is read from
 _LIGHT_WEIGHT = 0.05
@@ -257,7 +256,7 @@ class SecondLook(SingleObjectWorld):
         return self._image(code, place[:, None], self._matrices(code, CROP_PX), backgrounds)
 
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
-        """How far the model's points are displaced by the rotation, in diameters, beside offset, scale and light.
+        """How far the model's points are displaced by rotation, offset and depth, in diameters, beside the light.
 
         Of poses that look alike the one nearest to the prediction is the true one. Where there is no object only
         confidence and the surface count. The six numbers of the rotation count as they are, too: while nothing is
@@ -273,9 +272,10 @@ class SecondLook(SingleObjectWorld):
         numbers = (predicted[ROTATION_6D][:, 0] - wanted_6d).square().sum(dim=-1)
         place, true_place = predicted[TRANSLATION][:, 0], true[TRANSLATION][:, 0]
         offset = (place[:, :2] / place[:, 2:] - true_place[:, :2] / true_place[:, 2:]).norm(dim=-1)
-        scale = (place[:, 2].log() - true_place[:, 2].log()).abs()
+        away = true[ASSUMED_M][:, 0] / self.object.kind.diameter_m
+        depth = away * (place[:, 2].log() - true_place[:, 2].log()).abs()
         light = (predicted[LIGHT] - true[LIGHT]).norm(dim=-1)
-        pose = displaced + _NUMBERS_WEIGHT * numbers + offset + _DEPTH_WEIGHT * scale + _LIGHT_WEIGHT * light
+        pose = displaced + _NUMBERS_WEIGHT * numbers + offset + depth + _LIGHT_WEIGHT * light
         if COLOR in self.layout:
             pose = pose + _COLOR_WEIGHT * (predicted[COLOR] - true[COLOR])[:, 0].abs().mean(dim=-1)
         shift = self._metres(place, true[ASSUMED_M]) - self._metres(true_place, true[ASSUMED_M])

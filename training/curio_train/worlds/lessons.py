@@ -24,6 +24,7 @@ from curio_train.worlds.refinement import Refinement
 
 _OVERSAMPLING = 2  # points a pixel and side at which a crop is sampled, as the network samples its own
 _READ_AT_ONCE = 20
+_GAINS = (0.8, 1.25)  # of crops: light changes, and all else is the camera's own
 
 
 class Lessons:
@@ -93,4 +94,6 @@ class Lessons:
         turned = (gaze.rotation @ position_m[..., None])[..., 0]
         rotation = gaze.rotation @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
         code[LIGHT] = (gaze.rotation @ code[LIGHT][..., None])[..., 0]
-        return self._look.labelled(code, turned, rotation, assumed[:, None]), F.avg_pool2d(fine, _OVERSAMPLING)
+        gain = torch.from_numpy(random.uniform(*_GAINS, (count, 1, 1, 1))).float()
+        crops = (gain * F.avg_pool2d(fine, _OVERSAMPLING)).clamp(0, 1)
+        return self._look.labelled(code, turned, rotation, assumed[:, None]), crops
