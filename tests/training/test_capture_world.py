@@ -24,8 +24,9 @@ from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.learning.checkpoint import RunFolder
 from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
-from curio_train.worlds.capture import Capture
+from curio_train.worlds.capture import NUM_JUDGED, Capture
 from curio_train.worlds.options import CaptureOptions
+from torch import Tensor
 
 WIDTH, HEIGHT = 160, 120
 
@@ -176,6 +177,30 @@ def test_photographs_come_in_the_canonical_size_without_distortion(world: Captur
         np.array(world.object.camera.distortion),
     )
     assert torch.equal((found[0] * 255).round().byte(), torch.from_numpy(straight).permute(2, 0, 1))
+
+
+def test_a_model_is_not_judged_by_what_it_learned_from(folder: Path, tmp_path: Path) -> None:
+    """Of many photographs, here each of another grey; of a few it learns nothing, and nothing of what it can't find."""
+    for number in range(2 * NUM_JUDGED):
+        cv2.imwrite(str(tmp_path / f"{number:03}.png"), np.full((HEIGHT, WIDTH, 3), 3 * number, np.uint8))
+    many, few = build(options(folder, photos=tmp_path)), build(options(folder))
+    read: list[Tensor] = []
+
+    def predict(images: Tensor) -> dict[str, Tensor]:
+        read.append(images)
+        return many.sample(len(images), (1,))
+
+    def greys(images: Tensor) -> set[int]:
+        return set((images[:, 0, HEIGHT // 2, WIDTH // 2] * 85).round().int().tolist())
+
+    judged = many.photographs(1000)
+    assert judged is not None
+    assert len(greys(judged)) == NUM_JUDGED
+    assert many.lessons(predict) is None
+    assert greys(torch.cat(read)) == set(range(2 * NUM_JUDGED)) - greys(judged)
+    read.clear()
+    assert few.lessons(predict) is None
+    assert not read
 
 
 def test_what_contradicts_itself_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -37,6 +37,10 @@ from curio_train.worlds.single_object import Object, any_paint
 from curio_train.worlds.table_files import build_table
 from curio_train.worlds.views import upper_views
 
+NUM_JUDGED = 40
+"""Photographs that a model is judged by, and that it therefore never learns from; of fewer than twice as many it learns
+from none."""
+
 MOST_LESSONS = 300
 """Photographs for self-training: they are kept in memory, and each takes a sixth of a second to be refined."""
 
@@ -50,23 +54,34 @@ class Capture(GazeWorld):
         self._images, self._background = images, background
 
     def photographs(self, count: int) -> Tensor:
-        """Spread over the folder, without the lens's distortion, in the canonical size."""
-        return self._spread(count).float() / 255
+        """Those that teach nothing, without the lens's distortion, in the canonical size."""
+        return self._read(_spread(self._divided[0], count)).float() / 255
 
     def lessons(self, predict: Callable[[Tensor], SceneCode]) -> Lessons | None:
-        """Of :data:`MOST_LESSONS` photographs at most, spread over the folder."""
-        return Lessons.of_own_reading(self, self._spread(MOST_LESSONS), predict)
+        """Of the photographs that it is not judged by, :data:`MOST_LESSONS` at most."""
+        paths = _spread(self._divided[1], MOST_LESSONS)
+        return Lessons.of_own_reading(self, self._read(paths), predict) if paths else None
 
     def plate(self) -> Tensor | None:
         """What ``--background`` shows, as the photographs come."""
         return None if self._background is None else self._read([self._background])[0].float() / 255
 
-    def _spread(self, count: int) -> Tensor:
-        paths = Photographs(self._images).paths
-        return self._read([paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))])
+    @property
+    def _divided(self) -> tuple[list[Path], list[Path]]:
+        """Photographs to judge by, and the others; of a few the model is judged by all."""
+        paths = list(Photographs(self._images).paths)
+        if len(paths) < 2 * NUM_JUDGED:
+            return paths, []
+        judged = _spread(paths, NUM_JUDGED)
+        return judged, sorted(set(paths).difference(judged))
 
     def _read(self, paths: Sequence[Path]) -> Tensor:
         return torch.from_numpy(read_frames(paths, self.object.camera, self.camera.width, self.camera.height))
+
+
+def _spread(paths: Sequence[Path], count: int) -> list[Path]:
+    """At most so many, evenly over all."""
+    return [paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))] if paths else []
 
 
 def build(options: CaptureOptions) -> World:
