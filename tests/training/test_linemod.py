@@ -2,13 +2,16 @@ import json
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 import trimesh
+from curio_train.config import RunConfig, preset_recipe
 from curio_train.errors import DataError, UsageError
 from curio_train.export import export
 from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.preparation import prepared
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
 from curio_train.worlds.linemod import FAR_M, NEAR_M
@@ -33,8 +36,6 @@ def data(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory) -> Path:
-    import cv2
-
     folder = tmp_path_factory.mktemp("photographs")
     random = np.random.default_rng(0)
     for number in range(5):
@@ -127,3 +128,33 @@ def test_unknown_class_and_missing_data_are_named(data, tmp_path):
         build(LinemodOptions("driller", data))
     with pytest.raises(DataError, match="hf download"):
         build(LinemodOptions("ape", tmp_path / "nothing"))
+
+
+def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
+    with pytest.raises(UsageError, match=r"--photos .*leave out --no-gaze"):
+        build(LinemodOptions("ape", data, photographs, photos=photographs, gaze=False))
+    read = []
+    without = build(LinemodOptions("ape", data, photographs))
+    assert without.lessons(lambda images: read.append(images) or without.sample(len(images), (1,))) is None
+    assert not read
+
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    grey = np.full((480, 640, 3), 90, np.uint8)
+    for number in range(3):
+        cv2.imwrite(str(frames / f"{number}.png"), grey + number)
+    taught = build(LinemodOptions("ape", data, photographs, photos=frames))
+    assert taught.lessons(lambda images: read.append(images) or taught.sample(len(images), (1,))) is None
+    (seen,) = read
+    assert (seen.mean((1, 2, 3)) * 255).tolist() == pytest.approx([90, 91, 92])
+
+    cv2.imwrite(str(frames / "9.png"), grey[:96])
+    with pytest.raises(DataError, match=r"9\.png"):
+        taught.lessons(lambda images: taught.sample(len(images), (1,)))
+
+
+def test_a_run_without_such_frames_says_so(data, photographs, tmp_path):
+    for photos, share in ((None, 0.0), (photographs, 0.5)):
+        options = LinemodOptions("ape", data, photos=photos)
+        config = RunConfig(options, method="sleep", recipe=preset_recipe("laptop", LinemodOptions))
+        assert prepared(config, tmp_path, print, print).recipe.self_training == share

@@ -181,6 +181,18 @@ def test_the_papers_means_are_those_of_its_classes() -> None:
         assert sum(row.classes) / len(row.classes) == pytest.approx(row.mean, abs=0.11), name
 
 
+def test_networks_that_saw_real_frames_are_a_row_of_their_own(
+    folder: Path, data: Path, tmp_path: Path, write_run: WriteRun
+) -> None:
+    options = LinemodOptions("ape", data, folder / "photographs", gaze=False)
+    write_run(tmp_path / "without", options=options)
+    written = json.loads((write_run(tmp_path / "with", options=options) / "config.json").read_text())
+    written["recipe"]["self_training"] = 0.5
+    (tmp_path / "with" / "config.json").write_text(json.dumps(written))
+    methods = {candidate.path.name: candidate.method for candidate in candidates(tmp_path)}
+    assert methods == {"with": "noncur, self-trained", "without": "noncur"}
+
+
 @pytest.mark.parametrize("content", ["{", '{"sleep": {"ape": {"rendered": {}}}}', "[1]"])
 def test_other_files_are_no_results(tmp_path: Path, content: str) -> None:
     (tmp_path / "linemod.json").write_text(content)

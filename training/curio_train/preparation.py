@@ -24,6 +24,8 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
         DataError: A download failed, or files of one's own are certain not to work.
     """
     options = config.world
+    if isinstance(options, LinemodOptions) and options.photos is None:
+        config = replace(config, recipe=replace(config.recipe, self_training=0.0))  # so that the model says so
     if isinstance(options, LinemodOptions) and options.data is None and options.download:
         from curio_train.data.download import download_linemod
 

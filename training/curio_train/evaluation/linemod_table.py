@@ -20,10 +20,13 @@ from typing import Any
 from curio_train.errors import DataError, UsageError
 from curio_train.evaluation.results import Results, Row, load_rows
 from curio_train.learning.checkpoint import RunFolder
-from curio_train.learning.configuration import CONFIG_FILE
+from curio_train.learning.configuration import CONFIG_FILE, to_portable
 from curio_train.model_folder import MODEL_FILE, find_model
 from curio_train.onnx_file import OnnxModel
 from curio_train.worlds.options import LinemodOptions
+
+SELF_TRAINED = ", self-trained"
+"""What follows the method's name where real frames without labels were learned from."""
 
 REFINED = ", refined"
 """What follows the method's name where poses were refined."""
@@ -40,7 +43,7 @@ class Candidate:
     Attributes:
         path: Its folder.
         name: The class.
-        method: That trained it.
+        method: That trained it; ``, self-trained`` follows where unlabelled real frames took part.
         weights_sha256: Of the last checkpoint's tensors, or of the model file.
     """
 
@@ -78,12 +81,17 @@ def _found(folder: Path) -> Iterator[Candidate]:
             run = RunFolder.open(path)
             if isinstance(run.config.world, LinemodOptions) and run.checkpoints():
                 weights = run.checkpoints()[-1] / "tensors.safetensors"
-                yield Candidate(path, run.config.world.class_name, run.config.method, _sha256(weights))
+                yield Candidate(path, run.config.world.class_name, _method(to_portable(run.config)), _sha256(weights))
         elif any(path.glob(f"[0-9]*/{MODEL_FILE}")):
             file = find_model(path)
             spec = OnnxModel.open(file).spec
             if spec.world == "linemod":
-                yield Candidate(path, spec.objects[0].name, json.loads(spec.recipe)["method"], _sha256(file))
+                yield Candidate(path, spec.objects[0].name, _method(json.loads(spec.recipe)), _sha256(file))
+
+
+def _method(making: Mapping[str, Any]) -> str:
+    """Models that are older than self-training say nothing of it."""
+    return str(making["method"]) + (SELF_TRAINED if making["recipe"].get("self_training") else "")
 
 
 def _sha256(*files: Path) -> str:

@@ -57,7 +57,8 @@ def learn(
             note_sitting(path)
         trainer = Trainer(config, world, sources, here)
         if here.device.type == "cpu":
-            choose_threads(trainer.rehearse)
+            # A run that only sleeps draws its images in a thread of its own.
+            choose_threads(trainer.rehearse, reserved=int(config.terms == {"sleep"}))
         if resume and run.checkpoints():
             run.restore(trainer.state)
         elif config.init is not None:

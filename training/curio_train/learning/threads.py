@@ -12,16 +12,18 @@ import torch
 _NUM_TRIES = 2
 
 
-def choose_threads(work: Callable[[], object]) -> int:
+def choose_threads(work: Callable[[], object], *, reserved: int = 0) -> int:
     """Let torch compute with all the threads it may use, or with one, whichever does ``work`` quicker now.
+
+    Args:
+        work: A piece of what is to be done.
+        reserved: Threads that torch leaves to what else this process does at the same time; one stays in any case.
 
     Returns:
         That number.
     """
-    allowed = torch.get_num_threads()
-    if allowed > 1:
-        quickest = min((1, allowed), key=lambda count: _seconds(work, count))
-        torch.set_num_threads(quickest)
+    most = max(1, torch.get_num_threads() - reserved)
+    torch.set_num_threads(most if most == 1 else min((1, most), key=lambda count: _seconds(work, count)))
     return torch.get_num_threads()
 
 

@@ -30,7 +30,7 @@ from curio_train.geometry import random_rotations
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import ObjectKind, World
 from curio_train.worlds.gaze import LARGEST_LOG_SCALE, GazeWorld
-from curio_train.worlds.lessons import Lessons
+from curio_train.worlds.lessons import Lessons, spread
 from curio_train.worlds.options import CaptureOptions
 from curio_train.worlds.paints import paints_like
 from curio_train.worlds.single_object import Object, any_paint
@@ -40,9 +40,6 @@ from curio_train.worlds.views import upper_views
 NUM_JUDGED = 40
 """Photographs that a model is judged by, and that it therefore never learns from; of fewer than twice as many it learns
 from none."""
-
-MOST_LESSONS = 300
-"""Photographs for self-training: they are kept in memory, and each takes a sixth of a second to be refined."""
 
 
 class Capture(GazeWorld):
@@ -55,12 +52,11 @@ class Capture(GazeWorld):
 
     def photographs(self, count: int) -> Tensor:
         """Those that teach nothing, without the lens's distortion, in the canonical size."""
-        return self._read(_spread(self._divided[0], count)).float() / 255
+        return self._read(spread(self._divided[0], count)).float() / 255
 
     def lessons(self, predict: Callable[[Tensor], SceneCode]) -> Lessons | None:
-        """Of the photographs that it is not judged by, :data:`MOST_LESSONS` at most."""
-        paths = _spread(self._divided[1], MOST_LESSONS)
-        return Lessons.of_own_reading(self, self._read(paths), predict) if paths else None
+        """Of the photographs that it is not judged by."""
+        return Lessons.of_files(self, self._divided[1], predict)
 
     def plate(self) -> Tensor | None:
         """What ``--background`` shows, as the photographs come."""
@@ -72,16 +68,11 @@ class Capture(GazeWorld):
         paths = list(Photographs(self._images).paths)
         if len(paths) < 2 * NUM_JUDGED:
             return paths, []
-        judged = _spread(paths, NUM_JUDGED)
+        judged = spread(paths, NUM_JUDGED)
         return judged, sorted(set(paths).difference(judged))
 
     def _read(self, paths: Sequence[Path]) -> Tensor:
         return torch.from_numpy(read_frames(paths, self.object.camera, self.camera.width, self.camera.height))
-
-
-def _spread(paths: Sequence[Path], count: int) -> list[Path]:
-    """At most so many, evenly over all."""
-    return [paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))] if paths else []
 
 
 def build(options: CaptureOptions) -> World:

@@ -7,7 +7,8 @@ render-and-compare as in Wang et al. 2020, "Self6D"). That shows it what renderi
 part. No label of a photograph is used.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -17,14 +18,23 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from curio_train.camera import gaze_at, sampling_grid
+from curio_train.data.photographs import read_frames
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.gaze import CROP_PX, FILL, GazeWorld
 from curio_train.worlds.refinement import Refinement
 
+MOST_PHOTOGRAPHS = 300
+"""They are kept in memory, and each takes a sixth of a second to be refined."""
+
 _OVERSAMPLING = 2  # points a pixel and side at which a crop is sampled, as the network samples its own
 _READ_AT_ONCE = 20
 _GAINS = (0.8, 1.25)  # of crops: light changes, and all else is the camera's own
+
+
+def spread(paths: Sequence[Path], count: int) -> list[Path]:
+    """At most so many, evenly over all."""
+    return [paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))] if paths else []
 
 
 class Lessons:
@@ -68,6 +78,17 @@ class Lessons:
         chosen = torch.cat(kept)
         code = {name: torch.cat([part[name] for part in codes])[chosen] for name in codes[0]}
         return cls(world, frames[chosen], code) if chosen.any() else None
+
+    @classmethod
+    def of_files(cls, world: GazeWorld, paths: Sequence[Path], predict: Callable[[Tensor], SceneCode]) -> Self | None:
+        """The same of photographs in files, :data:`MOST_PHOTOGRAPHS` of them at most, evenly over all.
+
+        Raises:
+            DataError: One cannot be read, or is not of the camera's size.
+        """
+        chosen = spread(paths, MOST_PHOTOGRAPHS)
+        frames = read_frames(chosen, world.object.camera, world.camera.width, world.camera.height) if chosen else ()
+        return cls.of_own_reading(world, torch.from_numpy(frames), predict) if len(frames) else None
 
     def __len__(self) -> int:
         """How many photographs teach."""

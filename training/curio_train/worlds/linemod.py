@@ -11,14 +11,19 @@ Constants fixed before any training:
   0.3 to 1.25 times as bright, and tinted, in crops; 0.5 to 1.25 times, and a little tinted, in frames read by a gaze.
 """
 
+from collections.abc import Callable
 from pathlib import Path
+
+from torch import Tensor
 
 from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
 from curio_train.data.bop import BopDataset
 from curio_train.data.photographs import Photographs
 from curio_train.errors import UsageError
+from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.gaze import GazeWorld
+from curio_train.worlds.lessons import Lessons
 from curio_train.worlds.options import LinemodOptions
 from curio_train.worlds.single_object import Object, SingleObjectWorld, pose_layout, position_field, squeezed
 
@@ -35,11 +40,26 @@ class Linemod(SingleObjectWorld):
         super().__init__(thing, squeezed(thing.camera, SIDE_PX), pose_layout(position_field(thing), confidence=False))
 
 
+class LinemodGaze(GazeWorld):
+    """One LineMOD object read at two looks, in frames of which some may be there without labels."""
+
+    def __init__(self, thing: Object, photographs: Path | None) -> None:
+        """Nothing of the photographs is read before they are asked for."""
+        super().__init__(Linemod.name, thing)
+        self._photographs = photographs
+
+    def lessons(self, predict: Callable[[Tensor], SceneCode]) -> Lessons | None:
+        """Of the photographs, if there are any."""
+        if self._photographs is None:
+            return None
+        return Lessons.of_files(self, Photographs(self._photographs).paths, predict)
+
+
 def build(options: LinemodOptions) -> SingleObjectWorld:
     """The world of one LineMOD class, to be read at two looks or at one.
 
     Raises:
-        UsageError: Unknown class, or no data.
+        UsageError: Unknown class, no data, or photographs without a gaze.
         DataError: The folder is not a BOP data set, or lacks the class.
         MeshError: The mesh is broken.
     """
@@ -69,4 +89,8 @@ def build(options: LinemodOptions) -> SingleObjectWorld:
         return ClutterBackgrounds.cached(cache, others)
 
     thing = Object(kind, mesh, dataset.camera, NEAR_M, FAR_M, backgrounds)
-    return GazeWorld(Linemod.name, thing) if options.gaze else Linemod(thing)
+    if not options.gaze:
+        if options.photos is not None:
+            raise UsageError(f"--photos {options.photos}: they teach the second look of a gaze; leave out --no-gaze")
+        return Linemod(thing)
+    return LinemodGaze(thing, options.photos)

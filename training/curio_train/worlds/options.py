@@ -16,6 +16,7 @@ _GAZE_RECIPE: Mapping[str, Any] = {
     "warm_up_steps": 100,
     "gradient_clip": 1.0,
     "budget_images": 240_000,
+    "self_training": 0.5,
 }
 
 
@@ -67,6 +68,8 @@ class LinemodOptions(WorldOptions):
         data: Folder in BOP's layout (lm or lmo) with models, models_info.json and camera.json.
         download: Without --data, fetch LineMOD from BOP's repository into the cache folder, once; some gigabytes.
         backgrounds: Folder of photographs to see the object in front of; clutter is rendered where none is given.
+        photos: Folder of unlabelled frames of the data set's camera, from which a gaze learns towards the end, with the
+            poses that it reads there itself (--self-training). None are used unless given.
         gaze: Look twice: at the whole frame for the place, at a crop around it for the rest. Without, the paper's one
             encoder sees the frame squeezed to 128x128.
     """
@@ -77,12 +80,13 @@ class LinemodOptions(WorldOptions):
     class_name: Annotated[str, tyro.conf.arg(name="class")]
     data: Path | None = None
     backgrounds: Path | None = None
+    photos: Path | None = None
     gaze: tyro.conf.FlagCreatePairsOff[bool] | bool = True
     download: tyro.conf.FlagCreatePairsOff[bool] = False
 
     def __post_init__(self) -> None:
         """Make paths absolute."""
-        _make_absolute(self, "data", "backgrounds")
+        _make_absolute(self, "data", "backgrounds", "photos")
 
 
 @dataclass(frozen=True)
@@ -121,7 +125,7 @@ class CaptureOptions(WorldOptions):
     """
 
     default_method: ClassVar[Method] = "sleep"
-    default_recipe: ClassVar[Mapping[str, Any]] = {**_GAZE_RECIPE, "self_training": 0.5}
+    default_recipe: ClassVar[Mapping[str, Any]] = _GAZE_RECIPE
 
     mesh: tuple[Path, ...]
     camera: Path
