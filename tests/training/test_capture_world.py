@@ -100,6 +100,12 @@ def test_an_unpainted_part_has_any_colour_and_says_which(world: Capture) -> None
     assert second.code_loss(wrong, scenes) > second.code_loss(right, scenes)
 
 
+def test_before_a_plate_crops_have_more_turns(folder: Path, world: Capture) -> None:
+    elsewhere = build(options(folder, background=None))
+    assert world.turns.count(0) == elsewhere.turns.count(0) == 1
+    assert len(world.turns) > len(elsewhere.turns)
+
+
 def test_a_painted_part_keeps_its_colours(folder: Path, tmp_path: Path) -> None:
     shape = trimesh.load_mesh(folder / "bracket.stl")
     shape.visual.vertex_colors = np.tile([200, 30, 30, 255], (len(shape.vertices), 1))

@@ -57,8 +57,8 @@ FIRST_LOOK_SHARE = 4
 CROP_PX, FILL = 64, 0.6
 LARGEST_OFFSET, LARGEST_LOG_SCALE = 0.25, 0.25
 ABSENT_SHARE = 1 / 7
-TURNS = (0, 1, 1)
-"""Which look each step teaches: rotation takes longer than place."""
+TURNS, TURNS_IN_KNOWN_SCENE = (0, 1, 1), (0, 1, 1, 1, 1)
+"""Which look each step teaches: rotation takes longer than place, most of all before a known scene."""
 
 _PLACE_SCALE_PX = 2.0  # of the first look's pixels: what counts as near
 _DEPTH_SCALE = 0.1  # of the logarithm
@@ -95,8 +95,8 @@ class GazeWorld(SingleObjectWorld):
 
     @property
     def turns(self) -> tuple[int, ...]:
-        """Two steps for the crop after each for the frame."""
-        return TURNS
+        """A step for the frame, then several for the crop."""
+        return TURNS_IN_KNOWN_SCENE if self.object.known_scene else TURNS
 
     @property
     def exposure(self) -> Exposure:
