@@ -1,5 +1,6 @@
 """What a gaze is taught of photographs agrees with what they show, and nothing is taught of what was not found."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -129,12 +130,20 @@ class Remembering(nn.Module):
         return {name: value[: len(images)] for name, value in self.code.items()}
 
 
-def test_photographs_make_up_their_share_once_they_are_read(
-    world: GazeWorld, truth: SceneCode, frames: Tensor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(world, "lessons", lambda predict: Lessons.of_own_reading(world, frames, predict))
+class Photographed(GazeWorld):
+    """A gaze with photographs."""
+
+    def __init__(self, thing: Object, frames: Tensor) -> None:
+        super().__init__("photographed", thing)
+        self.frames = frames
+
+    def lessons(self, predict: Callable[[Tensor], SceneCode]) -> Lessons | None:
+        return Lessons.of_own_reading(self, self.frames, predict)
+
+
+def test_photographs_make_up_their_share_once_they_are_read(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
     network = Remembering(roughly(truth)).train()
-    training = SelfTraining(network, world, 0.25, torch.device("cpu"))
+    training = SelfTraining(network, Photographed(world.object, frames), 0.25, torch.device("cpu"))
     look = world.looks[1]
     code = look.sample(8, (1,))
     images = look.render(code)
