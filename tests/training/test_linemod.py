@@ -151,10 +151,15 @@ def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
     cv2.imwrite(str(frames / "9.png"), grey[:96])
     with pytest.raises(DataError, match=r"9\.png"):
         taught.lessons(lambda images: taught.sample(len(images), (1,)))
+    with pytest.raises(DataError, match=r"9\.png"):  # before an hour is lost, too
+        prepared(RunConfig(LinemodOptions("ape", data, photos=frames), method="sleep"), tmp_path, print, print)
 
 
-def test_a_run_without_such_frames_says_so(data, photographs, tmp_path):
-    for photos, share in ((None, 0.0), (photographs, 0.5)):
+def test_a_run_without_such_frames_says_so(data, tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    cv2.imwrite(str(frames / "0.png"), np.zeros((480, 640, 3), np.uint8))
+    for photos, share in ((None, 0.0), (frames, 0.5)):
         options = LinemodOptions("ape", data, photos=photos)
         config = RunConfig(options, method="sleep", recipe=preset_recipe("laptop", LinemodOptions))
         assert prepared(config, tmp_path, print, print).recipe.self_training == share

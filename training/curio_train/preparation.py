@@ -29,7 +29,9 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
     if isinstance(options, LinemodOptions) and options.data is None and options.download:
         from curio_train.data.download import download_linemod
 
-        return replace(config, world=replace(options, data=download_linemod(cache), download=False))
+        config = replace(config, world=replace(options, data=download_linemod(cache), download=False))
+    if isinstance(config.world, LinemodOptions):
+        _refuse_unreadable(config.world)
     if isinstance(options, CaptureOptions):
         from curio_train.doctor.before_training import refuse_unfit
 
@@ -37,6 +39,18 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
             warn(doubt)
         return replace(config, world=_with_paint(options, tell))
     return config
+
+
+def _refuse_unreadable(options: LinemodOptions) -> None:
+    """Frames for self-training are first needed when most of the budget is spent: too late to hear of a broken one."""
+    if options.photos is None or options.data is None:
+        return
+    from curio_train.data.bop import BopDataset
+    from curio_train.data.photographs import Photographs, read_frame
+
+    camera = BopDataset(options.data).camera
+    for path in Photographs(options.photos).paths:
+        read_frame(path, camera)
 
 
 def _with_paint(options: CaptureOptions, tell: Callable[[str], None]) -> CaptureOptions:

@@ -20,7 +20,7 @@ _NUM_CLEAREST = 16  # of 256 patches
 SCALES, _MIDDLE = (1 / 1.18, 1.0, 1.18), 1
 """Of the distance that the last crops are placed by."""
 
-_OVERSAMPLING = 2  # a crop is sampled at so many points a pixel and side, then averaged: no aliasing of near objects
+OVERSAMPLING = 2  # a crop is sampled at so many points a pixel and side, then averaged: no aliasing of near objects
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,14 +85,14 @@ class GazeNetwork(nn.Module):
         optics, place = self._optics, places.flatten(0, 1)
         depth = place.norm(dim=1, keepdim=True).clamp(min=optics.near_m)  # along the crop camera's axis
         matrix = self._matrix.expand(place.shape[0], 3, 3)
-        side = _OVERSAMPLING * optics.crop_px
+        side = OVERSAMPLING * optics.crop_px
         gaze = gaze_at(place, optics.fill * side * depth[:, 0] / optics.diameter_m, side, matrix)
         grid = sampling_grid(gaze, matrix, side, images.shape[3], images.shape[2])
         # The crops of an image in one tall grid: no frame is copied.
         tall = grid.view(-1, places.shape[1] * side, side, 2)
         fine = F.grid_sample(images, tall, padding_mode="border", align_corners=False)
         crops = fine.unflatten(2, (places.shape[1], side)).transpose(1, 2).flatten(0, 1)
-        code = self.second(F.avg_pool2d(crops, _OVERSAMPLING))
+        code = self.second(F.avg_pool2d(crops, OVERSAMPLING))
         relative = code[TRANSLATION][:, 0]
         seen = torch.cat([relative[:, :2] * optics.diameter_m, relative[:, 2:] * depth], dim=-1)
         back = gaze.rotation.transpose(1, 2)

@@ -20,6 +20,7 @@ from torch import Tensor
 from curio_train.camera import gaze_at, sampling_grid
 from curio_train.data.photographs import read_frames
 from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.networks.gaze import OVERSAMPLING
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.gaze import CROP_PX, FILL, GazeWorld
 from curio_train.worlds.refinement import Refinement
@@ -27,7 +28,6 @@ from curio_train.worlds.refinement import Refinement
 MOST_PHOTOGRAPHS = 300
 """They are kept in memory, and each takes a sixth of a second to be refined."""
 
-_OVERSAMPLING = 2  # points a pixel and side at which a crop is sampled, as the network samples its own
 _READ_AT_ONCE = 20
 _GAINS = (0.8, 1.25)  # of crops: light changes, and all else is the camera's own
 
@@ -107,7 +107,7 @@ class Lessons:
         position_m, matrix = code[TRANSLATION][:, 0], self._matrix.expand(count, 3, 3)
         place = self._look.mistaken(position_m, random)
         assumed = place.norm(dim=1)
-        side = _OVERSAMPLING * CROP_PX
+        side = OVERSAMPLING * CROP_PX
         gaze = gaze_at(place, FILL * side * assumed / self._look.object.kind.diameter_m, side, matrix)
         height, width = self._frames.shape[2:]
         grid = sampling_grid(gaze, matrix, side, width, height)
@@ -116,5 +116,5 @@ class Lessons:
         rotation = gaze.rotation @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
         code[LIGHT] = (gaze.rotation @ code[LIGHT][..., None])[..., 0]
         gain = torch.from_numpy(random.uniform(*_GAINS, (count, 1, 1, 1))).float()
-        crops = (gain * F.avg_pool2d(fine, _OVERSAMPLING)).clamp(0, 1)
+        crops = (gain * F.avg_pool2d(fine, OVERSAMPLING)).clamp(0, 1)
         return self._look.labelled(code, turned, rotation, assumed[:, None]), crops
