@@ -20,7 +20,7 @@ from curio_train.evaluation.results import load_rows, save_results
 from curio_train.evaluation.run_queue import QueuedRun, carry_out
 
 Scene = Literal["sphere_real", "bunny", "shapes"]
-Method = Literal["noncur", "our", "sleep", "wake_sleep"]
+Method = Literal["noncur", "our", "sleep", "sleep_cells"]
 
 _PARTS = {
     "sphere_real": (["sphere"], ["--counts", "3"]),
@@ -48,7 +48,7 @@ class Settings:
     """
 
     only: tuple[Scene, ...] = ("sphere_real", "bunny", "shapes")
-    methods: tuple[Method, ...] = ("noncur", "sleep", "our")
+    methods: tuple[Method, ...] = ("noncur", "sleep", "sleep_cells", "our")
     images: int = 16_000
     photos: int = 200
     tests: int = 50
@@ -70,7 +70,8 @@ def _run(settings: Settings, scene: str, method: str) -> QueuedRun:
     flags += [*amounts, "--camera", str(files / "camera.json"), "--photos", str(files / "photos")]
     flags += ["--plane", str(files / "views.json"), "--background", str(files / "plates" / "a-0.png")]
     flags += ["--held-out", str(files / "test" / "a"), "--second", str(files / "test" / "b")]
-    flags += ["--second-background", str(files / "plates" / "b.png"), "--method", method]
+    flags += ["--second-background", str(files / "plates" / "b.png"), "--method", method.removesuffix("_cells")]
+    flags += ["--reading", "cells" if method.endswith("_cells") else "whole"]
     flags += ["--batch-size", str(_BATCH_SIZE), "--micro-batch-size", str(_BATCH_SIZE)]
     folder = settings.runs / f"{scene}-{settings.images}" / method
     name = f"{scene} {method}, {settings.images:,} images"

@@ -28,7 +28,7 @@ BUDGETS = {"circles": 48_000, "spheres": 32_000, "chairs": 32_000, "varied": 32_
 SEVERAL_SEEDS = {"circles", "spheres"}
 _SEEDED = {"super_1.0", "noncur", "our"}
 # Quick ones first, so that a reference is there early.
-_METHODS = ("super_1.0", "sleep", "noncur", "super_0.1", "super_0.05", "our")
+_METHODS = ("super_1.0", "sleep", "sleep_cells", "noncur", "super_0.1", "super_0.05", "our")
 _ABLATIONS = ("wake_sleep", "wake_sleep_critic")
 _ABLATED = {"circles", "spheres", "varied"}
 
@@ -75,7 +75,8 @@ def plan(settings: Settings) -> list[QueuedRun]:
 
 
 def _rows_of(world: str) -> tuple[str, ...]:
-    return (*_METHODS, *_ABLATIONS) if world in _ABLATED else _METHODS
+    rows = (*_METHODS, *_ABLATIONS) if world in _ABLATED else _METHODS
+    return tuple(row for row in rows if row != "sleep_cells" or world != "circles")  # one thing alone needs no cells
 
 
 def _run(settings: Settings, world: str, method: str, seed: int) -> QueuedRun:
@@ -85,6 +86,8 @@ def _run(settings: Settings, world: str, method: str, seed: int) -> QueuedRun:
     flags = ["--method", method, "--preset", settings.preset, "--seed", str(seed)]
     if method.startswith("super"):
         flags[1:2] = ["super", "--labels", method.removeprefix("super_")]
+    if method.endswith("_cells"):
+        flags[1:2] = [method.removesuffix("_cells"), "--reading", "cells"]
     return QueuedRun(f"{world} {method} seed {seed}, {images:,} images", folder, world, images, flags)
 
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 from curio_train.config import NetworkConfig
 from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, gradient_penalty
-from curio_train.learning.losses import image_loss, supervised_loss
+from curio_train.learning.losses import image_loss
 from curio_train.learning.sleep import sleep_codes
+from curio_train.metrics.assignment import scene_error
 from curio_train.networks.critic import Critic
 from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Camera, ImageSource, Split, World
@@ -48,14 +49,14 @@ def test_image_loss_sums_over_pixels_and_channels_and_averages_over_images() -> 
 )
 def test_supervised_loss_is_eq_1(predicted: SceneCode, expected: float) -> None:
     true = scene((0.5, 1.0), (0.0, 0.0))
-    assert supervised_loss(LAYOUT, predicted, true, ((0, 1),)).item() == pytest.approx(expected, abs=1e-6)
+    assert scene_error(LAYOUT, predicted, true, ((0, 1),)).item() == pytest.approx(expected, abs=1e-6)
 
 
 def test_supervised_loss_leads_each_prediction_to_its_own_object() -> None:
     true = scene((0.5, 1.0), (-0.5, 1.0))
     predicted = scene((-0.4, 1.0), (0.3, 1.0))
     predicted[TRANSLATION].requires_grad_()
-    supervised_loss(LAYOUT, predicted, true, ((0, 1),)).backward()
+    scene_error(LAYOUT, predicted, true, ((0, 1),)).mean().backward()
     assert predicted[TRANSLATION].grad[0, :, 0].tolist() == pytest.approx([0.5, -0.5])
 
 

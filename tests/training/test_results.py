@@ -23,6 +23,7 @@ def evaluation(method: str, seed: int = 0, **found: Any) -> dict[str, Any]:
     return {
         "world": "spheres",
         "method": method,
+        "reading": "whole",
         "labels": 1.0 if method == "super" else 0.0,
         "seed": seed,
         "images_seen": 640,
@@ -51,6 +52,11 @@ def test_a_row_is_the_mean_of_its_seeds_and_its_ratio_to_full_supervision() -> N
 def test_shares_of_labels_are_rows_of_their_own() -> None:
     rows = merge({}, collect([evaluation("super", labels=share) for share in (1.0, 0.1, 0.05)]))["spheres"]
     assert list(rows) == ["super_1.0", "super_0.1", "super_0.05"]
+
+
+def test_images_read_by_cells_are_a_row_of_their_own() -> None:
+    rows = merge({}, collect([evaluation("sleep"), evaluation("sleep", reading="cells"), evaluation("super")]))
+    assert list(rows["spheres"]) == ["super_1.0", "sleep", "sleep_cells"]
 
 
 def test_without_the_reference_there_is_no_ratio_yet() -> None:

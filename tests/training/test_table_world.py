@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 from curio_train import cli
-from curio_train.config import METHODS, Method, Recipe, RunConfig
+from curio_train.config import METHODS, NetworkConfig, Recipe, RunConfig
 from curio_train.data.meshes import load_mesh
 from curio_train.doctor.before_training import refuse_unfit
 from curio_train.errors import CameraError, DataError, UsageError
@@ -158,12 +158,11 @@ def test_draws_lie_where_photographs_show_parts(folder: Path, world: Table) -> N
     assert float(changed.min()) > 0.005, "each draw is seen"
 
 
-@pytest.mark.parametrize("method", ["our", "noncur", "sleep", "wake_sleep"])
-def test_a_few_steps_bring_photographs_or_dreams_nearer(
-    world: Table, folder: Path, tmp_path: Path, method: Method
-) -> None:
+@pytest.mark.parametrize("row", ["our", "noncur", "sleep", "wake_sleep", "sleep_cells"])
+def test_a_few_steps_bring_photographs_or_dreams_nearer(world: Table, folder: Path, tmp_path: Path, row: str) -> None:
+    method, network = row.removesuffix("_cells"), NetworkConfig(reading="cells" if row.endswith("_cells") else "whole")
     recipe = Recipe(batch_size=NUM, micro_batch_size=NUM, learning_rate=1e-3, gradient_clip=1.0, critic_weight=0.1)
-    config = RunConfig(options(folder), method=method, recipe=recipe)
+    config = RunConfig(options(folder), method=method, recipe=recipe, network=network)
     source = world.source("train", 0, with_code=False, cache=tmp_path)
     fixed = world.sample(NUM, (5,))
     with ranks("cpu") as here:
@@ -299,7 +298,8 @@ def test_the_benchmark_asks_for_worlds_that_there_are(monkeypatch: pytest.Monkey
         command = cli._parse([run.world, "--images", str(run.images), *run.flags])
         world = command.config.world
         assert isinstance(world, CaptureOptions)
-        assert (command.config.method, world.lying, len(world.amounts)) == (method, scene == "bunny", len(world.mesh))
+        assert (world.lying, len(world.amounts)) == (scene == "bunny", len(world.mesh))
+        assert command.config.method + "_cells" * (command.config.network.reading == "cells") == method
 
 
 def test_pictures_that_do_not_belong_together(folder: Path, tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from curio_train.config import ConvStack, Method, NetworkConfig, Recipe, RunConf
 from curio_train.errors import DataError
 from curio_train.geometry import matrix_from_yaw
 from curio_train.learning.loop import Trainer
-from curio_train.learning.losses import supervised_loss
 from curio_train.learning.parallel import Ranks
+from curio_train.metrics.assignment import scene_error
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW, index
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.mesh_world import MeshWorld
@@ -284,6 +284,6 @@ def reading_error(world: MeshWorld, trainer: Trainer) -> Callable[[], float]:
     @torch.no_grad()
     def error() -> float:
         network = copy.deepcopy(trainer.state.looks[0])  # normalises by this batch, and the statistics of runs stay
-        return supervised_loss(world.layout, network(images), code, groups).item()
+        return scene_error(world.layout, network(images), code, groups).mean().item()
 
     return error

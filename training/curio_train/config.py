@@ -15,6 +15,7 @@ from curio_train.errors import UsageError
 Term = Literal["image", "curiosity", "sleep", "label"]
 Method = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic"]
 Preset = Literal["laptop", "paper"]
+Reading = Literal["whole", "cells"]
 
 METHODS: Mapping[Method, frozenset[Term]] = {
     "our": frozenset({"image", "curiosity"}),
@@ -56,6 +57,9 @@ class NetworkConfig:
         encoder: 2,029,056 parameters, 128 → 30 → 14 → 7 → 4 → 1 pixels.
         critic: 1,883,713 parameters, 128 → 30 → 7 → 4 → 2 → 1 pixels.
         critic_normalisation: Both worked for the paper; its results use "batch".
+        reading: How images of generated worlds and of parts on a plane are read. whole: the paper's way, all of a scene
+            from one latent code. cells: every cell of the image says what is there, and slots are filled afterwards.
+            Parts on a plane are read by cells unless given, all else as a whole.
         row: Values each object slot gets from the shared trunk.
         hidden: Width of each branch's hidden layer.
     """
@@ -65,6 +69,7 @@ class NetworkConfig:
     )
     critic: Suppress[ConvStack] = ConvStack((64, 192, 384, 256, 1), (11, 5, 3, 3, 3), (4, 4, 2, 2, 2), (0, 0, 1, 1, 1))
     critic_normalisation: Literal["batch", "instance"] = "batch"
+    reading: Reading | None = None
     row: int = 32
     hidden: int = 64
 

@@ -9,7 +9,7 @@ PAPER: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "shapes": {"noncur": (0.54, 0.46), "our": (0.37, 0.29)},
 }
 """DSSIM sharp and blurred (paper, section "Real world data")."""
-METHODS: Sequence[str] = ("noncur", "our", "sleep", "wake_sleep")
+METHODS: Sequence[str] = ("noncur", "our", "sleep", "sleep_cells")
 
 Row = dict[str, Any]
 Table = dict[str, dict[str, Row]]
@@ -42,8 +42,9 @@ def markdown(table: Table, command: str) -> str:
         " what was read in the first camera's, drawn from there over its plate; *blurred*: both behind a 9x9 Gaussian"
         " filter. Smaller is better. Photographs are stand-ins ([recipe](../recipes/capture.md)), so the paper's"
         " figures, in brackets, are of other photographs: what compares is the order of methods. `sleep` and"
-        " `wake_sleep` go beyond the paper: they learn from renderings of codes that the world draws itself, synthetic"
-        " labels in the sense of the paper's LineMOD table. Nobody labels anything in any row.",
+        " `sleep_cells` go beyond the paper: they learn from renderings of codes that the world draws itself, synthetic"
+        " labels in the sense of the paper's LineMOD table; the latter with another network, which reads images cell by"
+        " cell (`--reading cells`, usual on a plane). Nobody labels anything in any row.",
         _errors(table),
         "*Empty plate*: the error of finding nothing at all.",
         "## How they were made",

@@ -31,6 +31,7 @@ ORDER: Sequence[str] = (
     "wake_sleep_critic",
     "wake_sleep",
     "sleep",
+    "sleep_cells",
 )
 """Of the methods in tables: the paper's, then what goes beyond it."""
 WORLDS: Sequence[str] = ("circles", "spheres", "chairs", "varied", "multi", "light")
@@ -40,9 +41,10 @@ _PARAMETERS = ("color_mse", "rotation_deg", "confidence_mse", "light_deg")
 _M_PER_MM = 1e-3
 
 
-def method_name(method: str, labels: float) -> str:
-    """The name of a row: of supervision with its share of labels."""
-    return f"super_{labels:g}" if labels not in (0, 1) else REFERENCE if method == "super" else method
+def method_name(method: str, labels: float, reading: str) -> str:
+    """The name of a row: of supervision with its share of labels, of images read by cells with those."""
+    of_method = f"super_{labels:g}" if labels not in (0, 1) else REFERENCE if method == "super" else method
+    return of_method if reading == "whole" else f"{of_method}_{reading}"
 
 
 def collect(evaluations: Iterable[Mapping[str, Any]]) -> Results:
@@ -53,7 +55,8 @@ def collect(evaluations: Iterable[Mapping[str, Any]]) -> Results:
     """
     runs: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for found in evaluations:
-        runs.setdefault((found["world"], method_name(found["method"], found["labels"])), []).append(found)
+        name = method_name(found["method"], found["labels"], found["reading"])
+        runs.setdefault((found["world"], name), []).append(found)
     results: Results = {}
     for (world, method), of_row in runs.items():
         results.setdefault(world, {})[method] = _row(world, sorted(of_row, key=lambda found: found["seed"]))

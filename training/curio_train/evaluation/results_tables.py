@@ -23,6 +23,7 @@ _COLOURS: Mapping[str, str] = {
     "wake_sleep_critic": "#46bdc6",
     "wake_sleep": "#ff6d01",
     "sleep": "#8a63c8",
+    "sleep_cells": "#5f3b9e",
 }
 _NOTHING = "–"
 Figures = Mapping[str, Sequence[float]]
@@ -37,7 +38,8 @@ def markdown(results: Results, command: str) -> str:
         f"Written by `{command}` from [worlds.json](worlds.json). Ratios to `{REFERENCE}`, the same network with all"
         " true codes and as many images; the paper's stand in brackets. *Img* is DSSIM from a novel view, *Para* is"
         " Eq. 1. `sleep`, `wake_sleep` and `wake_sleep_critic` go beyond the paper: they learn from renderings of codes"
-        " drawn from the world's known range, synthetic labels in the sense of the paper's LineMOD table.",
+        " drawn from the world's known range, synthetic labels in the sense of the paper's LineMOD table. `sleep_cells`"
+        " learns so too, with another network, which reads images cell by cell (`--reading cells`).",
         "![Ratios by world](worlds.png)",
         "## Table 2: Img",
         _ratios(results, others, lambda row: row["img_ratio"], paper.IMG),

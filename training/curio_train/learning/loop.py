@@ -21,7 +21,7 @@ from curio_train.learning.ahead import Ahead
 from curio_train.learning.checkpoint import RunFolder
 from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, gradient_penalty
 from curio_train.learning.interruption import Interruption
-from curio_train.learning.losses import image_loss, supervised_loss
+from curio_train.learning.losses import image_loss
 from curio_train.learning.parallel import Ranks
 from curio_train.learning.progress import Reporter
 from curio_train.learning.recoloring import recolored
@@ -69,7 +69,7 @@ class Trainer:
             ranks: This process among those that train together.
 
         Raises:
-            UsageError: A world of several looks can only be learned asleep.
+            UsageError: The world, or its network, does not go with the method.
         """
         if len(world.looks) > 1 and config.terms != {"sleep"}:
             raise UsageError(
@@ -108,7 +108,6 @@ class Trainer:
         turn = self._turn(self.state.course.step)
         world, source = self.world.looks[turn], self._sources[turn]
         network = self.state.looks[turn]
-        groups = tuple(kind.slots for kind in world.objects)
         sums: Counter[str] = Counter()
         for learner in self.state.learners.values():
             learner.optimizer.zero_grad()
@@ -133,7 +132,7 @@ class Trainer:
                 with frozen(critic.network):
                     losses["curiosity"] = curiosity_loss(self._judge, rendered)
             if "label" in terms and batch.code is not None:
-                losses["label"] = supervised_loss(world.layout, code, batch.code, groups)
+                losses["label"] = world.code_loss(code, batch.code)
 
             # Asleep: render codes of one's own making, read them back.
             if "sleep" in terms:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
 from curio_train.config import RunConfig
+from curio_train.errors import UsageError
 from curio_train.learning.muon import Muon
 from curio_train.networks.critic import Critic
 from curio_train.worlds.base import World
@@ -115,9 +116,22 @@ class TrainState:
     """
 
     def __init__(self, config: RunConfig, world: World, device: torch.device) -> None:
+        """Everything before the first step.
+
+        Raises:
+            UsageError: The world's images cannot be read so, or what is read so cannot be learned by the method.
+        """
+        reading = config.network.reading
+        if reading is not None and reading not in world.readings:
+            raise UsageError(f"--reading {reading}: images of {world.name} cannot be read so; leave it out")
         torch.manual_seed(config.seed)
         self.course = Course()
         self.looks = [look.network(config.network) for look in world.looks]
+        if config.terms > {"sleep"} and not self.looks[0].has_raw_values:
+            raise UsageError(
+                f"--method {config.method} dreams around what it reads, which cells do not allow: expected --method "
+                "sleep, or --reading whole"
+            )
         recipe = config.recipe
         self.pose = Learner(world.assemble(self.looks).to(device), recipe.learning_rate, recipe.matrix_learning_rate)
         self.critic: Learner[Critic] | None = None

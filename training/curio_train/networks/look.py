@@ -14,6 +14,8 @@ class Look(nn.Module, ABC):
     """
 
     encoder: nn.Module
+    has_raw_values = True
+    """Whether :meth:`decode` gives what wake–sleep perturbs."""
 
     @abstractmethod
     def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

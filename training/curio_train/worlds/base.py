@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from curio_train.config import NetworkConfig
+from curio_train.config import NetworkConfig, Reading
 from curio_train.data.bop import ModelInfo
 from curio_train.errors import UsageError
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
@@ -147,6 +147,8 @@ class World(ABC):
     camera: Camera
     objects: tuple[ObjectKind, ...]
     mesh: "Mesh | None" = None
+    readings: ClassVar[tuple[Reading, ...]] = ("whole",)
+    """How its images can be read (``NetworkConfig.reading``), what is usual first."""
     colors_interchangeable: ClassVar[bool] = False
     """Whether scenes with their colours' channels exchanged are as likely, and look like their images so changed."""
 
@@ -181,7 +183,10 @@ class World(ABC):
         return
 
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
-        """What sleep makes small: the paper's Eq. 1, mean over the batch."""
+        """What sleep and full supervision make small: the paper's Eq. 1, mean over the batch.
+
+        It is the very figure that codes are scored by; its assignment of slots has no gradient.
+        """
         groups = tuple(kind.slots for kind in self.objects)
         return scene_error(self.layout, predicted, true, groups).mean()
 
@@ -202,7 +207,7 @@ class World(ABC):
         as [batch, slots]. Worlds with other fields (yaw, light in the world frame) extend this, :attr:`exported_fields`
         and :meth:`from_exported`.
         """
-        outputs = dict(code)
+        outputs = {field.name: code[field.name] for field in self.layout.fields}
         if ROTATION_6D in code:
             outputs["rotation"] = matrix_from_rotation_6d(code[ROTATION_6D])
             outputs[ROTATION_6D] = rotation_6d_from_matrix(outputs["rotation"])

@@ -77,6 +77,7 @@ class GroundWorld(MeshWorld):
     """Objects of 15 to 40 pixels: measured, half the usual number costs 0.001 of the gradients' cosine."""
 
     object_shadows = True
+    on_plane = True
 
     def __init__(
         self,
@@ -129,7 +130,7 @@ class GroundWorld(MeshWorld):
     def exported(self, code: SceneCode) -> dict[str, Tensor]:
         """The physical outputs of an exported model, in the camera frame, see :meth:`World.exported`."""
         turn, shift = self._cam_from_world(code[TRANSLATION])
-        outputs = {name: value for name, value in code.items() if name != YAW}
+        outputs = {field.name: code[field.name] for field in self.layout.fields if field.name != YAW}
         outputs[TRANSLATION] = code[TRANSLATION] @ turn.T + shift
         outputs["rotation"] = turn @ self.own_rotation(code)
         outputs[ROTATION_6D] = rotation_6d_from_matrix(outputs["rotation"])

@@ -6,8 +6,9 @@ Spheres, Varied, Chairs, Multi and Light differ in their meshes, fields and draw
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,8 +16,12 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from curio_train.config import NetworkConfig, Reading
 from curio_train.data.meshes import Mesh
 from curio_train.geometry import Pose, direction_from_hemisphere, matrix_from_yaw
+from curio_train.networks.cells import AMOUNTS, CellNetwork, cell_error
+from curio_train.networks.grid import CellGrid
+from curio_train.networks.look import Look
 from curio_train.rendering.ground import Ground
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, YAW, Layout, SceneCode
@@ -78,10 +83,13 @@ class MeshWorld(World):
         kinds: The objects.
         outline_samples: Points on each object's outline, for the gradient.
         object_shadows: Whether objects stand in each other's light.
+        on_plane: Whether they lie on the plane y = 0.
     """
 
+    readings: ClassVar[tuple[Reading, ...]] = ("whole", "cells")
     outline_samples = 512
     object_shadows = False
+    on_plane = False
 
     def __init__(self, layout: Layout, kinds: Sequence[Kind], stage: Stage) -> None:
         """Build the renderer.
@@ -141,6 +149,33 @@ class MeshWorld(World):
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> StoredImages:
         """2,000, 500 and 500 images, the paper's numbers."""
         return stored(self, self.recipe, split, seed, with_code=with_code, cache=cache)
+
+    def network(self, config: NetworkConfig) -> Look:
+        """The paper's, or one that reads cell by cell."""
+        if (config.reading or self.readings[0]) == "whole":
+            return super().network(config)
+        return CellNetwork(self.layout, self._slots_of_kinds, self._new_grid())
+
+    def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
+        """Eq. 1, or where cells were read what is wrong with them, mean over the batch."""
+        if AMOUNTS not in predicted:
+            return super().code_loss(predicted, true)
+        grid = self._grid.to(true[TRANSLATION].device)
+        return cell_error(self.layout, self._slots_of_kinds, grid, predicted, true).mean()
+
+    @property
+    def _slots_of_kinds(self) -> tuple[tuple[int, ...], ...]:
+        return tuple(kind.slots for kind in self.objects)
+
+    @cached_property
+    def _grid(self) -> CellGrid:
+        return self._new_grid()
+
+    def _new_grid(self) -> CellGrid:
+        assert self.camera.matrix is not None
+        size = self.camera.width, self.camera.height
+        position = self.layout[TRANSLATION]
+        return CellGrid(position, self.camera.matrix, self.stage.cam_from_world, size, on_plane=self.on_plane)
 
     def light(self, code: SceneCode) -> Float[Tensor, "batch 3"]:
         """Towards the sun, world frame; its length is the strength."""
