@@ -52,7 +52,7 @@ class Settings:
     images: int = 16_000
     photos: int = 200
     tests: int = 50
-    jobs: int = min(2, os.cpu_count() or 1)
+    jobs: int = min(2, len(os.sched_getaffinity(0)))
     runs: Path = Path("runs/captures")
     results: Path = Path("docs/results/captures.json")
     dry_run: bool = False

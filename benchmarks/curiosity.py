@@ -67,7 +67,7 @@ class Settings:
     world: Literal["circles", "spheres", "chairs", "varied", "multi", "light"] = "spheres"
     images: int = 16_000
     only: tuple[str, ...] = tuple(VARIANTS)
-    jobs: int = min(2, os.cpu_count() or 1)
+    jobs: int = min(2, len(os.sched_getaffinity(0)))
     runs: Path = Path("runs/curiosity")
     results: Path = Path("docs/results/curiosity.json")
 

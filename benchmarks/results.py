@@ -54,7 +54,7 @@ class Settings:
     images: int | None = None
     seeds: int = 3
     preset: Literal["laptop", "paper"] = "laptop"
-    jobs: int = min(2, os.cpu_count() or 1)
+    jobs: int = min(2, len(os.sched_getaffinity(0)))
     runs: Path = Path("runs/results")
     results: Path = Path("docs/results/worlds.json")
     dry_run: bool = False

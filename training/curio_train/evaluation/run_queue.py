@@ -100,7 +100,7 @@ def carry_out(runs: Sequence[QueuedRun], jobs: int, after_each: Callable[[], Non
     Returns:
         An exit status: 1 where a run failed, which is said on stderr with its log.
     """
-    threads = max(1, (os.cpu_count() or 1) // jobs)
+    threads = max(1, len(os.sched_getaffinity(0)) // jobs)
     left = [run for run in runs if not run.done]
     _say(f"{len(runs) - len(left)} of {len(runs)} runs are done")
     with ThreadPoolExecutor(jobs) as pool:
