@@ -27,8 +27,9 @@ World = Literal["circles", "spheres", "chairs", "varied", "multi", "light"]
 BUDGETS = {"circles": 48_000, "spheres": 32_000, "chairs": 32_000, "varied": 32_000, "multi": 32_000, "light": 32_000}
 SEVERAL_SEEDS = {"circles", "spheres"}
 _SEEDED = {"super_1.0", "noncur", "our"}
+_CELLS = ("sleep_cells", "super_1.0_cells")  # not in Circles: one thing alone needs none
 # Quick ones first, so that a reference is there early.
-_METHODS = ("super_1.0", "sleep", "sleep_cells", "noncur", "super_0.1", "super_0.05", "our")
+_METHODS = ("super_1.0", "sleep", *_CELLS, "noncur", "super_0.1", "super_0.05", "our")
 _ABLATIONS = ("wake_sleep", "wake_sleep_critic")
 _ABLATED = {"circles", "spheres", "varied"}
 
@@ -76,18 +77,17 @@ def plan(settings: Settings) -> list[QueuedRun]:
 
 def _rows_of(world: str) -> tuple[str, ...]:
     rows = (*_METHODS, *_ABLATIONS) if world in _ABLATED else _METHODS
-    return tuple(row for row in rows if row != "sleep_cells" or world != "circles")  # one thing alone needs no cells
+    return tuple(row for row in rows if row not in _CELLS or world != "circles")
 
 
 def _run(settings: Settings, world: str, method: str, seed: int) -> QueuedRun:
     own = BUDGETS[world] if settings.preset == "laptop" else PRESETS["paper"].budget_images
     images = settings.images or own
     folder = settings.runs / f"{world}-{settings.preset}-{images}" / f"{method.replace('.', '_')}-{seed}"
-    flags = ["--method", method, "--preset", settings.preset, "--seed", str(seed)]
-    if method.startswith("super"):
-        flags[1:2] = ["super", "--labels", method.removeprefix("super_")]
-    if method.endswith("_cells"):
-        flags[1:2] = [method.removesuffix("_cells"), "--reading", "cells"]
+    name = method.removesuffix("_cells")
+    learned = ["super", "--labels", name.removeprefix("super_")] if name.startswith("super") else [name]
+    reading = [] if name == method else ["--reading", "cells"]
+    flags = ["--method", *learned, *reading, "--preset", settings.preset, "--seed", str(seed)]
     return QueuedRun(f"{world} {method} seed {seed}, {images:,} images", folder, world, images, flags)
 
 

@@ -56,7 +56,8 @@ def test_shares_of_labels_are_rows_of_their_own() -> None:
 
 def test_images_read_by_cells_are_a_row_of_their_own() -> None:
     rows = merge({}, collect([evaluation("sleep"), evaluation("sleep", reading="cells"), evaluation("super")]))
-    assert list(rows["spheres"]) == ["super_1.0", "sleep", "sleep_cells"]
+    rows = merge(rows, collect([evaluation("super", reading="cells")]))
+    assert list(rows["spheres"]) == ["super_1.0", "sleep", "super_1.0_cells", "sleep_cells"]
 
 
 def test_without_the_reference_there_is_no_ratio_yet() -> None:

@@ -31,6 +31,7 @@ ORDER: Sequence[str] = (
     "wake_sleep_critic",
     "wake_sleep",
     "sleep",
+    "super_1.0_cells",
     "sleep_cells",
 )
 """Of the methods in tables: the paper's, then what goes beyond it."""
