@@ -77,6 +77,11 @@ def test_rays_above_the_horizon_do_not_lead_out_of_the_world(worlds: dict[str, M
     assert pixels.grad.isfinite().all()
 
 
+def test_what_is_not_before_the_camera_has_finite_pixels(worlds: dict[str, MeshWorld]) -> None:
+    pixels = grid_of(worlds["spheres"]).project(torch.tensor([[0.0, 0, 0], [0.1, 0.1, -1.0]]))
+    assert pixels.isfinite().all()
+
+
 def test_a_point_is_shared_out_among_the_cells_around_it(worlds: dict[str, MeshWorld]) -> None:
     grid = grid_of(worlds["spheres"])
     pixels = torch.tensor([[16.0, 24.0], [18.0, 24.0], [20.0, 28.0], [-40.0, 400.0]])

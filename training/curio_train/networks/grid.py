@@ -15,6 +15,7 @@ from curio_train.scene_code import Field
 STRIDE = 8
 """Pixels between cells; cell i looks at pixel i * STRIDE."""
 
+_LEAST_DEPTH_M = 1e-3
 _LEAST_DESCENT = 0.02  # of a ray's length: rays nearer to the horizon meet the plane too far away
 
 
@@ -65,9 +66,9 @@ class CellGrid(nn.Module):
         return nn.Buffer(torch.from_numpy(np.asarray(values)).float(), persistent=False)
 
     def project(self, position: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
-        """Pixels of positions in the world frame."""
+        """Pixels of positions in the world frame; far off, but finite, for those that are not before the camera."""
         seen = (position @ self._turn.T + self._shift) @ self._matrix.T
-        return seen[..., :2] / seen[..., 2:]
+        return seen[..., :2] / seen[..., 2:].clamp(min=_LEAST_DEPTH_M)
 
     def locate(self, pixels: Float[Tensor, "*batch 2"], along: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 3"]:
         """Positions in the world frame that are seen at pixels.
