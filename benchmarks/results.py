@@ -27,7 +27,8 @@ World = Literal["circles", "spheres", "chairs", "varied", "multi", "light"]
 BUDGETS = {"circles": 48_000, "spheres": 32_000, "chairs": 32_000, "varied": 32_000, "multi": 32_000, "light": 32_000}
 SEVERAL_SEEDS = {"circles", "spheres"}
 _SEEDED = {"super_1.0", "noncur", "our"}
-_CELLS = ("sleep_cells", "super_1.0_cells")  # not in Circles: one thing alone needs none
+# Not in Circles: one thing alone needs no cells.
+_CELLS = ("sleep_cells", "super_1.0_cells", "noncur_cells", "our_cells")
 # Quick ones first, so that a reference is there early.
 _METHODS = ("super_1.0", "sleep", *_CELLS, "noncur", "super_0.1", "super_0.05", "our")
 _ABLATIONS = ("wake_sleep", "wake_sleep_critic")

@@ -32,6 +32,8 @@ ORDER: Sequence[str] = (
     "wake_sleep",
     "sleep",
     "super_1.0_cells",
+    "noncur_cells",
+    "our_cells",
     "sleep_cells",
 )
 """Of the methods in tables: the paper's, then what goes beyond it."""

@@ -24,6 +24,8 @@ _COLOURS: Mapping[str, str] = {
     "wake_sleep": "#ff6d01",
     "sleep": "#8a63c8",
     "super_1.0_cells": "#9aa0a6",
+    "noncur_cells": "#b98900",
+    "our_cells": "#1e6b35",
     "sleep_cells": "#5f3b9e",
 }
 _NOTHING = "–"
@@ -40,8 +42,8 @@ def markdown(results: Results, command: str) -> str:
         " true codes and as many images; the paper's stand in brackets. *Img* is DSSIM from a novel view, *Para* is"
         " Eq. 1. `sleep`, `wake_sleep` and `wake_sleep_critic` go beyond the paper: they learn from renderings of codes"
         " drawn from the world's known range, synthetic labels in the sense of the paper's LineMOD table. Rows of"
-        " `…_cells` have another network, which reads images cell by cell (`--reading cells`), with full supervision in"
-        " `super_1.0_cells`.",
+        " `…_cells` have another network, which reads images cell by cell (`--reading cells`): full supervision, image"
+        " loss alone, the paper's loss, and sleep.",
         "![Ratios by world](worlds.png)",
         "## Table 2: Img",
         _ratios(results, others, lambda row: row["img_ratio"], paper.IMG),
@@ -62,7 +64,7 @@ def plot(results: Results, file: Path) -> None:
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     for panel, (name, figures) in zip(figure.subplots(1, 2), (("img", paper.IMG), ("para", paper.PARA)), strict=True):
         for number, (method, colour) in enumerate(_COLOURS.items()):
-            shift = (number - (len(_COLOURS) - 1) / 2) * 0.09
+            shift = (number - (len(_COLOURS) - 1) / 2) * 0.07
             found = [(WORLDS.index(w) + shift, row[f"{name}_ratio"]) for w, row in _rows(results, method)]
             found = [(place, value) for place, value in found if value]
             panel.scatter(*zip(*found, strict=True) if found else ([], []), s=34, color=colour, label=method)
