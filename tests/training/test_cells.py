@@ -192,6 +192,17 @@ def test_a_few_steps_of_every_method(worlds: dict[str, MeshWorld], name: str, me
     assert world.layout.fields[0].name in trainer.state.pose.network(images[:2])
 
 
+def test_image_loss_teaches_how_much_is_where_in_worlds_of_fixed_numbers(worlds: dict[str, MeshWorld]) -> None:
+    world = worlds["spheres"]
+    network = world.network(CELLS)
+    images = world.render(world.sample(4, (6,)))
+    code = network(images)
+    world.render(code).sum().backward()
+    of_amounts = network.cells[-1].bias.grad.view(1, -1)[:, 0]
+    assert of_amounts.abs().min() > 0
+    assert CONFIDENCE not in network.eval()(images)
+
+
 def test_methods_and_worlds_that_cells_are_not_for(worlds: dict[str, MeshWorld], tmp_path: Path) -> None:
     source = worlds["spheres"].source("test", 0, with_code=False, cache=tmp_path)
     config = RunConfig(WORLDS["spheres"](), method="wake_sleep", network=CELLS)

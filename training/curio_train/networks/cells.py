@@ -81,14 +81,18 @@ class CellNetwork(Look):
     def decode(
         self, features: Float[Tensor, "batch channels rows columns"]
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """No raw values, and the code beside all that the cells say."""
+        """No raw values, and the code beside all that the cells say.
+
+        While it learns, the code has a confidence in worlds of fixed numbers, too: drawn no surer than cells are, an
+        image tells them which of them to be surer. Else image loss could not teach where to look.
+        """
         each = self.cells(features).flatten(2).unflatten(1, (len(self._counts), sum(self._sizes))).transpose(2, 3)
         amounts, *raw = each.split(self._sizes, dim=-1)
         values = {field.name: self._physical(field.name, value) for field, value in zip(self._fields, raw, strict=True)}
         code = fill_slots(self.grid, self._counts, amounts[..., 0].sigmoid(), values)
         pooled = torch.cat([features.mean(dim=(2, 3)), features.amax(dim=(2, 3))], dim=1)
         code |= {field.name: field.activate(self.scene[field.name](pooled)) for field in self._of_scene}
-        if CONFIDENCE not in self.layout:
+        if CONFIDENCE not in self.layout and not self.training:
             del code[CONFIDENCE]
         known = {of_cells(name): value for name, value in values.items()}
         return {}, {**code, AMOUNTS: amounts[..., 0], **known}

@@ -139,7 +139,10 @@ class MeshWorld(World):
         }
 
     def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
-        """The scenes from the world's own camera, over ``backgrounds`` or what the world has behind its objects."""
+        """The scenes from the world's own camera, over ``backgrounds`` or what the world has behind its objects.
+
+        Objects are as transparent as their confidence, where the code has one, whatever the layout says.
+        """
         return self._view(code, self.stage.cam_from_world, backgrounds)
 
     def novel_view(self, code: SceneCode) -> Tensor:
@@ -205,7 +208,7 @@ class MeshWorld(World):
             "translation_m": place @ turn.T + shift,
             "camera_matrix": self.camera.matrix,
             "light": light,
-            "confidence": code[CONFIDENCE][..., 0].float() if CONFIDENCE in self.layout else None,
+            "confidence": code[CONFIDENCE][..., 0].float() if CONFIDENCE in code else None,
             "seed": jitter_seed(code),
         }
         color = code[COLOR].float() if COLOR in self.layout else None
