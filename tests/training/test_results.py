@@ -11,9 +11,11 @@ from typing import Any
 import pytest
 from curio_train.cli import _parse
 from curio_train.errors import DataError
+from curio_train.evaluation.captures_table import PAPER
 from curio_train.evaluation.results import collect, load_results, merge, save_results
 from curio_train.evaluation.results_tables import markdown, plot
 from curio_train.learning.configuration import to_json
+from curio_train.worlds.options import CaptureOptions
 
 ROOT = Path(__file__).parents[2]
 
@@ -198,3 +200,21 @@ def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path) -> None:
 def flat(config: dict[str, Any]) -> dict[str, Any]:
     nested = {f"{key}.{name}": value for key in ("recipe", "network") for name, value in config[key].items()}
     return {key: value for key, value in config.items() if key not in ("recipe", "network")} | nested
+
+
+def test_the_benchmark_asks_for_worlds_that_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every method of the paper's table in every scene, by flags that a command line takes."""
+    spec = importlib.util.spec_from_file_location("captures", ROOT / "benchmarks" / "captures.py")
+    assert spec is not None
+    assert spec.loader is not None
+    benchmark = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "captures", benchmark)  # where its dataclasses look their types up
+    spec.loader.exec_module(benchmark)
+    runs = benchmark.plan(benchmark.Settings())
+    assert {(scene, method) for scene, rows in PAPER.items() for method in rows} <= runs.keys()
+    for (scene, method), run in runs.items():
+        command = _parse([run.world, "--images", str(run.images), *run.flags])
+        world = command.config.world
+        assert isinstance(world, CaptureOptions)
+        assert (world.lying, len(world.amounts)) == (scene == "bunny", len(world.mesh))
+        assert command.config.method + "_cells" * (command.config.network.reading == "cells") == method

@@ -1,8 +1,6 @@
 """Parts on a plane: STL files, photographs, plates and cameras become a world that is learned from the photographs."""
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 
 import cv2
@@ -15,11 +13,12 @@ from curio_train.config import METHODS, NetworkConfig, Recipe, RunConfig
 from curio_train.data.meshes import load_mesh
 from curio_train.doctor.before_training import refuse_unfit
 from curio_train.errors import CameraError, DataError, UsageError
-from curio_train.evaluation.captures_table import PAPER, markdown, row
+from curio_train.evaluation.captures_table import markdown, row
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.photographed import judge
 from curio_train.export import export
 from curio_train.geometry import camera_looking_at
+from curio_train.learning.configuration import load_config
 from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import ranks
 from curio_train.rendering.renderer import Renderer
@@ -284,24 +283,6 @@ def test_flags_that_contradict_each_other(folder: Path, changes: dict[str, objec
         options(folder, **changes)
 
 
-def test_the_benchmark_asks_for_worlds_that_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every method of the paper's table in every scene, by flags that a command line takes."""
-    spec = importlib.util.spec_from_file_location("captures", ROOT / "benchmarks" / "captures.py")
-    assert spec is not None
-    assert spec.loader is not None
-    benchmark = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "captures", benchmark)  # where its dataclasses look their types up
-    spec.loader.exec_module(benchmark)
-    runs = benchmark.plan(benchmark.Settings())
-    assert {(scene, method) for scene, rows in PAPER.items() for method in rows} <= runs.keys()
-    for (scene, method), run in runs.items():
-        command = cli._parse([run.world, "--images", str(run.images), *run.flags])
-        world = command.config.world
-        assert isinstance(world, CaptureOptions)
-        assert (world.lying, len(world.amounts)) == (scene == "bunny", len(world.mesh))
-        assert command.config.method + "_cells" * (command.config.network.reading == "cells") == method
-
-
 def test_pictures_that_do_not_belong_together(folder: Path, tmp_path: Path) -> None:
     small = cv2.resize(cv2.imread(str(folder / "plate-a.png")), (48, 36))
     cv2.imwrite(str(tmp_path / "plate-b.png"), small)
@@ -336,6 +317,7 @@ def test_from_files_to_a_model_by_a_project_file(folder: Path, tmp_path: Path, m
     )
     run = tmp_path / "run"
     assert call("--project", project, "--images", 8, "--cache", tmp_path, "--out", run) == 0
+    assert load_config(run).network.reading == "cells"
     assert call("--resume", run, "--images", 12, "--cache", tmp_path) == 0
     report = (run / "report.html").read_text()
     assert 'id="verdict"' in report

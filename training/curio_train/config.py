@@ -59,7 +59,8 @@ class NetworkConfig:
         critic_normalisation: Both worked for the paper; its results use "batch".
         reading: How images of generated worlds and of parts on a plane are read. whole: the paper's way, all of a scene
             from one latent code. cells: every cell of the image says what is there, and slots are filled afterwards.
-            Parts on a plane are read by cells unless given, all else as a whole.
+            Unless given, parts on a plane are read by cells (but not with preset paper, nor by wake–sleep, which needs
+            the former), all else as a whole.
         row: Values each object slot gets from the shared trunk.
         hidden: Width of each branch's hidden layer.
     """

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from curio_train.config import RunConfig
+from curio_train.config import NetworkConfig, RunConfig
 from curio_train.worlds.options import CaptureOptions, LinemodOptions
 
 
@@ -37,8 +37,16 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
 
         for doubt in refuse_unfit(options):
             warn(doubt)
-        return replace(config, world=_with_paint(options, tell))
+        return replace(config, world=_with_paint(options, tell), network=_usual_network(config, options))
     return config
+
+
+def _usual_network(config: RunConfig, options: CaptureOptions) -> NetworkConfig:
+    """Parts on a plane are read by cells, unless the call, the paper, or wake–sleep wants it otherwise."""
+    if options.plane is None or config.network.reading is not None:
+        return config.network
+    whole = config.preset == "paper" or config.terms > {"sleep"}
+    return replace(config.network, reading="whole" if whole else "cells")
 
 
 def _refuse_unreadable(options: LinemodOptions) -> None:

@@ -178,7 +178,7 @@ def _origin(path: Path, subject: Subject) -> dict[str, Any]:
         "world": world_name(config),
         "objects": [kind.name for kind in subject.world.objects],
         "method": config.method,
-        "reading": config.network.reading or subject.world.readings[0],
+        "reading": config.network.reading or "whole",
         "labels": config.labels if "label" in config.terms else 0.0,
         "labels_real": False,  # images with true codes are renderings in every world
         "labels_synthetic": uses_synthetic_labels(config),

@@ -147,8 +147,8 @@ class World(ABC):
     camera: Camera
     objects: tuple[ObjectKind, ...]
     mesh: "Mesh | None" = None
-    readings: ClassVar[tuple[Reading, ...]] = ("whole",)
-    """How its images can be read (``NetworkConfig.reading``), what is usual first."""
+    readings: ClassVar[frozenset[Reading]] = frozenset({"whole"})
+    """How its images can be read (``NetworkConfig.reading``)."""
     colors_interchangeable: ClassVar[bool] = False
     """Whether scenes with their colours' channels exchanged are as likely, and look like their images so changed."""
 

@@ -86,7 +86,7 @@ class MeshWorld(World):
         on_plane: Whether they lie on the plane y = 0.
     """
 
-    readings: ClassVar[tuple[Reading, ...]] = ("whole", "cells")
+    readings: ClassVar[frozenset[Reading]] = frozenset({"whole", "cells"})
     outline_samples = 512
     object_shadows = False
     on_plane = False
@@ -155,9 +155,9 @@ class MeshWorld(World):
 
     def network(self, config: NetworkConfig) -> Look:
         """The paper's, or one that reads cell by cell."""
-        if (config.reading or self.readings[0]) == "whole":
-            return super().network(config)
-        return CellNetwork(self.layout, self._slots_of_kinds, self._new_grid())
+        if config.reading == "cells":
+            return CellNetwork(self.layout, self._slots_of_kinds, self._new_grid())
+        return super().network(config)
 
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
         """Eq. 1, or where cells were read what is wrong with them, mean over the batch."""

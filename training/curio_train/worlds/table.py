@@ -103,7 +103,6 @@ class Table(GroundWorld):
     """The world of parts on a plane."""
 
     name = "capture"
-    readings = ("cells", "whole")
     object_shadows = False
 
     def __init__(self, parts: Sequence[Part], where: Stage, pictures: Pictures, *, lying: bool, blur_px: int) -> None:
