@@ -148,18 +148,20 @@ def test_an_unknown_row_is_refused(tmp_path: Path) -> None:
     assert "--methods ours: there is no such row" in done.stderr
 
 
-def sweep_module() -> Any:
-    spec = importlib.util.spec_from_file_location("curiosity", ROOT / "benchmarks" / "curiosity.py")
+def benchmark_module(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
-    sweep = importlib.util.module_from_spec(spec)
-    sys.modules["curiosity"] = sweep  # where its dataclass looks itself up
-    spec.loader.exec_module(sweep)
-    return sweep
+    benchmark = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, name, benchmark)  # where its dataclasses look their types up
+    spec.loader.exec_module(benchmark)
+    return benchmark
 
 
-def test_the_sweep_keeps_what_other_worlds_and_earlier_calls_found(tmp_path: Path) -> None:
-    sweep = sweep_module()
+def test_the_sweep_keeps_what_other_worlds_and_earlier_calls_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep = benchmark_module("curiosity", monkeypatch)
     scored = {"images_seen": 640, "training_seconds": 6.0, "machine": "a machine", "commit": "abc"}
     for world, only, para in (("circles", "our", 1.5), ("spheres", "noncur", 2.5), ("circles", "noncur", 3.5)):
         settings = sweep.Settings(
@@ -178,8 +180,8 @@ def test_the_sweep_keeps_what_other_worlds_and_earlier_calls_found(tmp_path: Pat
     assert "## Spheres" in (tmp_path / "curiosity.md").read_text()
 
 
-def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path) -> None:
-    sweep = sweep_module()
+def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = benchmark_module("curiosity", monkeypatch)
     runs = sweep.plan(sweep.Settings(world="circles", images=640, runs=tmp_path))
     assert len({run.folder for run in runs}) == len(runs) == len(sweep.VARIANTS)
     configs = {run.name: to_json(_parse(["circles", "--images", str(run.images), *run.flags]).config) for run in runs}
@@ -204,12 +206,7 @@ def flat(config: dict[str, Any]) -> dict[str, Any]:
 
 def test_the_benchmark_asks_for_worlds_that_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every method of the paper's table in every scene, by flags that a command line takes."""
-    spec = importlib.util.spec_from_file_location("captures", ROOT / "benchmarks" / "captures.py")
-    assert spec is not None
-    assert spec.loader is not None
-    benchmark = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "captures", benchmark)  # where its dataclasses look their types up
-    spec.loader.exec_module(benchmark)
+    benchmark = benchmark_module("captures", monkeypatch)
     runs = benchmark.plan(benchmark.Settings())
     assert {(scene, method) for scene, rows in PAPER.items() for method in rows} <= runs.keys()
     for (scene, method), run in runs.items():
