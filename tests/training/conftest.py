@@ -1,16 +1,23 @@
-"""Run folders for what comes after training."""
+"""Run folders for what comes after training, and a gaze at a brick."""
 
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from curio_train.camera import Intrinsics
 from curio_train.config import RunConfig, WorldOptions
+from curio_train.data.backgrounds import ClutterBackgrounds
+from curio_train.data.shapes import box
 from curio_train.learning.checkpoint import RunFolder
 from curio_train.learning.provenance import note_sitting
 from curio_train.learning.state import Course, TrainState
 from curio_train.worlds import build
+from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.gaze import GazeWorld
 from curio_train.worlds.options import CirclesOptions
+from curio_train.worlds.single_object import Object
 
 
 @pytest.fixture(scope="session")
@@ -36,3 +43,20 @@ def write_run() -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture(scope="session")
+def brick() -> Object:
+    """Something that looks alike after half a turn, somewhere before a grey wall."""
+    mesh = box((0.09, 0.06, 0.12))
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    kind = ObjectKind("brick", (0,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, symmetries=(half_turn,))
+    camera = Intrinsics(np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]]), 640, 480)
+    pool = np.full((5, 240, 320, 3), 128, np.uint8)
+    return Object(kind, mesh, camera, 0.5, 1.5, lambda _: ClutterBackgrounds(pool))
+
+
+@pytest.fixture(scope="session")
+def brick_world(brick: Object) -> GazeWorld:
+    """The two looks at it."""
+    return GazeWorld("linemod", brick)

@@ -10,8 +10,8 @@ from curio_train.errors import UsageError
 from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
 from curio_train.metrics.assignment import scene_error
-from curio_train.networks.cells import AMOUNTS, cell_error, fill_slots, of_cells
-from curio_train.networks.grid import STRIDE, CellGrid
+from curio_train.networks.cells import AMOUNTS, cell_error, fill_slots
+from curio_train.networks.grid import STRIDE, CellGrid, of_cells
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, SceneCode, index
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.mesh_world import MeshWorld

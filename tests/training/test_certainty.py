@@ -37,15 +37,29 @@ def test_calibration_mends_confidences_that_say_too_little() -> None:
     """Of predictions that say 0.3 nine in ten are right, of those that say 0.1 one in two."""
     confidences = [0.3] * 500 + [0.1] * 500
     right = [True] * 450 + [False] * 50 + [True] * 250 + [False] * 250
-    slope, offset = calibration(confidences, right)
     logits = np.log(np.array(confidences) / (1 - np.array(confidences)))
+    slope, offset = calibration(logits[:, None], right)
     found = 1 / (1 + np.exp(-(slope * logits + offset)))
     assert found[0] == pytest.approx(0.9, abs=0.02)
     assert found[-1] == pytest.approx(0.5, abs=0.02)
     assert calibration_error(found, right) < 0.02
 
 
+def test_calibration_weighs_what_tells_apart_and_nothing_against_its_meaning() -> None:
+    """Of two signs beside the logit one knows which predictions are right, the other which are wrong."""
+    random = np.random.default_rng(0)
+    right = random.random(400) < 0.5
+    noise = random.normal(size=(3, 400))
+    logit, telling, misleading = noise[0], 3 * right + noise[1], noise[2] - 3 * right
+    first, second, third, offset = calibration(np.stack([logit, telling, misleading], axis=1), right.tolist())
+    assert second > 1
+    assert abs(first) < 0.3
+    assert third == 0
+    found = 1 / (1 + np.exp(-(first * logit + second * telling + offset)))
+    assert found[right].mean() > 0.8 > 0.2 > found[~right].mean()
+
+
 def test_calibration_stays_finite_where_all_is_right() -> None:
-    slope, offset = calibration([0.5, 0.6, 1.0], [True] * 3)
-    assert np.isfinite([slope, offset]).all()
-    assert slope > 0
+    weights = calibration([[0.0], [0.4], [13.0]], [True] * 3)
+    assert np.isfinite(weights).all()
+    assert weights[0] > 0

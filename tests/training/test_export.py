@@ -149,6 +149,14 @@ def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Expor
         text = card(1, spec, {TRANSLATION: (1, 3)}, Circles.objects, made)
         assert ("| position_px | 1.25 | 40 |" in text) == quoted
         assert ("Not evaluated" in text) != quoted
+        assert "real frames" not in text
+    real = {"dataset": "lmo", "split_name": "bop19 targets", "num_targets": 89, "metrics": {"add_recall": 0.25}}
+    for refined, column in (({}, "–"), ({"refined": {"real": {"metrics": {"add_recall": 0.5}}}}, "0.5")):
+        found = result | {"images_seen": 64, "real": real} | refined
+        (tmp_path / EVALUATION_FILE).write_text(json.dumps(found))
+        text = card(1, spec, {TRANSLATION: (1, 3)}, Circles.objects, made)
+        assert "On 89 targets in real frames of lmo (bop19 targets):" in text
+        assert f"| add_recall | 0.25 | {column} |" in text
 
 
 def test_commands_on_cards_name_no_folder_of_a_machine() -> None:

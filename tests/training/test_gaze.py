@@ -1,14 +1,13 @@
 """The gaze: crops are what a turned camera would see, and what is read in them is turned back."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from curio_train.camera import Intrinsics, project
 from curio_train.config import NetworkConfig
-from curio_train.data.backgrounds import ClutterBackgrounds
-from curio_train.data.shapes import box
 from curio_train.geometry import (
     matrix_from_rotation_6d,
     rotation_6d_from_matrix,
@@ -18,29 +17,13 @@ from curio_train.geometry import (
 from curio_train.networks.crop import SURFACE
 from curio_train.networks.gaze import SCALES
 from curio_train.networks.look import Look
-from curio_train.networks.places import CANDIDATE_LOG_WEIGHTS, CANDIDATES, LOG_WEIGHTS, NUM_CANDIDATES, PLACES
+from curio_train.networks.places import AMOUNTS, CANDIDATE_LOG_WEIGHTS, CANDIDATES, NUM_CANDIDATES, PLACES
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, index
-from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.calibration import calibrate
 from curio_train.worlds.gaze import ASSUMED_M, CROP_PX, FirstLook, GazeWorld, SecondLook, gaze_camera
 from curio_train.worlds.single_object import EXPOSURE, Object
 from curio_train.worlds.surface import SurfaceMap
 from torch import Tensor, nn
-
-K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
-MESH = box((0.09, 0.06, 0.12))
-
-
-@pytest.fixture(scope="module")
-def thing() -> Object:
-    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    kind = ObjectKind("brick", (0,), MESH.diameter_m, MESH.box_corners_m, MESH.sha256, symmetries=(half_turn,))
-    pool = np.full((5, 240, 320, 3), 128, np.uint8)
-    return Object(kind, MESH, Intrinsics(K, 640, 480), 0.5, 1.5, lambda _: ClutterBackgrounds(pool))
-
-
-@pytest.fixture(scope="module")
-def world(thing: Object) -> GazeWorld:
-    return GazeWorld("linemod", thing)
 
 
 class Told(Look):
@@ -63,27 +46,27 @@ class Told(Look):
         return {}, code
 
 
-def test_the_canonical_camera_is_the_frames_own_at_most_640_pixels_long() -> None:
-    camera = gaze_camera(Intrinsics(K, 640, 480))
+def test_the_canonical_camera_is_the_frames_own_at_most_640_pixels_long(brick: Object) -> None:
+    camera = gaze_camera(brick.camera)
     assert (camera.width, camera.height) == (640, 480)
-    assert np.array_equal(camera.matrix, K)
+    assert np.array_equal(camera.matrix, brick.camera.matrix)
     large = gaze_camera(Intrinsics(np.array([[1600.0, 0, 960], [0, 1600, 540], [0, 0, 1]]), 1920, 1080))
     assert (large.width, large.height) == (640, 360)
     assert large.matrix[0, 0] == pytest.approx(1600 / 3)
 
 
-def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(world: GazeWorld) -> None:
+def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(brick_world: GazeWorld) -> None:
     """A frame is rendered, looked at where the object is, and the crop compared with one rendered as a crop.
 
     Told the truth about the crop, the gaze must answer the truth about the frame.
     """
-    code = world.sample(6, (5,))
+    code = brick_world.sample(6, (5,))
     code[TRANSLATION][..., 2] = code[TRANSLATION][..., 2].clamp(0.62, 0.8)  # near enough, and so if taken nearer
     code[TRANSLATION][..., :2] *= 0.4  # whole in the frame
-    images = world.render(code)
+    images = brick_world.render(code)
     place = code[TRANSLATION][:, 0]
     distance = place.norm(dim=1, keepdim=True)
-    second = world.looks[1]
+    second = brick_world.looks[1]
     turn = rotation_between(place, torch.tensor([0.0, 0, 1]).expand_as(place))
     relative = {
         TRANSLATION: torch.tensor([0.0, 0, 1]).expand(6, 1, 3),
@@ -94,7 +77,7 @@ def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(w
     }
     glance = Told(relative)
     places = {CANDIDATES: code[TRANSLATION], CANDIDATE_LOG_WEIGHTS: torch.zeros(6, 1)}
-    network = world.assemble([Told(places), glance])
+    network = brick_world.assemble([Told(places), glance])
     found = network(images)
     assert torch.allclose(found[TRANSLATION], code[TRANSLATION], atol=1e-5)
     turned = rotation_angle_deg(*(matrix_from_rotation_6d(c[ROTATION_6D][:, 0]) for c in (found, code)))
@@ -108,8 +91,8 @@ def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(w
     assert missed < 0.5 * (rendered - rendered.roll(1, dims=-1)).abs().mean(), "further off than half a pixel"
 
 
-def test_objects_of_the_second_look_lie_where_its_code_says(world: GazeWorld) -> None:
-    second = world.looks[1]
+def test_objects_of_the_second_look_lie_where_its_code_says(brick_world: GazeWorld) -> None:
+    second = brick_world.looks[1]
     code = second.sample(40, (1,))
     assert 0 < (code[CONFIDENCE] == 0).sum() < 15
     code[CONFIDENCE][:] = 1
@@ -123,47 +106,10 @@ def test_objects_of_the_second_look_lie_where_its_code_says(world: GazeWorld) ->
         assert (middle - pixel).norm() < 6
 
 
-def test_second_look_loss_is_least_at_the_truth_and_knows_what_looks_alike(world: GazeWorld) -> None:
-    second = world.looks[1]
-    true = second.sample(5, (2,))
-    true[CONFIDENCE][:] = 1
-    points, seen = true[SURFACE].split((3, 1), dim=1)
-    surface = torch.cat([points, 20 * seen - 10], dim=1)
-    perfect = float(second.code_loss({**true, SURFACE: surface}, true))
-    assert perfect < 1e-3
-    turned = dict(true)
-    rotation = matrix_from_rotation_6d(true[ROTATION_6D][:, 0]) @ torch.diag(torch.tensor([-1.0, -1, 1]))
-    turned[ROTATION_6D] = rotation[:, None, :, :2].transpose(-1, -2).flatten(-2)
-    assert float(second.code_loss({**turned, SURFACE: surface}, true)) < 1e-3
-    mirrored = surface * torch.tensor([-1.0, -1, 1, 1])[:, None, None]
-    assert float(second.code_loss({**true, SURFACE: mirrored}, true)) < 1e-3
-    for name, change in ((TRANSLATION, 0.05), (ROTATION_6D, 0.3), (LIGHT, 0.3), (SURFACE, 0.3), (CONFIDENCE, -0.5)):
-        worse = {**true, SURFACE: surface}
-        worse[name] = worse[name] + change
-        assert float(second.code_loss(worse, true)) > perfect + 5e-3, name
-
-
-def test_confidence_is_to_foretell_whether_the_pose_is_right(world: GazeWorld) -> None:
-    """Certainty pays where ADD is below a tenth of the diameter, doubt where it is not or where nothing is there."""
-    second = world.looks[1]
-    true = second.sample(6, (2,))
-    surface = torch.zeros(6, 4, 16, 16)
-
-    def doubt_pays(there: float, shift: float) -> bool:
-        scene = true | {CONFIDENCE: torch.full((6, 1, 1), there)}
-        read = scene | {TRANSLATION: true[TRANSLATION] + torch.tensor([shift, 0, 0]), SURFACE: surface}
-        sure, unsure = (read | {CONFIDENCE: torch.full((6, 1, 1), value)} for value in (0.9, 0.1))
-        return bool(second.code_loss(unsure, scene) < second.code_loss(sure, scene))
-
-    assert not doubt_pays(1.0, 0.08)
-    assert doubt_pays(1.0, 0.12)
-    assert doubt_pays(0.0, 0.0)
-
-
-def test_surface_points_project_to_the_patches_that_see_them(world: GazeWorld) -> None:
-    second = world.looks[1]
+def test_surface_points_project_to_the_patches_that_see_them(brick_world: GazeWorld) -> None:
+    second = brick_world.looks[1]
     code = second.sample(8, (3,))
-    surface_map = SurfaceMap(MESH, 32)
+    surface_map = SurfaceMap(second.object.mesh, 32)
     rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
     place = second._metres(code[TRANSLATION][:, 0], code[ASSUMED_M])
     matrices = second._matrices(code, 32)
@@ -177,9 +123,9 @@ def test_surface_points_project_to_the_patches_that_see_them(world: GazeWorld) -
         assert (pixels - torch.stack([u, v], dim=1)).abs().mean() < 0.3
 
 
-def test_first_look_reads_the_likeliest_place(world: GazeWorld) -> None:
+def test_first_look_reads_the_likeliest_place(brick_world: GazeWorld) -> None:
     """A network that scores brightness must answer with the bright spot's place, between the depth bounds."""
-    first = world.looks[0]
+    first = brick_world.looks[0]
     network = first.network(NetworkConfig()).eval()
     spot = torch.zeros(1, 3, 120, 160)
     spot[:, :, 60:68, 100:108] = 1.0
@@ -194,32 +140,14 @@ def test_first_look_reads_the_likeliest_place(world: GazeWorld) -> None:
         network.score.weight[0, 0] = 50.0
         found = network(spot)
     assert found[PLACES].shape == (1, 20 * 15, 3)
-    assert found[LOG_WEIGHTS].exp().sum().item() == pytest.approx(1, abs=1e-5)
+    assert found[AMOUNTS].shape == (1, 20 * 15)
     pixel = project(found[TRANSLATION][0], torch.from_numpy(first.camera.matrix).float())[0]
     assert (pixel - torch.tensor([104.0, 64.0])).abs().max() < 8.1
     assert 0.5 <= found[TRANSLATION][0, 0, 2] <= 1.5
 
 
-def test_first_look_loss_rewards_right_hypotheses(world: GazeWorld) -> None:
-    first: FirstLook = world.looks[0]
-    true = first.sample(3, (1,))
-    right = slice(4, 4 + first.num_shown)
-    places = torch.tensor([0.5, 0.4, 1.2]).expand(3, 10, 3).clone()
-    places[:, right] = true[TRANSLATION]
-    even = torch.full((3, 10), 0.1).log()
-    certain = even.clone()
-    certain[:, right] = 2.0
-    losses = [
-        float(first.code_loss({PLACES: places, LOG_WEIGHTS: weights.log_softmax(-1)}, true))
-        for weights in (even, certain)
-    ]
-    assert losses[1] < losses[0] < 2.4  # log 10 where one of ten is right
-    places[:, 4] += 0.3  # of one object nothing is known any more
-    assert float(first.code_loss({PLACES: places, LOG_WEIGHTS: even}, true)) > losses[0] + 0.3
-
-
-def test_first_look_sees_several_under_one_light(world: GazeWorld) -> None:
-    first: FirstLook = world.looks[0]
+def test_first_look_sees_several_under_one_light(brick_world: GazeWorld) -> None:
+    first: FirstLook = brick_world.looks[0]
     code = first.sample(4, (1,))
     assert code[TRANSLATION].shape == (4, first.num_shown, 3)
     assert code[LIGHT].shape == (4, 3)
@@ -232,20 +160,12 @@ def test_first_look_sees_several_under_one_light(world: GazeWorld) -> None:
         assert patch.any(), (number, u, v)
 
 
-def test_gradients_reach_every_weight_of_both_looks(world: GazeWorld, tmp_path) -> None:
-    for look in world.looks:
-        network = look.network(NetworkConfig())
-        code = look.sample(4, (1,))
-        look.code_loss(network(look.render(code)), code).backward()
-        assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
-
-
-def test_batches_of_crops_give_what_rendering_needs_and_no_label(world: GazeWorld, tmp_path) -> None:
-    batch = world.looks[1].source("train", 0, with_code=False, cache=tmp_path).batch(3, 4)
+def test_batches_of_crops_give_what_rendering_needs_and_no_label(brick_world: GazeWorld, tmp_path) -> None:
+    batch = brick_world.looks[1].source("train", 0, with_code=False, cache=tmp_path).batch(3, 4)
     assert batch.code is None
     assert set(batch.given) == {ASSUMED_M}
-    labelled = world.looks[1].source("train", 0, with_code=True, cache=tmp_path).batch(3, 4)
-    again = world.looks[1].render(index(labelled.code, slice(None)), labelled.backgrounds)
+    labelled = brick_world.looks[1].source("train", 0, with_code=True, cache=tmp_path).batch(3, 4)
+    again = brick_world.looks[1].render(index(labelled.code, slice(None)), labelled.backgrounds)
     assert torch.allclose(again, batch.images, atol=1e-5)  # Dr.Jit's threads add in any order
 
 
@@ -267,31 +187,79 @@ class Bright(Look):
         }
 
 
-def test_of_several_candidates_the_likeliest_is_answered(world: GazeWorld) -> None:
+def test_of_several_candidates_the_likeliest_is_answered(brick_world: GazeWorld) -> None:
     """Two frames, each bright at another of three candidates; then a first look that knows better than the second."""
     candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8], [0.0, 0.2, 1.2]]).expand(2, 3, 3)
-    pixels = project(candidates, torch.from_numpy(K).float()[None]).round().int()
+    pixels = project(candidates, torch.from_numpy(brick_world.camera.matrix).float()[None]).round().int()
     frames = torch.zeros(2, 3, 480, 640)
     for image, chosen in enumerate((2, 0)):
         u, v = pixels[image, chosen].tolist()
         frames[image, :, v - 30 : v + 31, u - 30 : u + 31] = 1.0
     equal = {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: torch.full((2, 3), -1.1)}
-    found = world.assemble([Told(equal), Bright()])(frames)
+    found = brick_world.assemble([Told(equal), Bright()])(frames)
     assert torch.allclose(found[TRANSLATION][:, 0], candidates[0, [2, 0]], atol=1e-5)
     assert found[CONFIDENCE].min() > 0.1
-    assert set(found) == {field.name for field in world.layout.fields}
+    assert set(found) == {field.name for field in brick_world.layout.fields}
     known = {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: torch.tensor([[-9.0, 0, -9]]).expand(2, 3)}
-    found = world.assemble([Told(known), Bright()])(frames)
+    found = brick_world.assemble([Told(known), Bright()])(frames)
     assert torch.allclose(found[TRANSLATION][:, 0], candidates[0, [1, 1]], atol=1e-5)
 
 
-def test_candidates_are_apart_and_the_likeliest_comes_first(world: GazeWorld) -> None:
-    first = world.looks[0]
+def test_confidence_weighs_what_all_glances_see(brick_world: GazeWorld) -> None:
+    """Probability that the object is there, by evidence and weight of the place, times that of being right then."""
+    candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8]]).expand(3, 2, 3)
+    weights = torch.tensor([[-3.0, -0.5]]).expand(3, 2)
+    frames = torch.tensor([0.2, 0.5, 0.9])[:, None, None, None].expand(3, 3, 480, 640)
+    network = brick_world.assemble([Told({CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: weights}), Bright()])
+    _, signs = network.read(frames)
+    brightness = frames[:, 0, 0, 0]
+    assert torch.allclose(signs.right[:, 0], brightness.logit(), atol=1e-4)
+    assert torch.allclose(signs.there, torch.stack([brightness, torch.full((3,), -0.5)], dim=1), atol=1e-4)
+    assert torch.allclose(network(frames)[CONFIDENCE].flatten(), brightness, atol=1e-4)
+    network.rightness.copy_(torch.tensor([2.0, 0.5]))
+    network.presence.copy_(torch.tensor([2.0, 1.0, 0.25]))
+    expected = (2 * brightness.logit() + 0.5).sigmoid() * (2 * brightness - 0.25).sigmoid()
+    assert torch.allclose(network(frames)[CONFIDENCE].flatten(), expected, atol=1e-4)
+
+
+class Middle(Look):
+    """A look at frames that takes everything to be at one place."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = nn.Identity()
+
+    def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        count = len(features)
+        place = torch.tensor([0.0, 0, 0.8]).expand(count, 1, 3)
+        return {}, {CANDIDATES: place, CANDIDATE_LOG_WEIGHTS: torch.zeros(count, 1)}
+
+
+def test_calibration_knows_empty_frames(brick_world: GazeWorld, tmp_path: Path) -> None:
+    """To a network that sees what stands out from the wall, whose own confidence says nothing."""
+    wall = torch.full((4, 3, 480, 640), 128 / 255)
+
+    class StandsOut(Bright):
+        def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+            seen = (features - wall[0, 0, 0, 0]).abs().mean(dim=(1, 2, 3), keepdim=True)
+            surface = (100 * seen).expand(-1, 4, 16, 16)
+            return {}, super().decode(features)[1] | {SURFACE: surface, CONFIDENCE: torch.full_like(seen[:, 0], 0.5)}
+
+    network = brick_world.assemble([Middle(), StandsOut()])
+    calibrate(network, brick_world, tmp_path)
+    code = brick_world.sample(4, (1,))
+    code[TRANSLATION][:] = torch.tensor([0.0, 0, 0.8])
+    full, empty = (network(images)[CONFIDENCE].mean() for images in (brick_world.render(code, wall), wall))
+    assert empty < 0.6 * full
+
+
+def test_candidates_are_apart_and_the_likeliest_comes_first(brick_world: GazeWorld) -> None:
+    first = brick_world.looks[0]
     network = first.network(NetworkConfig())
     weights = torch.full((1, 20 * 15), 1e-6)
     chosen = torch.tensor([5 * 20 + 5, 5 * 20 + 6, 10 * 20 + 12, 2 * 20 + 17])
     weights[0, chosen] = torch.tensor([0.5, 0.3, 0.15, 0.05])
-    places = torch.cat([network.cells, torch.ones(300, 1)], dim=1)[None]
+    places = network.grid.locate(network.grid.pixels, torch.zeros(300, 1))[None]
     found, of_found = network._candidates(places, weights)
     assert found.shape == (1, NUM_CANDIDATES, 3)
     assert torch.equal(found[0, :3], places[0, chosen[[0, 2, 3]]])
@@ -302,13 +270,13 @@ def test_candidates_are_apart_and_the_likeliest_comes_first(world: GazeWorld) ->
     assert torch.equal(found[0, :2], places[0, chosen[[0, 3]]])
 
 
-def test_colours_differ_least_where_they_tell_most(thing: Object, world: GazeWorld) -> None:
+def test_colours_differ_least_where_they_tell_most(brick: Object, brick_world: GazeWorld) -> None:
     """The first look, and all looks at a known scene, see milder light than the second look at an unknown one."""
-    first, second = world.looks
-    known = GazeWorld("capture", replace(thing, known_scene=True))
+    first, second = brick_world.looks
+    known = GazeWorld("capture", replace(brick, known_scene=True))
     spread = {
         name: float(look.sample(400, (1,))[EXPOSURE].log().std())
-        for name, look in {"whole": world, "first": first, "second": second, "known": known.looks[1]}.items()
+        for name, look in {"whole": brick_world, "first": first, "second": second, "known": known.looks[1]}.items()
     }
     assert spread["second"] > 1.3 * spread["first"]
     assert spread["whole"] == pytest.approx(spread["first"], rel=0.1)
@@ -323,26 +291,9 @@ def test_colours_differ_least_where_they_tell_most(thing: Object, world: GazeWor
     assert moved(known.looks[0]) == pytest.approx(moved(known.looks[1]))
 
 
-def test_light_of_a_known_scene_tells_faces_apart(thing: Object) -> None:
+def test_light_of_a_known_scene_tells_faces_apart(brick: Object) -> None:
     for known, weakest in ((False, 0.2), (True, 0.5)):
-        for look in GazeWorld("capture", replace(thing, known_scene=known)).looks:
+        for look in GazeWorld("capture", replace(brick, known_scene=known)).looks:
             strength = look.sample(400, (1,))[LIGHT].norm(dim=-1)
             assert weakest <= strength.min() < 1.1 * weakest
             assert strength.max() <= 2
-
-
-def test_rotation_is_learned_from_where_nothing_is_known(thing: Object) -> None:
-    """Numbers near zero that mean opposite rotations err as little; the right ones, at full length, err least."""
-    look = GazeWorld("capture", thing).looks[1]
-    true = look.sample(8, (1,))
-    true[CONFIDENCE][:] = 1
-    told = {**true, CONFIDENCE: torch.full_like(true[CONFIDENCE], 0.5)}
-
-    def loss(numbers: torch.Tensor) -> float:
-        return float(look.code_loss({**told, ROTATION_6D: numbers}, true))
-
-    right = true[ROTATION_6D]
-    quarter = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    wrong = rotation_6d_from_matrix(matrix_from_rotation_6d(right) @ quarter)
-    assert loss(right) < loss(0.5 * right) < loss(0.001 * right)
-    assert loss(0.001 * wrong) < loss(wrong)

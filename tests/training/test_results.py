@@ -96,6 +96,10 @@ def test_tables_show_ours_beside_the_papers(tmp_path: Path) -> None:
     assert "| spheres | 1.5 (1.87) | 1 |" in para
     assert "### Position" in text
     assert "### Rotation" not in text
+    cells = [evaluation("super", reading="cells", metrics={"scene_error": 0.5}), evaluation("our", reading="cells")]
+    text = markdown(merge(results, collect(cells)), "make results")
+    own = text.partition("## Para, against supervision of the same network")[2].partition("##")[0]
+    assert "| spheres | – (8.97) | 1.5 (1.87) | – | – | 4 | – |" in own
     plot(results, tmp_path / "worlds.png")
     assert (tmp_path / "worlds.png").stat().st_size > 10_000
 
@@ -163,10 +167,9 @@ def test_the_sweep_keeps_what_other_worlds_and_earlier_calls_found(
 ) -> None:
     sweep = benchmark_module("curiosity", monkeypatch)
     scored = {"images_seen": 640, "training_seconds": 6.0, "machine": "a machine", "commit": "abc"}
+    told = {"images": 640, "runs": tmp_path, "results": tmp_path / "curiosity.json"}
     for world, only, para in (("circles", "our", 1.5), ("spheres", "noncur", 2.5), ("circles", "noncur", 3.5)):
-        settings = sweep.Settings(
-            world=world, images=640, only=(only,), runs=tmp_path, results=tmp_path / "curiosity.json"
-        )
+        settings = sweep.Settings(world=world, only=(only,), reading="cells" if world == "spheres" else "whole", **told)
         (run,) = sweep.plan(settings)
         run.folder.mkdir(parents=True)
         found = scored | {"metrics": {"scene_error": para, "novel_view_dssim": 0.1}}
@@ -175,14 +178,14 @@ def test_the_sweep_keeps_what_other_worlds_and_earlier_calls_found(
     results = json.loads((tmp_path / "curiosity.json").read_text())
     assert {world: {name: row["para"] for name, row in rows.items()} for world, rows in results.items()} == {
         "circles": {"our": 1.5, "noncur": 3.5},
-        "spheres": {"noncur": 2.5},
+        "spheres, read by cells": {"noncur": 2.5},
     }
-    assert "## Spheres" in (tmp_path / "curiosity.md").read_text()
+    assert "## Spheres, read by cells" in (tmp_path / "curiosity.md").read_text()
 
 
 def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sweep = benchmark_module("curiosity", monkeypatch)
-    runs = sweep.plan(sweep.Settings(world="circles", images=640, runs=tmp_path))
+    runs = sweep.plan(sweep.Settings(world="circles", reading="whole", images=640, runs=tmp_path))
     assert len({run.folder for run in runs}) == len(runs) == len(sweep.VARIANTS)
     configs = {run.name: to_json(_parse(["circles", "--images", str(run.images), *run.flags]).config) for run in runs}
     plain = flat(configs["noncur"])

@@ -62,6 +62,8 @@ def card(
         _table(("object", "diameter", "mesh SHA-256", "source and licence of the mesh"), _objects(spec, objects)),
         _metrics(evaluation) if evaluation else "Not evaluated when it was exported.\n",
     ]
+    if evaluation and "real" in evaluation:
+        parts.append(_real_frames(evaluation))
     return "\n".join(parts)
 
 
@@ -128,6 +130,17 @@ def _metrics(evaluation: Mapping[str, Any]) -> str:
     ]
     head = f"On {evaluation['num_images']} held-out images of the {evaluation['split']} split:\n"
     return f"{head}\n{_table(('metric', 'this model', 'untrained network'), rows)}"
+
+
+def _real_frames(evaluation: Mapping[str, Any]) -> str:
+    """Of the frames of a data set, whose labels are for scoring alone."""
+    real, refined = evaluation["real"], evaluation.get("refined", {}).get("real", {}).get("metrics", {})
+    rows = [
+        (name, f"{value:.4g}", f"{refined[name]:.4g}" if name in refined else "–")
+        for name, value in real["metrics"].items()
+    ]
+    head = f"On {real['num_targets']} targets in real frames of {real['dataset']} ({real['split_name']}):\n"
+    return f"{head}\n{_table(('metric', 'this model', 'after render-and-compare'), rows)}"
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -28,6 +28,8 @@ _COLOURS: Mapping[str, str] = {
     "our_cells": "#1e6b35",
     "sleep_cells": "#5f3b9e",
 }
+_CELLS = "_cells"
+_UNLABELLED = ("noncur", "our", "sleep", "noncur_cells", "our_cells", "sleep_cells")
 _NOTHING = "–"
 Figures = Mapping[str, Sequence[float]]
 
@@ -49,6 +51,10 @@ def markdown(results: Results, command: str) -> str:
         _ratios(results, others, lambda row: row["img_ratio"], paper.IMG),
         "## Table 2: Para",
         _ratios(results, others, lambda row: row["para_ratio"], paper.PARA),
+        "## Para, against supervision of the same network",
+        f"Ratios of `…_cells` to `{REFERENCE}_cells`, and of the paper's network to `{REFERENCE}`: how much is lost"
+        " without labels, whatever the network.",
+        _ratios(_against_own_network(results), _UNLABELLED, lambda row: row["own_ratio"], paper.PARA),
         "## Table 3: each parameter",
     ]
     for name, title in _TITLES.items():
@@ -146,6 +152,17 @@ def _parameter(row: Row, name: str) -> bool:
 def _reader(name: str) -> Callable[[Row], float | None]:
     """The ratio of the parameter of that name, whatever its unit."""
     return lambda row: next((v for key, v in row["per_parameter_ratio"].items() if key.startswith(name)), None)
+
+
+def _against_own_network(results: Results) -> Results:
+    """The rows with Eq. 1 divided by that of full supervision of the same network; None where that is missing."""
+    found: Results = {}
+    for world, rows in results.items():
+        found[world] = {}
+        for method, row in rows.items():
+            reference = rows.get(REFERENCE + (_CELLS if method.endswith(_CELLS) else ""))
+            found[world][method] = row | {"own_ratio": row["para"] / reference["para"] if reference else None}
+    return found
 
 
 def _cell(value: float | None) -> str:

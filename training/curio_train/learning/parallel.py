@@ -89,5 +89,7 @@ def ranks(device: Literal["auto", "cpu", "cuda"]) -> Iterator[Ranks]:
     distributed.init_process_group("nccl" if cuda else "gloo")
     try:
         yield Ranks(distributed.get_rank(), size, place)
+        # Leave together: a thread that still lets go of the last sum's tensor while the interpreter ends aborts it.
+        distributed.barrier()
     finally:
         distributed.destroy_process_group()

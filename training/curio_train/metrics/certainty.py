@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize
-from scipy.special import logit
 from scipy.stats import rankdata
 
 NUM_BINS = 10
-_LEAST = 1e-6
 _PULL = 1e-4
 
 
@@ -30,26 +29,31 @@ def calibration_error(confidences: Sequence[float], right: Sequence[bool]) -> fl
     return float(sum(gaps) / len(found))
 
 
-def calibration(confidences: Sequence[float], right: Sequence[bool]) -> tuple[float, float]:
-    """Slope and offset of the logit with which confidences become probabilities of being right (Platt 1999).
+def calibration(signs: ArrayLike, right: Sequence[bool]) -> list[float]:
+    """Weights of signs, and an offset, that make their sum the logit of being right (Platt 1999; logistic regression).
 
-    Two numbers from a few hundred predictions; the slope stays positive, so that the order of confidences does.
+    A few numbers from a few hundred predictions. No weight is negative: a sign never speaks against what it is for.
 
     Args:
-        confidences: In [0, 1].
+        signs: [predictions, signs], logits or the like.
         right: Whether each prediction was.
+
+    Returns:
+        A weight for each sign, then the offset.
     """
-    logits = logit(np.clip(confidences, _LEAST, 1 - _LEAST))
-    hits = np.asarray(right, dtype=np.float64)
+    found, hits = np.asarray(signs, dtype=np.float64), np.asarray(right, dtype=np.float64)
+    found = np.concatenate([found, np.ones((len(found), 1))], axis=1)
+    start = np.eye(1, found.shape[1])[0]
 
-    def loss(parameters: np.ndarray) -> float:
-        log_slope, offset = parameters
-        found = np.exp(log_slope) * logits + offset
-        # A little pull towards leaving all as it is, where too few predictions are right or wrong to tell.
-        return float(np.mean(np.logaddexp(0, found) - hits * found) + _PULL * (log_slope**2 + offset**2))
+    def loss(weights: np.ndarray) -> float:
+        logits = found @ weights
+        # A little pull towards the first sign as it is, where too few are right or wrong to tell, or a sign tells all.
+        pull = _PULL * np.square(weights - start).sum()
+        return float(np.mean(np.logaddexp(0, logits) - hits * logits) + pull)
 
-    log_slope, offset = minimize(loss, np.zeros(2), method="Nelder-Mead").x
-    return float(np.exp(log_slope)), float(offset)
+    bounds = [(0.0, None)] * (len(start) - 1) + [(None, None)]
+    weights: list[float] = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x.tolist()
+    return weights
 
 
 def separation(with_object: Sequence[float], without: Sequence[float]) -> float:

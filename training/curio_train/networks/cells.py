@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from curio_train.metrics.assignment import canonical
-from curio_train.networks.grid import STRIDE, CellGrid
+from curio_train.networks.grid import STRIDE, CellGrid, Share, amounts_error, of_cells, said_by
 from curio_train.networks.layers import convolution
 from curio_train.networks.look import Look
 from curio_train.scene_code import CONFIDENCE, TRANSLATION, Layout, SceneCode
@@ -31,11 +31,6 @@ _SCARCE = -4.0  # logit of an amount at the start: most cells hold nothing
 _HARDLY = 1e-6  # amount of an object that a slot takes where nothing is left, so that it says something all the same
 _PREFERENCE = 0.01  # by which the first cell's amount counts for more than the last's
 _SAME_PX = 0.75 * STRIDE  # cells that put an object this near to each other mean the same one
-
-
-def of_cells(name: str) -> str:
-    """Under which a field's values at all cells stand."""
-    return f"cell_{name}"
 
 
 class CellNetwork(Look):
@@ -150,24 +145,15 @@ def cell_error(
     of_slot = torch.cat([torch.full((len(slots),), kind) for kind, slots in enumerate(kinds)])
     here = grid.share(grid.project(true[TRANSLATION]))
     present = true[CONFIDENCE] if CONFIDENCE in layout else torch.ones_like(true[TRANSLATION][..., :1])
-    weight = here.weight * present  # [batch, slots, 4]
-    batch, num_kinds, num_cells = predicted[AMOUNTS].shape
-    at = of_slot.to(here.cell)[:, None] * num_cells + here.cell
-    wanted = weight.new_zeros(batch, num_kinds * num_cells).scatter_add(1, at.flatten(1), weight.flatten(1))
-    amounts = F.binary_cross_entropy_with_logits(
-        predicted[AMOUNTS].flatten(1), wanted.clamp(max=1), reduction="none"
-    ).sum(dim=1)
+    num_cells = predicted[AMOUNTS].shape[2]
+    here = Share(of_slot.to(here.cell)[:, None] * num_cells + here.cell, here.weight * present)
     names = [field.name for field in layout.fields if of_cells(field.name) in predicted]
-    said = {}
-    for name in names:
-        values = predicted[of_cells(name)].flatten(1, 2)
-        picked = values.gather(1, at.flatten(1)[..., None].expand(-1, -1, values.shape[-1]))
-        said[name] = picked.unflatten(1, at.shape[1:])
-    truth, error = canonical(true), amounts
+    truth, error = canonical(true), amounts_error(predicted[AMOUNTS].flatten(1), here)
     for name in names:
         field = layout[name]
-        distance = (field.relative(said[name]) - field.relative(truth[name])[:, :, None]).norm(dim=-1)
-        error = error + (distance * weight).sum(dim=(1, 2))
+        said = said_by(predicted[of_cells(name)].flatten(1, 2), here)
+        distance = (field.relative(said) - field.relative(truth[name])[:, :, None]).norm(dim=-1)
+        error = error + (distance * here.weight).sum(dim=(1, 2))
     for field in layout.fields:
         if not field.per_object:
             error = error + (field.relative(predicted[field.name]) - field.relative(true[field.name])).norm(dim=-1)

@@ -1,6 +1,7 @@
 """Two looks as one network: a place from the whole frame, then pose and light from a crop around it."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +20,8 @@ _EVIDENCE = "evidence"
 _NUM_CLEAREST = 16  # of 256 patches
 SCALES, _MIDDLE = (1 / 1.18, 1.0, 1.18), 1
 """Of the distance that the last crops are placed by."""
+
+_SURELY = 20.0  # logit: as long as nothing is calibrated, the confidence is the second look's
 
 OVERSAMPLING = 2  # a crop is sampled at so many points a pixel and side, then averaged: no aliasing of near objects
 
@@ -44,6 +47,18 @@ class Optics:
     fill: float
 
 
+class Signs(NamedTuple):
+    """What the confidence is made of: the probability that the object is there, times that of reading it rightly then.
+
+    Attributes:
+        right: [batch, 1], logit of the second look's confidence.
+        there: [batch, 2], how clearly the last glances show the object, and the logarithm of the first look's weight.
+    """
+
+    right: Float[Tensor, "batch 1"]
+    there: Float[Tensor, "batch 2"]
+
+
 class GazeNetwork(nn.Module):
     """Whole frame to scene code, all in one graph.
 
@@ -54,7 +69,8 @@ class GazeNetwork(nn.Module):
     Attributes:
         first: Reads places from frames at low resolution.
         second: Reads poses and light from crops.
-        calibration: Slope and offset of the confidence's logit, set when training is done.
+        rightness: Weight and offset that make the sign of a right pose a logit; set when training is done.
+        presence: Weights and offset that do so with the signs that the object is there.
     """
 
     def __init__(self, first: Look, second: Look, optics: Optics) -> None:
@@ -62,19 +78,27 @@ class GazeNetwork(nn.Module):
         self.first, self.second = first, second
         self._optics = optics
         self._matrix: Tensor
-        self.calibration: Tensor
-        self.register_buffer("calibration", torch.tensor([1.0, 0.0]))
+        self.rightness: Tensor
+        self.presence: Tensor
+        self.register_buffer("rightness", torch.tensor([1.0, 0.0]))
+        self.register_buffer("presence", torch.tensor([0.0, 0.0, _SURELY]))
         self.register_buffer("_matrix", torch.from_numpy(optics.matrix).float()[None], persistent=False)
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
+        code, signs = self.read(images)
+        sure = _probability(signs.right, self.rightness) * _probability(signs.there, self.presence)
+        return code | {CONFIDENCE: sure[:, None, None]}
+
+    def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], Signs]:
+        """The code without its confidence's calibration, and what that is made of."""
         seen = self.first(F.avg_pool2d(images, self._optics.first_look_share))
         glances = self._glance(images, seen[CANDIDATES])
-        likeliest = _likeliest(glances[TRANSLATION], glances[_EVIDENCE], seen[CANDIDATE_LOG_WEIGHTS])
-        code = _position_of_all(self._glance(images, likeliest * likeliest.new_tensor(SCALES)[:, None]))
-        del code[_EVIDENCE]
-        slope, offset = self.calibration
-        return code | {CONFIDENCE: torch.sigmoid(slope * torch.logit(code[CONFIDENCE], 1e-6) + offset)}
+        likeliest, log_weight = _likeliest(glances[TRANSLATION], glances[_EVIDENCE], seen[CANDIDATE_LOG_WEIGHTS])
+        last = self._glance(images, likeliest * likeliest.new_tensor(SCALES)[:, None])
+        logit, evidence = torch.logit(last[CONFIDENCE].flatten(), 1e-6), last.pop(_EVIDENCE)
+        logit, evidence = (of_all.view(-1, len(SCALES)).mean(dim=1, keepdim=True) for of_all in (logit, evidence))
+        return _position_of_all(last), Signs(logit, torch.cat([evidence, log_weight], dim=1))
 
     def _glance(self, images: Tensor, places: Float[Tensor, "batch num 3"]) -> dict[str, Tensor]:
         """Look at crops around places, and turn what is read there back into the frame's camera.
@@ -121,11 +145,16 @@ def _position_of_all(glances: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def _likeliest(
     places: Float[Tensor, "rows 1 3"], evidence: Float[Tensor, " rows"], log_weights: Float[Tensor, "batch num"]
-) -> Float[Tensor, "batch 1 3"]:
-    """Of the places of each image the one with the highest sum of evidence and log weight."""
+) -> tuple[Float[Tensor, "batch 1 3"], Float[Tensor, "batch 1"]]:
+    """Of the places of each image the one with the highest sum of evidence and log weight, and that weight."""
     best = (evidence.view_as(log_weights) + log_weights).argmax(dim=1)
     first = torch.arange(best.shape[0], device=best.device) * log_weights.shape[1]
-    return places[first + best]
+    return places[first + best], log_weights.gather(1, best[:, None])
+
+
+def _probability(signs: Float[Tensor, "batch signs"], weights: Float[Tensor, " values"]) -> Float[Tensor, " batch"]:
+    """Of the weighed sum as a logit; the offset is last."""
+    return torch.sigmoid(signs @ weights[:-1] + weights[-1])
 
 
 def _evidence(surface: Float[Tensor, "rows 4 side side"]) -> Float[Tensor, " rows"]:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
@@ -17,6 +18,11 @@ STRIDE = 8
 
 _LEAST_DEPTH_M = 1e-3
 _LEAST_DESCENT = 0.02  # of a ray's length: rays nearer to the horizon meet the plane too far away
+
+
+def of_cells(name: str) -> str:
+    """Under which a field's values at all cells stand."""
+    return f"cell_{name}"
 
 
 class Share(NamedTuple):
@@ -102,3 +108,20 @@ class CellGrid(nn.Module):
                 near = torch.where(first.new_tensor([right, down]) > 0, part, 1 - part)
                 weights.append(near.prod(dim=-1))
         return Share(torch.stack(cells, dim=-1), torch.stack(weights, dim=-1))
+
+
+def amounts_error(logits: Float[Tensor, "batch cells"], share: Share) -> Float[Tensor, " batch"]:
+    """Cross entropy of how much of an object each cell is said to hold, and how much it does hold.
+
+    Args:
+        logits: Of the amounts.
+        share: Of the objects, [batch, objects, 4].
+    """
+    wanted = torch.zeros_like(logits).scatter_add(1, share.cell.flatten(1), share.weight.flatten(1))
+    return F.binary_cross_entropy_with_logits(logits, wanted.clamp(max=1), reduction="none").sum(dim=1)
+
+
+def said_by(values: Float[Tensor, "batch cells size"], share: Share) -> Float[Tensor, "batch objects 4 size"]:
+    """What the cells around each object say."""
+    picked = values.gather(1, share.cell.flatten(1)[..., None].expand(-1, -1, values.shape[-1]))
+    return picked.unflatten(1, share.cell.shape[1:])

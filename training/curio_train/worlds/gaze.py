@@ -29,12 +29,13 @@ from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
 from curio_train.data.augmentation import WHOLE_FRAME, Disturbance
 from curio_train.data.backgrounds import Backgrounds
-from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.metrics.poses import ADD_THRESHOLD, symmetry_poses
 from curio_train.networks.crop import SURFACE, SURFACE_SHARE, CropNetwork
 from curio_train.networks.gaze import GazeNetwork, Optics
+from curio_train.networks.grid import STRIDE, CellGrid, amounts_error, of_cells, said_by
 from curio_train.networks.look import Look
-from curio_train.networks.places import LOG_WEIGHTS, PLACES, PlaceNetwork
+from curio_train.networks.places import AMOUNTS, PLACES, PlaceNetwork
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Camera
 from curio_train.worlds.calibration import calibrate
@@ -62,6 +63,7 @@ TURNS, TURNS_IN_KNOWN_SCENE = (0, 1, 1), (0, 1, 1, 1, 1)
 
 _PLACE_SCALE_PX = 2.0  # of the first look's pixels: what counts as near
 _DEPTH_SCALE = 0.1  # of the logarithm
+_PLACE_WEIGHT = 0.3  # beside whether there is an object at all
 _NUM_POINTS = 128
 _NUMBERS_WEIGHT = 0.5
 _SURFACE_WEIGHT = 3.0  # it teaches what the rotation is read from
@@ -145,21 +147,22 @@ class FirstLook(SingleObjectWorld):
 
     def network(self, config: NetworkConfig) -> PlaceNetwork:
         """Hypotheses on a grid."""
-        assert self.camera.matrix is not None
-        return PlaceNetwork(self.layout[TRANSLATION], self.camera.matrix, self.camera.width, self.camera.height)
+        return PlaceNetwork(_grid(self))
 
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
-        """Negative log likelihood of the true places among the weighted hypotheses (a mixture density, Bishop 1994).
+        """Which cells have an object beside them, and where those say that it is (after Zhou et al. 2019).
 
-        A hypothesis that is near is made nearer and more certain; those far away only lose weight. So no cell has to be
-        named as the right one, and a second red thing in the picture gets a hypothesis of its own instead of pulling a
-        mean between the two.
+        Each place is shared out among the four cells around it; all others only learn that they have none. So two red
+        things in the picture are two hypotheses, and never a mean between them.
         """
-        places, place = predicted[PLACES][:, None], true[TRANSLATION][:, :, None]  # [batch, objects, cells, 3]
-        slope = places[..., :2] / places[..., 2:] - place[..., :2] / place[..., 2:]
-        depth = places[..., 2].log() - place[..., 2].log()
+        place, grid = true[TRANSLATION], _grid(self).to(true[TRANSLATION].device)
+        here = grid.share(grid.project(place))
+        said, wanted = said_by(predicted[PLACES], here), place[:, :, None]  # [batch, objects, 4, 3]
+        slope = said[..., :2] / said[..., 2:] - wanted[..., :2] / wanted[..., 2:]
+        depth = said[..., 2].log() - wanted[..., 2].log()
         distance = slope.norm(dim=-1) / self._slope_scale + depth.abs() / _DEPTH_SCALE
-        return -(predicted[LOG_WEIGHTS][:, None] - distance).logsumexp(dim=-1).mean()
+        placed = (distance * here.weight).sum(dim=-1).mean()
+        return amounts_error(predicted[AMOUNTS], here).mean() / place.shape[1] + _PLACE_WEIGHT * placed
 
     @property
     def _slope_scale(self) -> float:
@@ -194,8 +197,8 @@ class SecondLook(SingleObjectWorld):
         super().__init__(thing, camera, pose_layout(position, confidence=True, color=thing.painted))
 
     def network(self, config: NetworkConfig) -> CropNetwork:
-        """A small residual network."""
-        return CropNetwork(self.layout, CROP_PX)
+        """A small residual network whose cells say the pose."""
+        return CropNetwork(self.layout, _grid(self))
 
     def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:
         """Objects near the middle of crops, as a first look that errs leaves them."""
@@ -270,21 +273,36 @@ class SecondLook(SingleObjectWorld):
         displaced, nearest = between.norm(dim=-1).mean(dim=-1).min(dim=1)
         wanted_6d = rotation_6d_from_matrix(alike[torch.arange(len(nearest)), nearest, 0])
         numbers = (predicted[ROTATION_6D][:, 0] - wanted_6d).square().sum(dim=-1)
-        place, true_place = predicted[TRANSLATION][:, 0], true[TRANSLATION][:, 0]
-        offset = (place[:, :2] / place[:, 2:] - true_place[:, :2] / true_place[:, 2:]).norm(dim=-1)
-        away = true[ASSUMED_M][:, 0] / self.object.kind.diameter_m
-        depth = away * (place[:, 2].log() - true_place[:, 2].log()).abs()
+        offset, depth = self._place_error(predicted[TRANSLATION], true[TRANSLATION], true[ASSUMED_M])
         light = (predicted[LIGHT] - true[LIGHT]).norm(dim=-1)
-        pose = displaced + _NUMBERS_WEIGHT * numbers + offset + depth + _LIGHT_WEIGHT * light
+        pose = displaced + _NUMBERS_WEIGHT * numbers + (offset + depth)[:, 0] + _LIGHT_WEIGHT * light
         if COLOR in self.layout:
             pose = pose + _COLOR_WEIGHT * (predicted[COLOR] - true[COLOR])[:, 0].abs().mean(dim=-1)
-        shift = self._metres(place, true[ASSUMED_M]) - self._metres(true_place, true[ASSUMED_M])
+        shift = torch.sub(*(self._metres(code[TRANSLATION][:, 0], true[ASSUMED_M]) for code in (predicted, true)))
         add = (between + shift[:, None, None] / self.object.kind.diameter_m).norm(dim=-1).mean(dim=-1).amin(dim=1)
         right = (add < ADD_THRESHOLD).to(there) * there
         sure = F.binary_cross_entropy(predicted[CONFIDENCE][:, 0, 0].clamp(1e-6, 1 - 1e-6), right)
+        pose = pose + self._cell_error(predicted, wanted_6d, true)
         pose_loss = (pose * there).sum() / there.sum().clamp(min=1)
         surface = self._surface_loss(predicted[SURFACE], true)
         return pose_loss + _CONFIDENCE_WEIGHT * sure + _SURFACE_WEIGHT * surface
+
+    def _cell_error(self, predicted: SceneCode, rotation_6d: Tensor, true: SceneCode) -> Float[Tensor, " batch"]:
+        """How far what each cell that sees the object says of its pose is from the truth, as the whole answer counts.
+
+        Of poses that look alike cells are taught the one that is nearest to the answer: they are to agree.
+        """
+        seen = F.avg_pool2d(true[SURFACE][:, 3:], STRIDE // SURFACE_SHARE).flatten(1)
+        share = seen / seen.sum(dim=1, keepdim=True).clamp(min=1)
+        numbers = (predicted[of_cells(ROTATION_6D)] - rotation_6d[:, None]).square().sum(dim=-1)
+        offset, depth = self._place_error(predicted[of_cells(TRANSLATION)], true[TRANSLATION], true[ASSUMED_M])
+        return (share * (_NUMBERS_WEIGHT * numbers + offset + depth)).sum(dim=1)
+
+    def _place_error(self, place: Tensor, true_place: Tensor, assumed: Tensor) -> tuple[Tensor, Tensor]:
+        """Across and in depth, by how many diameters the object is displaced; [batch, any number]."""
+        offset = (place[..., :2] / place[..., 2:] - true_place[..., :2] / true_place[..., 2:]).norm(dim=-1)
+        away = assumed / self.object.kind.diameter_m
+        return offset, away * (place[..., 2].log() - true_place[..., 2].log()).abs()
 
     def _surface_loss(self, surface: Float[Tensor, "batch 4 side side"], true: SceneCode) -> Float[Tensor, ""]:
         """Whether each patch sees the object, and where it does, which point of it (mean absolute coordinate error)."""
@@ -322,3 +340,11 @@ class SecondLook(SingleObjectWorld):
         """Rotations onto itself, the identity first; their shifts are a few millimetres and left out."""
         info = self.object.kind.info
         return torch.from_numpy(np.stack([pose.rotation for pose in symmetry_poses(info, _SYMMETRY_STEP)])).float()
+
+
+def _grid(look: SingleObjectWorld) -> CellGrid:
+    """The cells of a look's images."""
+    camera = look.camera
+    assert camera.matrix is not None
+    here = Pose(np.eye(3), np.zeros(3))
+    return CellGrid(look.layout[TRANSLATION], camera.matrix, here, (camera.width, camera.height), on_plane=False)
