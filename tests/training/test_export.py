@@ -15,7 +15,7 @@ import torch
 from curio_train import cli
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, ExportError, UsageError
-from curio_train.export import Exported, check_images, export, largest_difference
+from curio_train.export import Exported, Graph, check_images, export, largest_difference, refuse_disparity, settled
 from curio_train.learning.checkpoint import RunFolder
 from curio_train.learning.provenance import this_sitting
 from curio_train.learning.state import Course
@@ -171,9 +171,32 @@ def test_disagreement_is_refused_and_leaves_nothing(tmp_path: Path, write_run: W
     """Outputs of a billion are exact to a hundred in float32: the order of sums already decides."""
     run = write_run(tmp_path / "run", spread=1e9)
     before = files(tmp_path)
-    with pytest.raises(ExportError, match=r"torch and onnxruntime differ by .* in translation_m, expected at most"):
+    with pytest.raises(ExportError, match=r"answers to 16 of 16 check images change with their last digits"):
         export(run, tmp_path / "models")
     assert files(tmp_path) == before
+
+
+def test_a_graph_that_computes_something_else_is_refused() -> None:
+    with pytest.raises(ExportError, match=r"torch and onnxruntime differ by 0.5 in translation_m, expected at most"):
+        refuse_disparity({TRANSLATION: torch.tensor([1.0, 2.0])}, {TRANSLATION: torch.tensor([1.0, 2.5])})
+
+
+class _Brighter(torch.nn.Module):
+    """Right of the middle if the right half of a picture is brighter: of equal halves rounding decides."""
+
+    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        left, right = images.double().chunk(2, dim=3)
+        side = torch.where(right.mean((1, 2, 3)) > left.mean((1, 2, 3)), 0.2, -0.2)
+        return {TRANSLATION: torch.stack([side, side, 0 * side], dim=1)[:, None].float()}
+
+
+def test_images_on_which_rounding_decides_can_tell_nothing() -> None:
+    graph = Graph(_Brighter(), Circles())
+    images = torch.zeros(8, 128, 128, 3, dtype=torch.uint8)
+    images[:5, :, 64:] = 100
+    assert settled(graph, images).tolist() == [True] * 5 + [False] * 3
+    with pytest.raises(ExportError, match=r"answers to 6 of 8 check images"):
+        settled(graph, images[[0, 1, 5, 6, 7, 5, 6, 7]])
 
 
 def test_weights_too_large_for_half_are_refused(tmp_path: Path, write_run: WriteRun) -> None:
