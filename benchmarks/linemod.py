@@ -36,6 +36,7 @@ class Settings:
         frames: BOP data set whose frames are listed one by one, where it has the class.
         sheets: Folder for a contact sheet a class, which show the data set: never in this repository.
         num_images: Held-out renderings.
+        refine: Score every network after render-and-compare, too, which takes most of the time.
         columns: Frames of a contact sheet.
         results: The file of results; the page lies beside it.
         cache: Where image sets that a world draws once are kept.
@@ -47,6 +48,7 @@ class Settings:
     frames: Path | None = None
     sheets: Path | None = None
     num_images: int = 500
+    refine: bool = True
     columns: int = 6
     results: Path = Path("docs/results/linemod.json")
     cache: Path = Path("~/.cache/curio-pose")
@@ -64,18 +66,18 @@ def score(settings: Settings, candidate: Candidate) -> dict[str, Row]:
         candidate.path,
         num_images=settings.num_images,
         data=settings.data,
-        refine=True,
+        refine=settings.refine,
         cache=settings.cache,
         progress=lambda text: log(f"{candidate.path.name}: {text}"),
         warn=log,
     )
     served = load_subject(candidate.path, settings.data)
-    refiner = replace(served, predict=refined(served.predict, served.world))
+    scored = [(candidate.method, served, result)]
+    if settings.refine:
+        refiner = replace(served, predict=refined(served.predict, served.world))
+        scored.append((candidate.method + REFINED, refiner, result | result["refined"]))
     rows = {}
-    for method, subject, found in (
-        (candidate.method, served, result),
-        (candidate.method + REFINED, refiner, result | result["refined"]),
-    ):
+    for method, subject, found in scored:
         frames = []
         if settings.frames is not None and candidate.name in BopDataset(settings.frames).classes:
             frames = evaluate_real_frames(subject, settings.frames, None)["targets"]
@@ -95,7 +97,8 @@ def main(settings: Settings) -> int:
     """Score what is left."""
     table: Results = load_table(settings.results)
     for candidate in candidates(settings.runs):
-        rows = [table.get(method, {}).get(candidate.name) for method in (candidate.method, candidate.method + REFINED)]
+        methods = [candidate.method + after for after in ("", REFINED)[: 1 + settings.refine]]
+        rows = [table.get(method, {}).get(candidate.name) for method in methods]
         if all(is_current(row, candidate, settings.num_images, settings.data) for row in rows):
             log(f"{candidate.path.name}: kept")
         else:

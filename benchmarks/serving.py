@@ -136,6 +136,7 @@ def limits(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any]:
         "goodput_at_3x": round(flood["goodput"] / peak, 3),
         "offered_over_peak": round(flood["offered"] / peak, 2),
         "codes_at_3x": flood["codes"],
+        "reasons_at_3x": flood["reasons"],
     }
 
 

@@ -175,6 +175,7 @@ class _Record:
         self._requests = target.requests
         self._call = channel.unary_unary(target.method)
         self.codes: Counter[str] = Counter()
+        self._reasons: dict[str, str] = {}
         self._latencies_ms: list[float] = []
 
     async def call(self, due: float) -> None:
@@ -183,15 +184,17 @@ class _Record:
             await self._call(request, timeout=DEADLINE_S)
         except grpc.aio.AioRpcError as exc:
             self.codes[exc.code().name] += 1
+            self._reasons.setdefault(exc.code().name, exc.details() or "")
             return
         self.codes["OK"] += 1
         self._latencies_ms.append(1000 * (time.perf_counter() - due))
 
     def summary(self, seconds: float) -> dict[str, Any]:
-        """Codes, latencies of good answers, and rates a second."""
+        """Codes, what the first call of each bad one was told, latencies of good answers, and rates a second."""
         good = sum(latency <= 1000 * DEADLINE_S for latency in self._latencies_ms)
         return {
             "codes": dict(self.codes),
+            "reasons": self._reasons,
             "latencies_ms": self._latencies_ms,
             "goodput": good / seconds,
             "offered": self.codes.total() / seconds,
