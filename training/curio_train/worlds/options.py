@@ -81,7 +81,7 @@ class LinemodOptions(WorldOptions):
     data: Path | None = None
     backgrounds: Path | None = None
     photos: Path | None = None
-    gaze: tyro.conf.FlagCreatePairsOff[bool] | bool = True
+    gaze: tyro.conf.FlagCreatePairsOff[bool] = True
     download: tyro.conf.FlagCreatePairsOff[bool] = False
 
     def __post_init__(self) -> None:
