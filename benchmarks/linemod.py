@@ -97,7 +97,7 @@ def main(settings: Settings) -> int:
     """Score what is left."""
     table: Results = load_table(settings.results)
     for candidate in candidates(settings.runs):
-        methods = [candidate.method + after for after in ("", REFINED)[: 1 + settings.refine]]
+        methods = [candidate.method, candidate.method + REFINED] if settings.refine else [candidate.method]
         rows = [table.get(method, {}).get(candidate.name) for method in methods]
         if all(is_current(row, candidate, settings.num_images, settings.data) for row in rows):
             log(f"{candidate.path.name}: kept")

@@ -1,6 +1,7 @@
 """LineMOD's table on runs and a real data set of our own: scored once, kept, told as a page, drawn as a sheet."""
 
 import copy
+import dataclasses
 import importlib.util
 import json
 import shutil
@@ -108,6 +109,17 @@ def test_the_sheet_has_a_column_a_frame_that_is_seen_well(table: Results, folder
     assert green[:160].any()
     assert not green[160:].any()
     assert (sheet[:160] == 90).mean() > 0.5, "the frame itself is not to be seen"
+
+
+def test_refined_rows_stand_beside_unless_left_out(
+    table: Results, settings: Any, folder: Path, benchmark: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert table.keys() == {"noncur", "noncur, refined"}
+    alone = dataclasses.replace(settings, refine=False, sheets=None, results=folder / "alone.json")
+    for kept in (False, True):
+        assert benchmark.main(alone) == 0
+        assert ("first: kept" in capsys.readouterr().err) is kept
+        assert load_table(alone.results).keys() == {"noncur"}
 
 
 def test_a_class_is_kept_until_something_it_is_made_of_changes(
