@@ -7,8 +7,9 @@ from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
 from curio_train.worlds.lessons import Lessons
 
-STUDIES = (0.6, 0.8)
-"""Shares of the budget after which photographs are read: late, when what is read is worth it, and once more."""
+STUDIES = (0.2, 0.5, 0.8)
+"""Shares of the budget after which photographs are read: when what is read may be worth it, and anew as it is worth
+more."""
 
 
 class SelfTraining:

@@ -56,6 +56,7 @@ class View:
         bounds: Of the part's rows.
         camera: Float, see :class:`Rows`.
         key: Of all random numbers of the batch, UInt32.
+        finish: Float, see :class:`Rows`, or None.
     """
 
     images: tuple[int, int]
@@ -63,6 +64,7 @@ class View:
     bounds: ImageBounds
     camera: Any
     key: Any
+    finish: Any = None
 
     @property
     def num_images(self) -> int:

@@ -5,6 +5,7 @@ from types import ModuleType
 from typing import Any
 
 from curio_train.rendering.bounds import NEAR_M
+from curio_train.rendering.finish import FINISH_SIZE, Finish
 from curio_train.rendering.pixels import Place
 from curio_train.rendering.rows import Rows
 
@@ -54,9 +55,15 @@ class LayerTracer:
         normal = mi.Normal3f(surface.sh_frame.n)
         # Meshes wound inside out or open show their back: both sides shade alike.
         normal = dr.select(dr.dot(surface.n, ray.d) > 0, -normal, normal)
-        radiance = self.ambient + lit * dr.maximum(0, dr.dot(normal, rows.light(row)))
-        own = bsdf.eval_diffuse_reflectance(surface)
-        return [srgb_from_linear(dr, own[i] * albedo * radiance) for i, albedo in enumerate(rows.albedo(row))]
+        own, light = bsdf.eval_diffuse_reflectance(surface), rows.light(row)
+        if rows.finish is None:
+            radiance, shine = self.ambient + lit * dr.maximum(0, dr.dot(normal, light)), 0.0
+        else:
+            finish = Finish(mi, dr, self.scene, rows.finish_values(row, FINISH_SIZE))
+            grain, normal = finish.roughened(surface.p - rows.sphere_center(row), normal)
+            radiance, lit = finish.radiance(self.ambient, lit, surface, normal, light)
+            radiance, shine = grain * radiance, finish.highlight(lit, -ray.d, normal, light)
+        return [srgb_from_linear(dr, own[i] * albedo * radiance + shine) for i, albedo in enumerate(rows.albedo(row))]
 
     def _surface(self, ray: Any, hit: Any) -> tuple[Any, Any]:
         """Where rays hit, and the BSDF there; a single shape is asked itself, which saves looking up whose it is."""

@@ -1,5 +1,6 @@
 """One part of a batch through the renderer: primal image and gradient."""
 
+from dataclasses import replace
 from typing import Any
 
 from curio_train.rendering.launch import Hits, Launch, Setting, View
@@ -57,7 +58,7 @@ class Pass:
         return through
 
     def _rows(self, values: Any) -> Rows:
-        return self.view.sight.rows(values, self.view.camera)
+        return replace(self.view.sight.rows(values, self.view.camera), finish=self.view.finish)
 
     def _trace_pixels(self, launch: Launch, rows: Rows) -> Hits | None:
         setting, view = self.set, self.view

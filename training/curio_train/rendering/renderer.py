@@ -13,6 +13,7 @@ from curio_train.data.simplification import simplified
 from curio_train.errors import RendererError
 from curio_train.rendering.bounds import project_bounds
 from curio_train.rendering.color import linear_from_srgb
+from curio_train.rendering.finish import in_object_frame
 from curio_train.rendering.ground import Ground
 from curio_train.rendering.launch import Setting, View
 from curio_train.rendering.layers import LayerTracer, Objects, Sight
@@ -99,6 +100,7 @@ class Renderer:
         light: Float[Tensor, "batch 3"],
         color: Float[Tensor, "batch slots 3"] | None = None,
         confidence: Float[Tensor, "batch slots"] | None = None,
+        finish: Float[Tensor, "batch slots size"] | None = None,
         seed: int = 0,
     ) -> Float[Tensor, "batch 3 height width"]:
         """Render a batch.
@@ -111,6 +113,7 @@ class Renderer:
             light: Camera frame, towards the light; its length is the strength.
             color: sRGB albedo that multiplies the mesh's own; None: 1.
             confidence: In [0, 1]; None: 1.
+            finish: Of the surfaces, see finish.py; None: all are dull and smooth.
             seed: Of the jitter within pixels and along outlines.
 
         Returns:
@@ -130,7 +133,8 @@ class Renderer:
         rotation, translation_m, light, color, confidence = _on_host(rotation, translation_m, light, color, confidence)
         rows = self._pack(rotation, translation_m, light, color, confidence)
         corners_m, intrinsics = self._corners(rotation, translation_m), _intrinsics(camera_matrix, len(rotation))
-        views = self._views(corners_m, intrinsics, Objects(setting.mi, setting.dr), seed)
+        turned = None if finish is None else in_object_frame(finish.cpu(), rotation.detach())
+        views = self._views(corners_m, intrinsics, Objects(setting.mi, setting.dr), seed, turned)
         return _Render.apply(rows, backgrounds.cpu(), setting, views).to(device)
 
     def shadows(
@@ -184,7 +188,9 @@ class Renderer:
         parts = [origin, matrix.flatten(2), light_in_object, albedo, confidence[..., None]]
         return torch.cat(parts, dim=-1).reshape(-1, ROW_SIZE)
 
-    def _views(self, corners_m: np.ndarray, intrinsics: np.ndarray, sight: Sight, seed: int) -> list[View]:
+    def _views(
+        self, corners_m: np.ndarray, intrinsics: np.ndarray, sight: Sight, seed: int, finish: Tensor | None = None
+    ) -> list[View]:
         setting, n = self.setting, self.setting.num_slots
         per_row = np.repeat(intrinsics, n, axis=0)
         bounds = project_bounds(corners_m, per_row, setting.width, setting.height)
@@ -196,7 +202,8 @@ class Renderer:
             last = first + max(1, int(np.searchsorted(np.cumsum(num_rays[first:]), MAX_RAYS, side="right")))
             low, high = first * n, last * n
             part = setting.mi.Float(camera[low:high].ravel())
-            views.append(View((first, last), sight, bounds.part(low, high), part, key))
+            own = None if finish is None else setting.mi.Float(finish.flatten(0, 1)[low:high].numpy().ravel())
+            views.append(View((first, last), sight, bounds.part(low, high), part, key, own))
             first = last
         return views
 

@@ -27,12 +27,14 @@ class Rows:
         dr: Dr.Jit.
         values: Float [rows · ROW_SIZE], row after row.
         camera: Float [rows · CAMERA_SIZE], row after row.
+        finish: Float [rows · FINISH_SIZE], row after row, or None: all surfaces are dull and smooth.
     """
 
     mi: ModuleType
     dr: ModuleType
     values: Any
     camera: Any
+    finish: Any = None
 
     def detached(self) -> Self:
         """The same values, without gradients."""
@@ -82,6 +84,10 @@ class Rows:
     def confidence(self, row: Any) -> Any:
         """In [0, 1]."""
         return self._take(row, 18, 1)[0]
+
+    def finish_values(self, row: Any, count: int) -> list[Any]:
+        """Of :attr:`finish`."""
+        return [self.dr.gather(self.mi.Float, self.finish, row * count + i) for i in range(count)]
 
     def project(self, row: Any, point: Any) -> tuple[Any, Any]:
         """Camera frame to pixels."""

@@ -70,7 +70,7 @@ _SURFACE_WEIGHT = 3.0  # it teaches what the rotation is read from
 _LIGHT_WEIGHT = 0.05
 _COLOR_WEIGHT = 0.1  # light and exposure leave it uncertain
 _CONFIDENCE_WEIGHT = 0.2
-_SYMMETRY_STEP = 0.1  # continuous symmetries count as one in so many parts of a turn: 31
+SYMMETRY_STEP = 0.1  # continuous symmetries count as one in so many parts of a turn: 31
 
 
 def gaze_camera(frame: Intrinsics) -> Camera:
@@ -122,8 +122,7 @@ class GazeWorld(SingleObjectWorld):
 class FirstLook(SingleObjectWorld):
     """Whole frames at low resolution, of which only the place is read."""
 
-    name = "first look"
-    num_shown = 3
+    name, num_shown, finished = "first look", 3, True
 
     def __init__(self, thing: Object, frame: Camera) -> None:
         camera = resized(thing.camera, frame.width // FIRST_LOOK_SHARE, frame.height // FIRST_LOOK_SHARE)
@@ -177,7 +176,7 @@ class SecondLook(SingleObjectWorld):
     length FILL · CROP_PX, centre in the middle. The real crop camera has FILL · CROP_PX · assumed depth / diameter.
     """
 
-    name = "second look"
+    name, finished = "second look", True
     given = (ASSUMED_M,)
 
     def __init__(self, thing: Object) -> None:
@@ -339,7 +338,7 @@ class SecondLook(SingleObjectWorld):
     def _turns(self) -> Tensor:
         """Rotations onto itself, the identity first; their shifts are a few millimetres and left out."""
         info = self.object.kind.info
-        return torch.from_numpy(np.stack([pose.rotation for pose in symmetry_poses(info, _SYMMETRY_STEP)])).float()
+        return torch.from_numpy(np.stack([pose.rotation for pose in symmetry_poses(info, SYMMETRY_STEP)])).float()
 
 
 def _grid(look: SingleObjectWorld) -> CellGrid:

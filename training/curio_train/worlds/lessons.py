@@ -4,7 +4,8 @@ What a network reads in a photograph is rough, and render-and-compare makes it f
 mesh and renderer, which no server has. So while training goes on, photographs are read and refined, and crops of them
 join the renderings of the second look with those poses for labels (pseudo-labels, Lee 2013; of poses by
 render-and-compare as in Wang et al. 2020, "Self6D"). That shows it what renderings don't: this camera, this light, this
-part. No label of a photograph is used.
+part. Where the camera moved around a scene that stands still, photographs correct each other (:mod:`still_scene`). No
+label of a photograph is used.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,19 +15,24 @@ from typing import Self
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from curio_train.camera import gaze_at, sampling_grid
 from curio_train.data.photographs import read_frames
 from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.metrics.poses import symmetry_poses
 from curio_train.networks.gaze import OVERSAMPLING
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode
-from curio_train.worlds.gaze import CROP_PX, FILL, GazeWorld
+from curio_train.worlds.gaze import CROP_PX, FILL, SYMMETRY_STEP, GazeWorld
 from curio_train.worlds.refinement import Refinement
+from curio_train.worlds.still_scene import agreed
 
 MOST_PHOTOGRAPHS = 300
 """They are kept in memory, and each takes a sixth of a second to be refined."""
+
+FEWEST_AGREED = 10
+"""Photographs with agreed poses that are worth more than all others with poses of their own."""
 
 _READ_AT_ONCE = 20
 _GAINS = (0.8, 1.25)  # of crops: light changes, and all else is the camera's own
@@ -55,32 +61,46 @@ class Lessons:
     @classmethod
     @torch.no_grad()
     def of_own_reading(
-        cls, world: GazeWorld, frames: UInt8[Tensor, "num 3 height width"], predict: Callable[[Tensor], SceneCode]
+        cls,
+        world: GazeWorld,
+        frames: UInt8[Tensor, "num 3 height width"],
+        predict: Callable[[Tensor], SceneCode],
+        cam_from_world: Float[np.ndarray, "num 4 4"] | None = None,
     ) -> Self | None:
-        """Read photographs and refine what was read, twice.
+        """Read photographs, refine what was read, and keep what several agree on; or, of single ones, what is better.
 
         Args:
             world: The gaze's.
             frames: Photographs as the world's camera takes them, sRGB.
             predict: Reads images [batch, 3, height, width] in [0, 1].
+            cam_from_world: Where the camera stood, see :func:`~curio_train.worlds.still_scene.agreed`; None: unknown.
 
         Returns:
-            What can be learned of those whose refined pose is nearer to the picture; None if there is none.
+            What can be learned of photographs whose object stands still among them, if the camera is known to have
+            moved and enough of them agree; else of those whose refined pose, refined once more, is nearer to the
+            picture. None if there is none.
         """
         refine = Refinement(world)
-        codes, kept = [], []
-        for chunk in frames.split(_READ_AT_ONCE):
-            with torch.enable_grad():
-                once, taken = refine.judged(chunk, predict(chunk.float() / 255))
-                twice, taken_again = refine.judged(chunk, once)
-            codes.append(twice)
-            kept.append(taken | taken_again)
-        chosen = torch.cat(kept)
-        code = {name: torch.cat([part[name] for part in codes])[chosen] for name in codes[0]}
+        read = _joined([predict(chunk.float() / 255) for chunk in frames.split(_READ_AT_ONCE)])
+        refined, taken = _refined(refine, frames, read)
+        if cam_from_world is not None:
+            symmetries = symmetry_poses(world.object.kind.info, SYMMETRY_STEP)
+            code, chosen = agreed(refine, frames, cam_from_world, read, (refined, taken), symmetries)
+            if chosen.sum() >= FEWEST_AGREED:
+                return cls(world, frames[chosen], {name: value[chosen] for name, value in code.items()})
+        twice, taken_again = _refined(refine, frames, refined)
+        chosen = taken | taken_again
+        code = {name: value[chosen] for name, value in twice.items()}
         return cls(world, frames[chosen], code) if chosen.any() else None
 
     @classmethod
-    def of_files(cls, world: GazeWorld, paths: Sequence[Path], predict: Callable[[Tensor], SceneCode]) -> Self | None:
+    def of_files(
+        cls,
+        world: GazeWorld,
+        paths: Sequence[Path],
+        predict: Callable[[Tensor], SceneCode],
+        cam_from_world: Float[np.ndarray, "num 4 4"] | None = None,
+    ) -> Self | None:
         """The same of photographs in files, :data:`MOST_PHOTOGRAPHS` of them at most, evenly over all.
 
         Raises:
@@ -88,7 +108,7 @@ class Lessons:
         """
         chosen = spread(paths, MOST_PHOTOGRAPHS)
         frames = read_frames(chosen, world.object.camera, world.camera.width, world.camera.height) if chosen else ()
-        return cls.of_own_reading(world, torch.from_numpy(frames), predict) if len(frames) else None
+        return cls.of_own_reading(world, torch.from_numpy(frames), predict, cam_from_world) if len(frames) else None
 
     def __len__(self) -> int:
         """How many photographs teach."""
@@ -118,3 +138,17 @@ class Lessons:
         gain = torch.from_numpy(random.uniform(*_GAINS, (count, 1, 1, 1))).float()
         crops = (gain * F.avg_pool2d(fine, OVERSAMPLING)).clamp(0, 1)
         return self._look.labelled(code, turned, rotation, assumed[:, None]), crops
+
+
+@torch.enable_grad()
+def _refined(refine: Refinement, frames: Tensor, code: SceneCode) -> tuple[dict[str, Tensor], Tensor]:
+    """Better poses, and where they are found."""
+    parts = []
+    for first in range(0, len(frames), _READ_AT_ONCE):
+        some = slice(first, first + _READ_AT_ONCE)
+        parts.append(refine.judged(frames[some], {name: value[some] for name, value in code.items()}))
+    return _joined([part for part, _ in parts]), torch.cat([taken for _, taken in parts])
+
+
+def _joined(parts: Sequence[SceneCode]) -> dict[str, Tensor]:
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

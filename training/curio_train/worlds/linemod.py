@@ -11,24 +11,30 @@ Constants fixed before any training:
   0.3 to 1.25 times as bright, and tinted, in crops; 0.5 to 1.25 times, and a little tinted, in frames read by a gaze.
 """
 
+import logging
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 
+import numpy as np
 from torch import Tensor
 
+from curio_train.capture.structure import recover
 from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
 from curio_train.data.bop import BopDataset
 from curio_train.data.photographs import Photographs
-from curio_train.errors import UsageError
+from curio_train.errors import CurioError, UsageError
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.gaze import GazeWorld
-from curio_train.worlds.lessons import Lessons
+from curio_train.worlds.lessons import MOST_PHOTOGRAPHS, Lessons, spread
 from curio_train.worlds.options import LinemodOptions
 from curio_train.worlds.single_object import Object, SingleObjectWorld, pose_layout, position_field, squeezed
 
 SIDE_PX = 128
 NEAR_M, FAR_M = 0.5, 1.5
+
+_log = logging.getLogger(__name__)
 
 
 class Linemod(SingleObjectWorld):
@@ -46,13 +52,28 @@ class LinemodGaze(GazeWorld):
     def __init__(self, thing: Object, photographs: Path | None) -> None:
         """Nothing of the photographs is read before they are asked for."""
         super().__init__(Linemod.name, thing)
-        self._photographs = photographs
+        self._folder = photographs
 
     def lessons(self, predict: Callable[[Tensor], SceneCode]) -> Lessons | None:
         """Of the photographs, if there are any."""
-        if self._photographs is None:
+        return Lessons.of_files(self, self._paths, predict, self._cameras) if self._folder is not None else None
+
+    @cached_property
+    def _paths(self) -> list[Path]:
+        assert self._folder is not None
+        return spread(Photographs(self._folder).paths, MOST_PHOTOGRAPHS)
+
+    @cached_property
+    def _cameras(self) -> np.ndarray | None:
+        """Where the camera stood [photographs, 4, 4], NaN where that is not known; None if it is known of none."""
+        try:
+            structure = recover(self._paths, self.object.camera)
+        except CurioError as exc:
+            _log.warning("photographs teach one by one, because their cameras cannot be placed: %s", exc)
             return None
-        return Lessons.of_files(self, Photographs(self._photographs).paths, predict)
+        cameras = np.full((len(self._paths), 4, 4), np.nan)
+        cameras[[self._paths.index(path) for path in structure.photographs]] = structure.cam_from_world
+        return cameras
 
 
 def build(options: LinemodOptions) -> SingleObjectWorld:

@@ -42,8 +42,12 @@ _LEARNING_RATES = {"across": 0.01, "log_depth": 0.015, "turn": 0.03, "light": 0.
 _BETAS = (0.8, 0.95)  # of Adam: there are few steps
 _SCALE = 0.09  # difference of sRGB colours at which a pixel pulls hardest
 _MARGIN_PX = 6  # around the silhouette, where the background is filled in
-_LEAST_SEEN = 0.4  # of the silhouette: 0.55 to 0.9 where the object is whole in view, below 0.4 on clutter alone
+LEAST_SEEN = 0.4
+"""Of the silhouette: 0.55 to 0.9 where the object is whole in view, below 0.4 on clutter alone."""
+
 _GAINS = (0.4, 2.0)
+_EVEN_LIGHT = 0.0, -0.4, -0.5  # from above the camera, where nothing adapts the light that was read
+_AT_ONCE = 32  # images, where nothing is learned
 _FLAT = 0.002  # variance of colours below which contrast cannot be told
 
 
@@ -62,7 +66,11 @@ def refined(predict: Callable[[Tensor], SceneCode], world: World) -> Callable[[T
 
 
 class Refinement:
-    """Refines poses of one object in pictures of a world's camera."""
+    """Refines poses of one object in pictures of a world's camera.
+
+    Attributes:
+        diameter_m: Of the object.
+    """
 
     def __init__(self, world: World) -> None:
         """Build the renderer.
@@ -75,8 +83,9 @@ class Refinement:
                 f"--refine: world {world.name} cannot be refined, expected one object before a camera (linemod, "
                 "capture); leave it out"
             )
+        self._camera = world.camera
         self._matrix = torch.from_numpy(np.asarray(world.camera.matrix)).float()[None]
-        self._diameter_m = world.object.kind.diameter_m
+        self.diameter_m = world.object.kind.diameter_m
         self._renderer = Renderer([world.object.mesh], [0], CROP_PX, CROP_PX, ambient=AMBIENT)
 
     def __call__(self, images: Tensor, code: SceneCode) -> dict[str, Tensor]:
@@ -109,11 +118,36 @@ class Refinement:
                 rates.step()
         return self._accepted(view, start, moves, code)
 
+    @torch.no_grad()
+    def explained(self, images: Tensor, code: SceneCode) -> Float[Tensor, " batch"]:
+        """Share of the silhouettes that poses as they are explain, and the backgrounds alone do not.
+
+        Arguments are those of :meth:`judged`.
+        """
+        shares = []
+        for first in range(0, len(images), _AT_ONCE):
+            part = {name: value[first : first + _AT_ONCE] for name, value in code.items()}
+            part[LIGHT] = part[LIGHT].new_tensor(_EVEN_LIGHT).expand_as(part[LIGHT])
+            view = self._view(images[first : first + _AT_ONCE], part).blurred(1)
+            still = _Moves.none(len(view.crops), part[LIGHT])
+            missed = view.missed(self._rendered(view, still, self._response(view, still)))
+            silhouette, _ = self._object(view, still)
+            shares.append(view.explained(missed) / silhouette.sum((1, 2, 3)).clamp(min=1))
+        return torch.cat(shares)
+
+    def in_view(self, translation_m: Float[np.ndarray, "num 3"]) -> Bool[np.ndarray, " num"]:
+        """Whether positions in the camera's frame are seen within the frame."""
+        depth = translation_m[:, 2:]
+        pixels = (translation_m @ self._matrix[0].double().numpy().T)[:, :2] / np.maximum(depth, 1e-6)
+        inside = (pixels >= 0).all(axis=1) & (pixels < [self._camera.width, self._camera.height]).all(axis=1)
+        seen: np.ndarray = inside & (depth[:, 0] > self.diameter_m)
+        return seen
+
     def _view(self, images: Tensor, code: SceneCode) -> "_View":
         """The crops around the estimates, and the backgrounds behind them."""
         place = code[TRANSLATION][:, 0]
         depth, frames = place.norm(dim=1), self._matrix.expand(len(place), 3, 3)
-        focal = FILL * CROP_PX * depth / self._diameter_m
+        focal = FILL * CROP_PX * depth / self.diameter_m
         gaze = gaze_at(place, 2 * focal, 2 * CROP_PX, frames)  # two samples a pixel and side, then averaged
         grid = sampling_grid(gaze, frames, 2 * CROP_PX, images.shape[3], images.shape[2])
         fine = F.grid_sample(images.float() / 255, grid, padding_mode="border", align_corners=False)
@@ -144,7 +178,7 @@ class Refinement:
     def _pose(self, view: "_View", moves: "_Moves") -> tuple[Tensor, Tensor]:
         """cam_from_obj of the crop's camera."""
         depth = view.depth_m[:, None] * moves.log_depth.exp()
-        across = moves.across * self._diameter_m * moves.log_depth.exp()
+        across = moves.across * self.diameter_m * moves.log_depth.exp()
         return rotation_from_vector(moves.turn) @ view.rotation, torch.cat([across, depth], dim=1)
 
     @torch.no_grad()
@@ -185,12 +219,11 @@ class Refinement:
         """The code with the poses that may replace the estimates, and which do."""
         before, after = (view.missed(self._rendered(view, m, self._response(view, m))) for m in (start, moves))
         silhouette, _ = self._object(view, moves)
-        seen = (view.missed(view.behind) - after).clamp(min=0).sum((1, 2, 3))
         rotation, translation_m = self._pose(view, moves)
         near = rotation_angle_deg(rotation, view.rotation) < LARGEST_TURN_DEG
         near &= moves.across.norm(dim=1) < LARGEST_SHIFT
         near &= moves.log_depth[:, 0].abs() < LARGEST_LOG_DEPTH
-        near &= seen > _LEAST_SEEN * silhouette.sum((1, 2, 3))
+        near &= view.explained(after) > LEAST_SEEN * silhouette.sum((1, 2, 3))
         taken = near & (view.share(after) < view.share(before))
         back = view.crop_from_cam.transpose(1, 2)
         found = {
@@ -263,6 +296,10 @@ class _View:
         """Robust difference between images and crops, 0 to 1 a pixel; 0 outside the region."""
         squared = ((images - self.crops) / _SCALE).square().sum(1, keepdim=True)
         return squared / (squared + 1) * self.region
+
+    def explained(self, missed: Tensor) -> Float[Tensor, " batch"]:
+        """By how much less is missed than by the background alone, pixels."""
+        return (self.missed(self.behind) - missed).clamp(min=0).sum((1, 2, 3))
 
     def share(self, missed: Tensor) -> Float[Tensor, " batch"]:
         """Its mean over the region."""

@@ -15,6 +15,7 @@ from curio_train.data.augmentation import KNOWN_SCENE, UNKNOWN_SCENE, Disturbanc
 from curio_train.data.backgrounds import Backgrounds
 from curio_train.data.meshes import Mesh
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.rendering.finish import random_finishes
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Batch, Camera, ImageSource, ObjectKind, Split, World, jitter_seed
@@ -44,9 +45,13 @@ EXPOSURE = "exposure"
 """What the colours of an object that has its own are multiplied by, [batch, 1, 3]: drawn beside the code, never
 predicted. What a camera sees of a part on a desk is darker, and of another tint, than its mesh's colours."""
 
+FINISH = "finish"
+"""What its surface is like beside its colour, drawn beside the code of images that teach and never predicted."""
+
 LEAST_PAINT_VALUE = 0.1
 """Of the colours of an unpainted object, which may be black, white, grey or anything between."""
 
+_FINISH_DRAWS = 1  # of the draws of a step
 _SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 
 
@@ -91,10 +96,12 @@ class SingleObjectWorld(World):
         object: What is looked for.
         given: Entries of its codes that are known of every image and never predicted.
         num_shown: How many of the object an image shows.
+        finished: Images that teach show surfaces of any kind, see finish.py, unless the scene is known.
     """
 
     given: tuple[str, ...] = ()
     num_shown: int = 1
+    finished: bool = False
 
     def __init__(self, thing: Object, camera: Camera, layout: Layout) -> None:
         self.object, self.camera, self.layout = thing, camera, layout
@@ -143,10 +150,17 @@ class SingleObjectWorld(World):
             return {COLOR: self.object.paints(count, random)}
         return {EXPOSURE: exposures(count, random, self.exposure)}
 
+    def finishes(self, code: SceneCode, seed: tuple[int, ...]) -> dict[str, Tensor]:
+        """The entry of codes that says what the surfaces are like."""
+        count, slots = code[TRANSLATION].shape[:2]
+        drawn = random_finishes(count * slots, np.random.default_rng((*seed, _FINISH_DRAWS)))
+        return {FINISH: drawn.reshape(count, slots, -1)}
+
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> "RenderedStream":
         """An endless stream of renderings; the splits differ in poses and in backgrounds."""
-        backgrounds = self.backgrounds(cache).split(split == "train")
-        return RenderedStream(self, backgrounds, (_SPLITS.index(split), seed), with_code)
+        training = split == "train"
+        backgrounds = self.backgrounds(cache).split(training)
+        return RenderedStream(self, backgrounds, (_SPLITS.index(split), seed), with_code, training)
 
     def backgrounds(self, cache: Path) -> Backgrounds:
         """What its images show behind the object."""
@@ -167,6 +181,7 @@ class SingleObjectWorld(World):
             light=code[LIGHT].float(),
             color=code[COLOR].float() if COLOR in code else code.get(EXPOSURE),
             confidence=code[CONFIDENCE][..., 0].float() if CONFIDENCE in code else None,
+            finish=code.get(FINISH),
             seed=jitter_seed(code),
         )
 
@@ -175,14 +190,17 @@ class RenderedStream(ImageSource):
     """Images of a world over random backgrounds, rendered as they are asked for and never stored."""
 
     def __init__(
-        self, world: SingleObjectWorld, backgrounds: Backgrounds, seed: tuple[int, ...], with_code: bool
+        self, world: SingleObjectWorld, backgrounds: Backgrounds, seed: tuple[int, ...], with_code: bool, finished: bool
     ) -> None:
         self._world, self._backgrounds, self._seed, self._with_code = world, backgrounds, seed, with_code
+        self._finished = finished and world.finished and not world.object.known_scene
 
     @torch.no_grad()
     def batch(self, step: int, size: int) -> Batch:
         """The images of one step, a function of seed and step alone."""
         code = self._world.sample(size, (*self._seed, step))
+        if self._finished:
+            code |= self._world.finishes(code, (*self._seed, step))
         backgrounds = self.backgrounds(step, size)
         images = self._world.render(code, backgrounds)
         given = {name: code[name] for name in self._world.given}
