@@ -48,6 +48,31 @@ class _Readings(NamedTuple):
     translation_m: np.ndarray
 
 
+class _Scene(NamedTuple):
+    """Cameras in a still scene.
+
+    Attributes:
+        cam_from_world: Rigid, [num, 4, 4].
+        known: Of which photographs the camera is known, [num].
+        scale: Metres a unit of the scene.
+    """
+
+    cam_from_world: np.ndarray
+    known: np.ndarray
+    scale: float
+
+    def poses_of(self, readings: _Readings) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations and positions, metres, in the scene's frame."""
+        turn, shift = self.cam_from_world[readings.frame, :3, :3], self.cam_from_world[readings.frame, :3, 3]
+        rotation = np.einsum("nji,njk->nik", turn, readings.rotation)
+        return rotation, np.einsum("nji,nj->ni", turn, readings.translation_m - self.scale * shift)
+
+    def seen_from(self, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations and positions, metres, in each camera's frame."""
+        turn, shift = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
+        return turn @ pose.rotation, turn @ pose.translation_m + self.scale * shift
+
+
 def agreed(
     refine: Refinement,
     frames: Tensor,
@@ -88,21 +113,15 @@ def agreed(
     pairs = zip(sources, scales, strict=True)
     level = [r._replace(translation_m=r.translation_m * scale / s) for r, s in pairs if s is not None]
     every = _Readings(*(np.concatenate(values) for values in zip(*level, strict=True)))
-    poses = _clusters(_in_scene(cameras, scale, every), every, cameras, refine.diameter_m, turns)
-    return _looked_for(refine, frames, cameras, scale, known, poses, read, better, turns)
+    scene = _Scene(cameras, known, scale)
+    poses = _clusters(scene, every, refine.diameter_m, turns)
+    return _looked_for(refine, frames, scene, poses, read, better, turns)
 
 
 def _readings(code: SceneCode, chosen: np.ndarray) -> _Readings:
     rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0]).double().numpy()
     translation_m = code[TRANSLATION][:, 0].double().numpy()
     return _Readings(np.flatnonzero(chosen), rotation[chosen], translation_m[chosen])
-
-
-def _in_scene(cameras: np.ndarray, scale: float, readings: _Readings) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations and positions, metres, in the scene's frame."""
-    turn, shift = cameras[readings.frame, :3, :3], cameras[readings.frame, :3, 3]
-    rotation = np.einsum("nji,njk->nik", turn, readings.rotation)
-    return rotation, np.einsum("nji,nj->ni", turn, readings.translation_m - scale * shift)
 
 
 def _scale(cameras: np.ndarray, readings: _Readings, diameter_m: float) -> float | None:
@@ -125,16 +144,10 @@ def _scale(cameras: np.ndarray, readings: _Readings, diameter_m: float) -> float
     return float(np.exp(np.median(logs[near]))) if near.sum() >= _FEWEST_PAIRS else None
 
 
-def _clusters(
-    in_scene: tuple[np.ndarray, np.ndarray],
-    readings: _Readings,
-    cameras: np.ndarray,
-    diameter_m: float,
-    turns: np.ndarray,
-) -> list[Pose]:
+def _clusters(scene: _Scene, readings: _Readings, diameter_m: float, turns: np.ndarray) -> list[Pose]:
     """Poses in the scene that readings of several photographs agree on, those of most readings first."""
-    rotations, positions = in_scene
-    spread = _spread(readings, cameras, diameter_m)
+    rotations, positions = scene.poses_of(readings)
+    spread = _spread(scene, readings, diameter_m)
     gaps = positions[None] - positions[:, None]
     alike = _distance(gaps, spread[:, None] + spread[None]) < _LARGEST_DISTANCE
     alike &= _angles_deg(rotations, rotations, turns)[0] < _LARGEST_TURN_DEG
@@ -157,9 +170,9 @@ def _clusters(
     return found
 
 
-def _spread(readings: _Readings, cameras: np.ndarray, diameter_m: float) -> Float[np.ndarray, "n 3 3"]:
+def _spread(scene: _Scene, readings: _Readings, diameter_m: float) -> Float[np.ndarray, "n 3 3"]:
     """Covariance of each reading's position: what is across the view is known better than depth."""
-    ray = np.einsum("nji,nj->ni", cameras[readings.frame, :3, :3], readings.translation_m)
+    ray = np.einsum("nji,nj->ni", scene.cam_from_world[readings.frame, :3, :3], readings.translation_m)
     away = np.linalg.norm(ray, axis=1)
     along = ray[:, :, None] * ray[:, None] / away[:, None, None] ** 2
     across = np.eye(3) - along
@@ -190,33 +203,33 @@ def _mean(rotations: np.ndarray, positions: np.ndarray, spread: np.ndarray, turn
 def _looked_for(
     refine: Refinement,
     frames: Tensor,
-    cameras: np.ndarray,
-    scale: float,
-    known: np.ndarray,
+    scene: _Scene,
     poses: list[Pose],
     read: SceneCode,
     better: SceneCode,
     turns: np.ndarray,
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """The pose that explains most of each photograph, if what was read there does not speak against it."""
+    """The pose that explains most of each photograph, if what was read there does not speak against it.
+
+    Where the photograph's own reading explains something, the pose is to lie there, too, and to explain nearly as much;
+    where it is turned otherwise, more.
+    """
     own = refine.explained(frames, better).numpy()
-    credible = own > _CREDIBLE
     best, code = np.zeros(len(frames)), {name: value.clone() for name, value in read.items()}
-    read_rotation, read_m = _readings(better, np.ones(len(frames), dtype=bool))[1:]
+    _, read_rotation, read_m = _readings(better, np.ones(len(frames), dtype=bool))
     for pose in poses:
-        rotation = cameras[:, :3, :3] @ pose.rotation
-        translation_m = cameras[:, :3, :3] @ pose.translation_m + scale * cameras[:, :3, 3]
-        turned = _angles_deg_each(rotation, read_rotation, turns)
+        rotation, translation_m = scene.seen_from(pose)
+        turned = _angles_deg_each(rotation, read_rotation, turns) > 2 * _LARGEST_TURN_DEG
         apart = np.linalg.norm(translation_m[:, :2] - read_m[:, :2] * (translation_m[:, 2:] / read_m[:, 2:]), axis=1)
-        against = (apart > _CONTRADICTION * refine.diameter_m) | (turned > 2 * _LARGEST_TURN_DEG)
-        seen = known & refine.in_view(translation_m) & ~(credible & against)
-        placed = _placed(read, rotation, translation_m)
-        explained = np.zeros(len(frames))
-        chosen = torch.from_numpy(np.flatnonzero(seen))
-        if len(chosen):
-            parts = {name: value[chosen] for name, value in placed.items()}
-            explained[chosen.numpy()] = refine.explained(frames[chosen], parts).numpy()
-        wins = torch.from_numpy(explained > np.maximum(best, np.maximum(LEAST_SEEN, own - _WEAKER)))
+        elsewhere = (own > _CREDIBLE) & (apart > _CONTRADICTION * refine.diameter_m)
+        least = np.maximum(LEAST_SEEN, np.where(turned, own, own - _WEAKER))
+        chosen = torch.from_numpy(np.flatnonzero(scene.known & refine.in_view(translation_m) & ~elsewhere))
+        if len(chosen) == 0:
+            continue
+        placed, explained = _placed(read, rotation, translation_m), np.zeros(len(frames))
+        parts = {name: value[chosen] for name, value in placed.items()}
+        explained[chosen.numpy()] = refine.explained(frames[chosen], parts).numpy()
+        wins = torch.from_numpy(explained > np.maximum(best, least))
         best = np.where(wins.numpy(), explained, best)
         code = {name: torch.where(_like(wins, value), placed[name], value) for name, value in code.items()}
     return code, torch.from_numpy(best > 0)
