@@ -12,7 +12,7 @@ from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.data.shapes import chair
 from curio_train.errors import UsageError
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
-from curio_train.learning.self_training import STUDIES, SelfTraining
+from curio_train.learning.self_training import STUDIES, STUDIES_OF_TRAINED, SelfTraining
 from curio_train.networks.crop import SURFACE
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.base import ObjectKind
@@ -164,6 +164,17 @@ def test_photographs_make_up_their_share_once_they_are_read(world: GazeWorld, tr
     assert not torch.equal(crops[6:], images[:2])
     assert torch.equal(mixed[TRANSLATION][:6], code[TRANSLATION][2:])
     assert look.code_loss(look.network(NetworkConfig())(crops), mixed).isfinite()
+
+
+def test_a_network_that_began_as_a_trained_one_reads_sooner(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+    network = Remembering(roughly(truth)).train()
+    photographed = Photographed(world.object, frames)
+    training = SelfTraining(network, photographed, 0.25, torch.device("cpu"), trained=True)
+    assert STUDIES_OF_TRAINED[0] < STUDIES[0]
+    assert training.is_due(STUDIES_OF_TRAINED[0])
+    training.study(STUDIES_OF_TRAINED[0])
+    assert not training.is_due(STUDIES_OF_TRAINED[1] - 0.01)
+    assert training.is_due(STUDIES_OF_TRAINED[1])
 
 
 def test_a_share_of_all_is_refused() -> None:

@@ -114,8 +114,8 @@ class Recipe:
         sleep_drawn: Share of sleep codes drawn from the world's known range instead of around own predictions; all are
             with --method sleep, which makes no predictions of the data.
         self_training: Share of the second look's images that are photographs, with the poses that the network has read
-            in them and render-and-compare has refined, in the last two fifths of a run that sleeps; 0: none. Only where
-            a world has photographs.
+            in them and render-and-compare has refined, in the last two fifths of a run that sleeps, or in the last four
+            where it began as another (--init); 0: none. Only where a world has photographs.
         gradient_clip: Largest L2 norm of a step's gradient, of the network and of the critic each.
         precision: Of the convolutions; everything else is in float32.
         budget_images: Images to show where neither --minutes nor --images is given.

@@ -84,7 +84,9 @@ class Trainer:
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
         self._share = ranks.share(self._num_micro)
         self._ahead: Ahead[Dream] | None = None
-        self._self_training = SelfTraining(self.state.pose.network, world, config.recipe.self_training, ranks.device)
+        self._self_training = SelfTraining(
+            self.state.pose.network, world, config.recipe.self_training, ranks.device, trained=config.init is not None
+        )
 
     def step(self, rate: float) -> dict[str, float]:
         """One whole step: every micro-batch adds its gradients, then all networks move.

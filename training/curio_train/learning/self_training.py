@@ -7,15 +7,17 @@ from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
 from curio_train.worlds.lessons import Lessons
 
-STUDIES = (0.2, 0.5, 0.8)
-"""Shares of the budget after which photographs are read: when what is read may be worth it, and anew as it is worth
-more."""
+STUDIES, STUDIES_OF_TRAINED = (0.6, 0.8), (0.2, 0.5, 0.8)
+"""Shares of the budget after which photographs are read: late, when what is read is worth it, and once more; sooner by
+networks that began as trained ones (``--init``)."""
 
 
 class SelfTraining:
     """The photographs of a world as its network reads them, for the last look."""
 
-    def __init__(self, network: nn.Module, world: World, share: float, device: torch.device) -> None:
+    def __init__(
+        self, network: nn.Module, world: World, share: float, device: torch.device, *, trained: bool = False
+    ) -> None:
         """Begin without any.
 
         Args:
@@ -23,14 +25,16 @@ class SelfTraining:
             world: What it learns.
             share: Of the last look's images that are to be photographs.
             device: Of the network.
+            trained: The network began as one that reads already.
         """
         self._world, self._network, self._share, self._device = world, network, share, device
+        self._studies = STUDIES_OF_TRAINED if trained else STUDIES
         self._lessons: Lessons | None = None
         self._num_studies = 0
 
     def is_due(self, progress: float) -> bool:
         """Whether to read photographs, after this share of the budget; a run that was interrupted reads them anew."""
-        return self._share > 0 and sum(progress >= share for share in STUDIES) > self._num_studies
+        return self._share > 0 and sum(progress >= share for share in self._studies) > self._num_studies
 
     def study(self, progress: float) -> None:
         """Read them; where nothing is found, what was found before stays.
@@ -38,7 +42,7 @@ class SelfTraining:
         Raises:
             DataError: A photograph cannot be read, or is not of the camera's size.
         """
-        self._num_studies = sum(progress >= share for share in STUDIES)
+        self._num_studies = sum(progress >= share for share in self._studies)
         self._network.eval()
         self._lessons = self._world.lessons(self._read) or self._lessons
         self._network.train()

@@ -69,9 +69,10 @@ class LinemodOptions(WorldOptions):
         download: Without --data, fetch LineMOD from BOP's repository into the cache folder, once; some gigabytes.
         backgrounds: Folder of photographs to see the object in front of; clutter is rendered where none is given.
         photos: Folder of unlabelled frames of the data set's camera, from which a gaze learns towards the end, with the
-            poses that it reads there itself (--self-training). None are used unless given.
-        gaze: Look twice: at the whole frame for the place, at a crop around it for the rest. Without, the paper's one
-            encoder sees the frame squeezed to 128x128.
+            poses that it reads there itself (--self-training). Frames that show one scene from several sides, in the
+            order of their names, correct each other. None are used unless given.
+        gaze: Look twice: at the whole frame for the place, at a crop around it for the rest. The other way, the paper's
+            one encoder sees the frame squeezed to 128x128.
     """
 
     default_method: ClassVar[Method] = "sleep"
