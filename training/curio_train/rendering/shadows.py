@@ -87,7 +87,7 @@ class GroundShadows(Sight):
 
     def rows(self, values: Any, camera: Any) -> ShadowRows:
         """Rows in the light of this ground."""
-        return ShadowRows(self.mi, self.dr, values, camera, self.plane)
+        return ShadowRows(self.mi, self.dr, values, camera, plane=self.plane)
 
     def colors(self, tracer: LayerTracer, rows: Rows, place: Place, hit: Any, lit: Any) -> list[Any]:
         """All of it, whatever was hit."""
