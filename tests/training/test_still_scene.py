@@ -144,5 +144,5 @@ def test_photographs_without_texture_teach_one_by_one_and_say_why(
     for number in range(4):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((480, 640, 3), 40 * number, np.uint8))
     with caplog.at_level(logging.WARNING):
-        assert LinemodGaze(thing(), tmp_path)._cameras is None
+        assert LinemodGaze(thing(), tmp_path).cameras(sorted(tmp_path.iterdir())) is None
     assert "teach one by one" in caplog.text

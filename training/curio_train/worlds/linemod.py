@@ -13,7 +13,6 @@ Constants fixed before any training:
 
 import logging
 from collections.abc import Callable
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -53,26 +52,26 @@ class LinemodGaze(GazeWorld):
         """Nothing of the photographs is read before they are asked for."""
         super().__init__(Linemod.name, thing)
         self._folder = photographs
+        self._placed: tuple[list[Path], np.ndarray | None] | None = None
 
     def lessons(self, predict: Callable[[Tensor], SceneCode]) -> Lessons | None:
-        """Of the photographs, if there are any."""
-        return Lessons.of_files(self, self._paths, predict, self._cameras) if self._folder is not None else None
+        """Of the photographs, if there are any; their cameras are placed once."""
+        if self._folder is None:
+            return None
+        paths = spread(Photographs(self._folder).paths, MOST_PHOTOGRAPHS)
+        if self._placed is None or self._placed[0] != paths:
+            self._placed = paths, self.cameras(paths)
+        return Lessons.of_files(self, paths, predict, self._placed[1])
 
-    @cached_property
-    def _paths(self) -> list[Path]:
-        assert self._folder is not None
-        return spread(Photographs(self._folder).paths, MOST_PHOTOGRAPHS)
-
-    @cached_property
-    def _cameras(self) -> np.ndarray | None:
+    def cameras(self, paths: list[Path]) -> np.ndarray | None:
         """Where the camera stood [photographs, 4, 4], NaN where that is not known; None if it is known of none."""
         try:
-            structure = recover(self._paths, self.object.camera)
+            structure = recover(paths, self.object.camera)
         except CurioError as exc:
             _log.warning("photographs teach one by one, because their cameras cannot be placed: %s", exc)
             return None
-        cameras = np.full((len(self._paths), 4, 4), np.nan)
-        cameras[[self._paths.index(path) for path in structure.photographs]] = structure.cam_from_world
+        cameras = np.full((len(paths), 4, 4), np.nan)
+        cameras[[paths.index(path) for path in structure.photographs]] = structure.cam_from_world
         return cameras
 
 
