@@ -313,7 +313,7 @@ def test_from_files_to_a_model_by_a_project_file(folder: Path, tmp_path: Path, m
     project.write_text(
         'mesh = ["wedge.stl"]\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "a"\nbackground = "plate-a.png"\n'
         'plane = "views.json"\ncounts = [2]\nsecond = "b"\nsecond-background = "plate-b.png"\nmethod = "our"\n'
-        "batch-size = 4\nmicro-batch-size = 4\nseed = 1\n"
+        "batch-size = 4\nmicro-batch-size = 4\n"
     )
     run = tmp_path / "run"
     assert call("--project", project, "--images", 8, "--cache", tmp_path, "--out", run) == 0

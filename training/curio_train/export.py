@@ -3,7 +3,8 @@
 import copy
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,8 +34,10 @@ LARGEST_PARITY_ERROR = 1e-4
 
 _NUM_CHECK_IMAGES = 8  # of either kind
 _CHECK_SEED = (20_210,)
-_JITTER, _NUM_JITTERED = 3e-6, 4  # standard deviation of pixels from 0 to 1: fifty times their rounding
-_LEAST_SETTLED = 0.5  # of the check images
+_PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
+_LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
+_NUM_JITTERED = 16  # a tie is missed once in 2 to the power of this
+_LEAST_SETTLED = 0.25  # of the check images
 
 
 @dataclass(frozen=True)
@@ -189,7 +192,8 @@ def settled(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
     """Which images can tell whether a runtime computes the same: their last digits do not move the answer.
 
     Where the answer is a choice among equals (the likeliest cell, say, of a network that has learned next to nothing),
-    rounding decides, and torch differs from itself on another machine.
+    rounding decides, and torch differs from itself on another machine. It rounds in every layer, and cells that read
+    the same pixels almost alike are moved together by these: so layers are jittered, too.
 
     Args:
         graph: The network that is exported.
@@ -201,16 +205,33 @@ def settled(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
     answers, generator = graph.outputs(images), torch.Generator().manual_seed(*_CHECK_SEED)
     pixels = images.permute(0, 3, 1, 2).float() / 255
     known = torch.ones(len(images), dtype=torch.bool)
-    for _ in range(_NUM_JITTERED):
-        jittered = graph.read(pixels + _JITTER * torch.randn(pixels.shape, generator=generator))
-        for name, values in answers.items():
-            known &= (values - jittered[name]).abs().flatten(1).amax(dim=1) <= LARGEST_PARITY_ERROR
+    with _unsteady(graph.network, generator):
+        for _ in range(_NUM_JITTERED):
+            jittered = graph.read(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
+            for name, values in answers.items():
+                known &= (values - jittered[name]).abs().flatten(1).amax(dim=1) <= LARGEST_PARITY_ERROR
     if known.float().mean() < _LEAST_SETTLED:
         raise ExportError(
             f"the network's answers to {int((~known).sum())} of {len(images)} check images change with their last "
             "digits or are not finite; nothing was written. Has the training diverged, or hardly begun?"
         )
     return known
+
+
+@contextmanager
+def _unsteady(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
+    """Within this, every layer is off by about as much as rounding in some other order can make it."""
+
+    def off(_layer: nn.Module, _given: object, said: Tensor) -> Tensor:
+        return said * (1 + _LAYER_JITTER * torch.randn(said.shape, generator=generator))
+
+    layers = [module for module in network.modules() if module is not network and not list(module.children())]
+    hooks = [layer.register_forward_hook(off) for layer in layers]
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
 
 
 def largest_difference(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
