@@ -29,7 +29,7 @@ from curio_train.data.plate_difference import compare
 from curio_train.metrics.images import blurred
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
-from curio_train.worlds.refinement import filled_in
+from curio_train.worlds.inpainting import filled_in
 
 _TOLERANCE = 0.15  # sRGB; of 0.06, 0.1 and 0.15 the one that told right from wrong best
 _AROUND = 12 / 256  # of the frame's width: how far around the silhouette; 6 / 256 told less
