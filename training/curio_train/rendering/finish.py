@@ -61,13 +61,13 @@ def random_finishes(count: int, random: np.random.Generator) -> Float[Tensor, "c
     """Finishes of any kind."""
     one = (count, 1)
     directions = _unit(random.normal(size=(count, 3)))
-    vectors = _unit(random.normal(size=(count, NUM_WAVES, 3))) * _log_uniform(_WAVES, (count, NUM_WAVES, 1), random)
+    vectors = _unit(random.normal(size=(count, NUM_WAVES, 3))) * log_uniform(*_WAVES, (count, NUM_WAVES, 1), random)
     return finishes(
         count,
         fill=directions * random.uniform(0, _STRONGEST_FILL, one),
-        ambient=_log_uniform(_AMBIENT, one, random),
+        ambient=log_uniform(*_AMBIENT, one, random),
         gloss=random.uniform(0, _STRONGEST_GLOSS, one) * (random.random(one) < _GLOSSY_SHARE),
-        sharpness=_log_uniform(_SHARPNESS, one, random),
+        sharpness=log_uniform(*_SHARPNESS, one, random),
         shadow=random.integers(0, 2, one),
         grain=random.uniform(0, _MOST_GRAIN, one),
         bumps=random.uniform(0, _MOST_BUMPS, one),
@@ -85,56 +85,70 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _log_uniform(between: tuple[float, float], shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:
-    return np.exp(random.uniform(math.log(between[0]), math.log(between[1]), shape))
+def log_uniform(low: float, high: float, shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:
+    """Numbers between two whose logarithms are evenly spread."""
+    return np.exp(random.uniform(math.log(low), math.log(high), shape))
 
 
 @dataclass(frozen=True)
 class Finish:
-    """The finishes of the rows that hits belong to.
+    """The finishes of the rows that hits belong to; see :func:`finishes`.
 
     Attributes:
         mi: Mitsuba.
         dr: Dr.Jit.
         scene: In which surfaces shade themselves.
-        values: One array of :data:`FINISH_SIZE` for each value.
+        fill: Vector of the second light, in the objects' frames.
+        ambient, gloss, sharpness, shadow, grain, bumps: One value a hit.
+        waves: Vector and phase of each.
     """
 
     mi: ModuleType
     dr: ModuleType
     scene: Any
-    values: list[Any]
+    fill: Any
+    ambient: Any
+    gloss: Any
+    sharpness: Any
+    shadow: Any
+    grain: Any
+    bumps: Any
+    waves: list[tuple[Any, Any]]
+
+    @staticmethod
+    def of_values(mi: ModuleType, dr: ModuleType, scene: Any, values: list[Any]) -> "Finish":
+        """From one array for each of the :data:`FINISH_SIZE` values, in the order of :func:`finishes`."""
+        fill, others, waves = mi.Vector3f(*values[:3]), values[3:9], values[9:]
+        each = [(mi.Vector3f(*waves[first : first + 3]), waves[first + 3]) for first in range(0, 4 * NUM_WAVES, 4)]
+        return Finish(mi, dr, scene, fill, *others, waves=each)
 
     def roughened(self, point: Any, normal: Any) -> tuple[Any, Any]:
         """Factor on the albedo, and the normal, of points given from the object's middle, in its radii."""
         mi, dr = self.mi, self.dr
-        grain, bumps, *waves = self.values[7:]
         height, slope = mi.Float(0), mi.Vector3f(0)
-        for wave in range(NUM_WAVES):
-            along = mi.Vector3f(*waves[4 * wave : 4 * wave + 3])
-            sine, cosine = dr.sincos(dr.dot(along, point) + waves[4 * wave + 3])
+        for along, phase in self.waves:
+            sine, cosine = dr.sincos(dr.dot(along, point) + phase)
             height += sine
             slope += cosine * along * dr.rcp(dr.maximum(dr.norm(along), 1e-6))
-        return dr.exp(grain * height), mi.Normal3f(dr.normalize(normal - bumps * slope))
+        return dr.exp(self.grain * height), mi.Normal3f(dr.normalize(normal - self.bumps * slope))
 
     def radiance(self, ambient: float, lit: Any, surface: Any, normal: Any, light: Any) -> tuple[Any, Any]:
         """What falls on the surface: from everywhere, from the light and from the second one; and the lit share."""
         mi, dr = self.mi, self.dr
-        fill, scale, shadow = mi.Vector3f(*self.values[:3]), self.values[3], self.values[6]
         with dr.suspend_grad():
             side = dr.select(dr.dot(surface.n, light) < 0, -1.0, 1.0)
             start = dr.detach(surface.p) + _CLEAR * side * dr.detach(surface.n)
             ray = mi.Ray3f(start, dr.normalize(dr.detach(light)))
             ray.maxt = 2.0
-            hidden = self.scene.ray_test(ray, active=shadow > 0)
-        lit = lit * dr.select(hidden, 1 - shadow, 1.0)
-        facing = lit * dr.maximum(0, dr.dot(normal, light)) + dr.maximum(0, dr.dot(normal, fill))
-        return scale * ambient + facing, lit
+            hidden = self.scene.ray_test(ray, active=self.shadow > 0)
+        lit = lit * dr.select(hidden, 1 - self.shadow, 1.0)
+        facing = lit * dr.maximum(0, dr.dot(normal, light)) + dr.maximum(0, dr.dot(normal, self.fill))
+        return self.ambient * ambient + facing, lit
 
     def highlight(self, lit: Any, towards_camera: Any, normal: Any, light: Any) -> Any:
         """Reflection of the light itself (Blinn 1977)."""
         dr = self.dr
-        gloss, sharpness = self.values[4], self.values[5]
         strength = dr.norm(light)
         half = dr.normalize(light / dr.maximum(strength, 1e-6) + dr.normalize(towards_camera))
-        return gloss * lit * strength * dr.power(dr.maximum(dr.dot(normal, half), 1e-4), sharpness)
+        facing = dr.maximum(dr.dot(normal, half), 1e-4)
+        return self.gloss * lit * strength * dr.power(facing, self.sharpness)

@@ -59,7 +59,7 @@ class LayerTracer:
         if rows.finish is None:
             radiance, shine = self.ambient + lit * dr.maximum(0, dr.dot(normal, light)), 0.0
         else:
-            finish = Finish(mi, dr, self.scene, rows.finish_values(row, FINISH_SIZE))
+            finish = Finish.of_values(mi, dr, self.scene, rows.finish_values(row, FINISH_SIZE))
             grain, normal = finish.roughened(surface.p - rows.sphere_center(row), normal)
             radiance, lit = finish.radiance(self.ambient, lit, surface, normal, light)
             radiance, shine = grain * radiance, finish.highlight(lit, -ray.d, normal, light)

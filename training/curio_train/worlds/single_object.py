@@ -151,7 +151,7 @@ class SingleObjectWorld(World):
         return {EXPOSURE: exposures(count, random, self.exposure)}
 
     def finishes(self, code: SceneCode, seed: tuple[int, ...]) -> dict[str, Tensor]:
-        """The entry of codes that says what the surfaces are like."""
+        """The entry of a code that says what its surfaces are like, of any kind [batch, slots, FINISH_SIZE]."""
         count, slots = code[TRANSLATION].shape[:2]
         drawn = random_finishes(count * slots, np.random.default_rng((*seed, _FINISH_DRAWS)))
         return {FINISH: drawn.reshape(count, slots, -1)}

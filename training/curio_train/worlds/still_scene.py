@@ -23,13 +23,14 @@ from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.refinement import LEAST_SEEN, Refinement
 
 _FEWEST = 3  # photographs that a pose is agreed on by
-_FEWEST_READINGS, _GROWTHS = 4, 3
+_FEWEST_READINGS = 4  # of a pose; a photograph has up to two, as read and refined
+_GROWTHS = 3  # times that a pose becomes the mean of the readings near it
 _LARGEST_TURN_DEG = 20.0
 _ACROSS, _IN_DEPTH, _MOVED = 0.04, 0.04, 0.03  # standard deviations: diameters, shares of the distance, diameters
 _LARGEST_DISTANCE = 11.3  # squared, in standard deviations: 99 of 100 readings of one position
 _FEWEST_PAIRS = 30  # that a scale is told from
 _LARGEST_GAP, _LEAST_BASELINE = 0.6, 0.5  # diameters: of pairs that tell of the scale
-_SAME_SCALE = 0.05
+_SAME_SCALE = 0.05  # logarithms so near vote for each other
 _CREDIBLE, _WEAKER = 0.3, 0.1  # of what a photograph's own reading explains of its silhouette
 _CONTRADICTION = 0.25  # diameters across the view
 
@@ -150,7 +151,7 @@ def _clusters(scene: _Scene, readings: _Readings, diameter_m: float, turns: np.n
     spread = _spread(scene, readings, diameter_m)
     gaps = positions[None] - positions[:, None]
     alike = _distance(gaps, spread[:, None] + spread[None]) < _LARGEST_DISTANCE
-    alike &= _angles_deg(rotations, rotations, turns)[0] < _LARGEST_TURN_DEG
+    alike &= _angles_deg(rotations[:, None], rotations, turns)[0] < _LARGEST_TURN_DEG
     left, found = np.ones(len(positions), dtype=bool), []
     while True:
         seed = int((alike & left & left[:, None]).sum(axis=1).argmax())
@@ -160,7 +161,7 @@ def _clusters(scene: _Scene, readings: _Readings, diameter_m: float, turns: np.n
         for _ in range(_GROWTHS):
             pose = _mean(rotations[members], positions[members], spread[members], turns)
             near = _distance(positions - pose.translation_m, spread) < _LARGEST_DISTANCE
-            near &= _angles_deg(rotations, pose.rotation[None], turns)[0][:, 0] < _LARGEST_TURN_DEG
+            near &= _angles_deg(rotations, pose.rotation, turns)[0] < _LARGEST_TURN_DEG
             if (near & left).sum() < _FEWEST_READINGS:
                 break
             members = np.flatnonzero(near & left)
@@ -188,14 +189,14 @@ def _distance(gaps: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _angles_deg(one: np.ndarray, other: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least angle over the symmetries between each of two sets of rotations, and the symmetry that it is least with."""
-    cosines = np.stack([(np.einsum("nij,mij->nm", one @ turn, other) - 1) / 2 for turn in turns])
+    """Least angle over the symmetries between rotations [..., 3, 3], and the number of that symmetry."""
+    cosines = np.stack([(np.einsum("...ij,...ij->...", one @ turn, other) - 1) / 2 for turn in turns])
     return np.degrees(np.arccos(cosines.max(axis=0).clip(-1, 1))), cosines.argmax(axis=0)
 
 
 def _mean(rotations: np.ndarray, positions: np.ndarray, spread: np.ndarray, turns: np.ndarray) -> Pose:
-    _, symmetry = _angles_deg(rotations, rotations[:1], turns)
-    rotation = Rotation.from_matrix(rotations @ turns[symmetry[:, 0]]).mean().as_matrix()
+    _, symmetry = _angles_deg(rotations, rotations[0], turns)
+    rotation = Rotation.from_matrix(rotations @ turns[symmetry]).mean().as_matrix()
     weight = np.linalg.inv(spread)
     return Pose(rotation, np.linalg.solve(weight.sum(axis=0), np.einsum("nij,nj->i", weight, positions)))
 
@@ -219,7 +220,7 @@ def _looked_for(
     _, read_rotation, read_m = _readings(better, np.ones(len(frames), dtype=bool))
     for pose in poses:
         rotation, translation_m = scene.seen_from(pose)
-        turned = _angles_deg_each(rotation, read_rotation, turns) > 2 * _LARGEST_TURN_DEG
+        turned = _angles_deg(rotation, read_rotation, turns)[0] > 2 * _LARGEST_TURN_DEG
         apart = np.linalg.norm(translation_m[:, :2] - read_m[:, :2] * (translation_m[:, 2:] / read_m[:, 2:]), axis=1)
         elsewhere = (own > _CREDIBLE) & (apart > _CONTRADICTION * refine.diameter_m)
         least = np.maximum(LEAST_SEEN, np.where(turned, own, own - _WEAKER))
@@ -233,12 +234,6 @@ def _looked_for(
         best = np.where(wins.numpy(), explained, best)
         code = {name: torch.where(_like(wins, value), placed[name], value) for name, value in code.items()}
     return code, torch.from_numpy(best > 0)
-
-
-def _angles_deg_each(one: np.ndarray, other: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    cosines = np.stack([(np.einsum("nij,nij->n", one @ turn, other) - 1) / 2 for turn in turns])
-    result: np.ndarray = np.degrees(np.arccos(cosines.max(axis=0).clip(-1, 1)))
-    return result
 
 
 def _placed(code: SceneCode, rotation: np.ndarray, translation_m: np.ndarray) -> dict[str, Tensor]:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.geometry import rotation_between
+from curio_train.rendering.finish import log_uniform
 from curio_train.scene_code import Field
 
 LARGEST_ROLL_DEG = 45.0
@@ -70,14 +71,10 @@ def lights(count: int, random: np.random.Generator, weakest: float) -> Float[Ten
     direction = random.normal(size=(count, 3))
     direction[:, 2] = -np.abs(direction[:, 2])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return torch.from_numpy(direction * _log_uniform(weakest, STRONGEST_LIGHT, (count, 1), random)).float()
+    return torch.from_numpy(direction * log_uniform(weakest, STRONGEST_LIGHT, (count, 1), random)).float()
 
 
 def exposures(count: int, random: np.random.Generator, most: Exposure) -> Float[Tensor, "count 1 3"]:
     """What an object's colours are multiplied by, as if it stood in more or less, and warmer or colder, light."""
     tint = np.exp(most.tint * random.normal(size=(count, 1, 3)))
-    return torch.from_numpy(_log_uniform(most.darkest, most.brightest, (count, 1, 1), random) * tint).float()
-
-
-def _log_uniform(low: float, high: float, shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:
-    return np.exp(random.uniform(np.log(low), np.log(high), shape))
+    return torch.from_numpy(log_uniform(most.darkest, most.brightest, (count, 1, 1), random) * tint).float()
