@@ -120,7 +120,7 @@ class Finish:
         """From one array for each of the :data:`FINISH_SIZE` values, in the order of :func:`finishes`."""
         fill, others, waves = mi.Vector3f(*values[:3]), values[3:9], values[9:]
         each = [(mi.Vector3f(*waves[first : first + 3]), waves[first + 3]) for first in range(0, 4 * NUM_WAVES, 4)]
-        return Finish(mi, dr, scene, fill, *others, waves=each)
+        return Finish(mi, dr, scene, fill, *others, each)
 
     def roughened(self, point: Any, normal: Any) -> tuple[Any, Any]:
         """Factor on the albedo, and the normal, of points given from the object's middle, in its radii."""
