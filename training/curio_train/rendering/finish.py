@@ -118,9 +118,10 @@ class Finish:
     @staticmethod
     def of_values(mi: ModuleType, dr: ModuleType, scene: Any, values: list[Any]) -> "Finish":
         """From one array for each of the :data:`FINISH_SIZE` values, in the order of :func:`finishes`."""
-        fill, others, waves = mi.Vector3f(*values[:3]), values[3:9], values[9:]
+        ambient, gloss, sharpness, shadow, grain, bumps, *waves = values[3:]
         each = [(mi.Vector3f(*waves[first : first + 3]), waves[first + 3]) for first in range(0, 4 * NUM_WAVES, 4)]
-        return Finish(mi, dr, scene, fill, *others, each)
+        fill = mi.Vector3f(*values[:3])
+        return Finish(mi, dr, scene, fill, ambient, gloss, sharpness, shadow, grain, bumps, each)
 
     def roughened(self, point: Any, normal: Any) -> tuple[Any, Any]:
         """Factor on the albedo, and the normal, of points given from the object's middle, in its radii."""
