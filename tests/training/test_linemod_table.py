@@ -156,6 +156,7 @@ def figures(name: str, share: float, visible: float, num_visible: int) -> dict[s
     real = {"dataset": "lmo", "split_name": "bop19 targets", "num_targets": 90, "metrics": metrics}
     rendered = {"add_recall": 0.8, "rotation_deg_median": 4.0, "translation_mm_median": 7.0, "confidence_ece": 0.05}
     made = {
+        "num_images": 1500,
         "images_seen": 1000,
         "training_seconds": 120,
         "machine": "M",
@@ -173,7 +174,7 @@ def line(page: str, start: str) -> list[str]:
 def test_published_figures_stand_beside_rows_of_the_same_frames_only() -> None:
     rows = {"ape": figures("ape", 0.4, 0.5, 58), "cat": figures("cat", 0.2, 0.3, 52)}
     page = markdown({"sleep": rows}, "make it")
-    assert "Labels of real images: no; of renderings: yes." in page
+    assert "Labels of real images: no; of renderings: yes. 1,500 renderings a class." in page
     assert line(page, "ape")[8:14] == ["40.0 (30–50)", "90", "46.1", "50.0 (40–60)", "58", "65.5"]
     mean = line(page, "**mean of 2**")
     assert [mean[3], mean[6], mean[7]] == ["80.0", "0.050", "–"]

@@ -58,8 +58,10 @@ def _supervision(rows: Mapping[str, Row]) -> str:
     kinds = {(row["labels_real"], row["labels_synthetic"]) for row in rows.values()}
     real, synthetic = (any(kind[i] for kind in kinds) for i in (0, 1))
     sets = sorted({f"{row['real']['dataset']}, {row['real']['split_name']}" for row in rows.values()})
+    counts = " or ".join(f"{count:,}" for count in sorted({row["num_images"] for row in rows.values()}))
     return (
-        f"Labels of real images: {_yes(real)}; of renderings: {_yes(synthetic)}. Real frames: {'; '.join(sets)}. "
+        f"Labels of real images: {_yes(real)}; of renderings: {_yes(synthetic)}. {counts} renderings a class. "
+        f"Real frames: {'; '.join(sets)}. "
         f"{', '.join(sorted({row['machine'] for row in rows.values()}))}."
     )
 
