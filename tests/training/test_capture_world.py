@@ -177,12 +177,13 @@ def test_photographs_come_in_the_canonical_size_without_distortion(world: Captur
     plate = world.plate()
     assert plate is not None
     assert (found[0] == plate).all(dim=0).float().mean() > 0.9, "but for a square that differs"
-    straight = cv2.undistort(
-        cv2.cvtColor(cv2.imread(str(world._images / "00.png")), cv2.COLOR_BGR2RGB),
-        world.object.camera.matrix,
-        np.array(world.object.camera.distortion),
-    )
-    assert torch.equal((found[0] * 255).round().byte(), torch.from_numpy(straight).permute(2, 0, 1))
+    lens = world.object.camera.matrix, np.array(world.object.camera.distortion)
+    straight = cv2.undistort(cv2.cvtColor(cv2.imread(str(world._images / "00.png")), cv2.COLOR_BGR2RGB), *lens)
+    within = cv2.undistort(np.full_like(straight, 255), *lens) == 255  # elsewhere OpenCV's is black, and ours goes on
+    seen = (found[0] * 255).round().permute(1, 2, 0).numpy()
+    assert np.abs(seen - straight)[within].max() <= 2  # of 255: its maps are of lower precision
+    assert within.mean() > 0.8
+    assert seen[0, 0].any()
 
 
 def test_a_model_is_not_judged_by_what_it_learned_from(folder: Path, tmp_path: Path) -> None:

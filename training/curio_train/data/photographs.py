@@ -64,7 +64,10 @@ def read_frame(path: Path, camera: Intrinsics) -> np.ndarray:
         )
     if not any(camera.distortion):
         return pixels
-    return cv2.undistort(pixels, camera.matrix, np.array(camera.distortion))
+    matrix, size = camera.matrix, (pixels.shape[1], pixels.shape[0])
+    maps = cv2.initUndistortRectifyMap(matrix, np.array(camera.distortion), None, matrix, size, cv2.CV_32FC1)
+    # As serving does it: what lies beyond the photograph's edge continues it, and is no black frame to find things in.
+    return cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def read_frames(paths: Sequence[Path], camera: Intrinsics, width: int, height: int) -> np.ndarray:
