@@ -117,7 +117,7 @@ class Recipe:
             in them and render-and-compare has refined, in the last two fifths of a run that sleeps, or in the last four
             where it began as another (--init); 0: none. Only where a world has photographs.
         gradient_clip: Largest L2 norm of a step's gradient, of the network and of the critic each.
-        precision: Of the convolutions; everything else is in float32.
+        precision: Of the convolutions, bfloat16 only where the machine is quick with it; all else is in float32.
         budget_images: Images to show where neither --minutes nor --images is given.
     """
 

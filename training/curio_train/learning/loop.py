@@ -23,6 +23,7 @@ from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, 
 from curio_train.learning.interruption import Interruption
 from curio_train.learning.losses import image_loss
 from curio_train.learning.parallel import Ranks
+from curio_train.learning.precision import autocast
 from curio_train.learning.progress import Reporter
 from curio_train.learning.recoloring import recolored
 from curio_train.learning.self_training import SelfTraining
@@ -243,8 +244,7 @@ class Trainer:
         return logits.float()
 
     def _autocast(self) -> torch.autocast:
-        half = self.config.recipe.precision == "bfloat16"
-        return torch.autocast(self.ranks.device.type, torch.bfloat16, enabled=half)
+        return autocast(self.config.recipe.precision, self.ranks.device.type)
 
     def _to_device(self, batch: Batch) -> Batch:
         device = self.ranks.device

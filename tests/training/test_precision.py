@@ -1,0 +1,33 @@
+"""Numbers of half the digits are used only where they save time."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from curio_train.learning.muon import orthogonal
+from curio_train.learning.precision import autocast, quick_bfloat16
+
+
+@pytest.mark.parametrize("device_type", ["cpu", "cuda"])
+def test_float32_stays_float32_on_any_machine(device_type: str) -> None:
+    if device_type == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    with autocast("float32", device_type):
+        product = torch.ones(4, 4, device=device_type) @ torch.ones(4, 4, device=device_type)
+    assert product.dtype == torch.float32
+
+
+def test_convolutions_have_the_precision_that_the_machine_is_quick_with() -> None:
+    expected = torch.bfloat16 if quick_bfloat16("cpu") else torch.float32
+    with autocast("bfloat16", "cpu"):
+        assert torch.nn.Conv2d(3, 4, 3)(torch.ones(1, 3, 8, 8)).dtype == expected
+    assert orthogonal(torch.eye(16)).dtype == torch.float32, "what comes out is as what went in"
+
+
+def test_a_processor_without_its_instructions_is_not_asked_for_bfloat16() -> None:
+    cpuinfo = Path("/proc/cpuinfo")
+    flags = set(cpuinfo.read_text(encoding="utf-8").split()) if cpuinfo.exists() else set()
+    if "avx2" not in flags:
+        pytest.skip("no list of this processor's instructions, or it is no x86 with AVX2")
+    if not flags & {"avx512bw", "avx_ne_convert", "amx_bf16"}:
+        assert not quick_bfloat16("cpu")
