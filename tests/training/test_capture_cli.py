@@ -14,7 +14,15 @@ def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, 
 
 
 def test_flags_that_contradict_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for flags in (["--every", 0], ["--distance-m", 1.0], ["--board", 9, 6, "--views-out", tmp_path / "views.json"]):
+    views = ["--views-out", tmp_path / "views.json"]
+    for flags in (
+        ["--every", 0],
+        ["--distance-m", 1.0],
+        ["--board", 9, 6, *views],
+        ["--objects", tmp_path],
+        ["--objects", tmp_path, *views],
+        ["--objects", tmp_path, "--camera", tmp_path / "camera.json", "--distance-m", 1.0, *views],
+    ):
         status, _, err = call(capsys, "--images", tmp_path, *flags)
         assert status == 2
         assert "error: --" in err

@@ -8,13 +8,13 @@ import pytest
 import torch
 import trimesh
 from curio_train.config import RunConfig, preset_recipe
-from curio_train.errors import DataError, UsageError
+from curio_train.errors import CameraError, DataError, UsageError
 from curio_train.export import export
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.preparation import prepared
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
-from curio_train.worlds.linemod import FAR_M, NEAR_M
+from curio_train.worlds.linemod import FAR_M, NEAR_M, read_cameras
 from curio_train.worlds.options import LinemodOptions
 from curio_train.worlds.single_object import EXPOSURE
 from curio_train.worlds.views import STRONGEST_LIGHT, WEAKEST_LIGHT
@@ -153,6 +153,37 @@ def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
         taught.lessons(lambda images: taught.sample(len(images), (1,)))
     with pytest.raises(DataError, match=r"9\.png"):  # before an hour is lost, too
         prepared(RunConfig(LinemodOptions("ape", data, photos=frames), method="sleep"), tmp_path, print, print)
+
+
+def view(height: float = 0.8) -> list[list[float]]:
+    """From above, half tilted."""
+    turn, s = np.diag([1.0, -1, -1]), np.sqrt(0.5)
+    tilted = turn @ np.array([[1, 0, 0], [0, s, -s], [0, s, s]])
+    return [[*row, shift] for row, shift in zip(tilted, -tilted @ [0, height, 0], strict=True)] + [[0, 0, 0, 1]]
+
+
+def test_where_frames_were_taken_is_known_in_metres_or_not_at_all(data, tmp_path):
+    frames = [tmp_path / f"{number}.png" for number in range(3)]
+    file = tmp_path / "views.json"
+    file.write_text(json.dumps({"0.png": {"cam_from_world": view(), "unit": "m"}, "1.png": {"cam_from_world": view()}}))
+    cameras = read_cameras(file, frames)
+    assert cameras.in_metres
+    assert cameras.known.tolist() == [True, False, False]
+    assert cameras.cam_from_world[0].tolist() == view()
+
+    with pytest.raises(CameraError, match=r'"unit": "m".*--objects'):
+        read_cameras(file, frames[1:])
+    file.write_text(json.dumps({"0.png": {"cam_from_world": [[1, 2], [3, 4]], "unit": "m"}}))
+    with pytest.raises(CameraError, match=r"--views .*0\.png: cam_from_world has shape"):
+        read_cameras(file, frames)
+    with pytest.raises(UsageError, match=r"--views .*--photos"):
+        build(LinemodOptions("ape", data, views=file))
+    for frame in frames:
+        cv2.imwrite(str(frame), np.full((480, 640, 3), 90, np.uint8))
+    with pytest.raises(CameraError, match="shape"):  # before an hour is lost
+        prepared(
+            RunConfig(LinemodOptions("ape", data, photos=tmp_path, views=file), method="sleep"), tmp_path, print, print
+        )
 
 
 def test_a_run_without_such_frames_says_so(data, tmp_path):

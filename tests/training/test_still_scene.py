@@ -9,7 +9,7 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.data.shapes import chair
-from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
+from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
 from curio_train.metrics.poses import symmetry_poses
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.base import ObjectKind
@@ -18,7 +18,7 @@ from curio_train.worlds.lessons import FEWEST_AGREED, Lessons
 from curio_train.worlds.linemod import LinemodGaze
 from curio_train.worlds.refinement import Refinement
 from curio_train.worlds.single_object import Object
-from curio_train.worlds.still_scene import agreed
+from curio_train.worlds.still_scene import Cameras, agreed, told_scale
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -76,7 +76,9 @@ def roughly(code: SceneCode, turned: tuple[int, ...] = FLIPPED) -> dict[str, Ten
 
 def agree(world: GazeWorld, frames: Tensor, matrices: np.ndarray, read: SceneCode) -> tuple[dict[str, Tensor], Tensor]:
     symmetries = symmetry_poses(world.object.kind.info, SYMMETRY_STEP)
-    return agreed(Refinement(world), frames, matrices, read, (read, torch.ones(NUM, dtype=torch.bool)), symmetries)
+    return agreed(
+        Refinement(world), frames, Cameras(matrices), read, (read, torch.ones(NUM, dtype=torch.bool)), symmetries
+    )
 
 
 def errors(found: SceneCode, true: SceneCode) -> tuple[Tensor, Tensor]:
@@ -95,6 +97,29 @@ def test_what_most_read_rightly_corrects_the_others(world: GazeWorld, truth: Sce
     assert degrees[chosen].max() < 5
     assert depth_m[chosen].median() < before_depth_m.median()
     assert set(code) == set(read)
+
+
+def test_metres_correct_what_an_object_is_read_too_far_by(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+    """All readings err to one side, and the scale that they tell with them; another scale says so."""
+    read = roughly(truth)
+    read[TRANSLATION] = read[TRANSLATION] * 1.04
+    of_any_scale, metres = cameras(truth), cameras(truth)
+    metres[:, :3, 3] *= SCALE
+    taken = torch.ones(NUM, dtype=torch.bool)
+    off = []
+    for where in (Cameras(of_any_scale), Cameras(metres, in_metres=True)):
+        code, chosen = agreed(Refinement(world), frames, where, read, (read, taken), [Pose(np.eye(3), np.zeros(3))])
+        assert chosen.sum() >= NUM - 4
+        off.append((code[TRANSLATION][chosen, 0, 2] / truth[TRANSLATION][chosen, 0, 2]).log().median())
+    assert off[0] == pytest.approx(np.log(1.04), abs=0.01)
+    assert off[1] == pytest.approx(0, abs=0.01)
+
+
+def test_an_object_that_is_read_tells_the_scale(world: GazeWorld, truth: SceneCode) -> None:
+    taken = torch.ones(NUM, dtype=torch.bool)
+    diameter_m = world.object.kind.diameter_m
+    assert told_scale(Cameras(cameras(truth)), roughly(truth), taken, diameter_m) == pytest.approx(SCALE, rel=0.03)
+    assert told_scale(Cameras(cameras(truth)), world.sample(NUM, (9,)), taken, diameter_m) is None
 
 
 def test_photographs_whose_camera_is_unknown_teach_nothing(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
@@ -125,7 +150,7 @@ def test_readings_that_do_not_agree_teach_nothing(world: GazeWorld, truth: Scene
 def test_lessons_are_of_agreed_poses_where_the_camera_moved(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
     read = roughly(truth)
     reader = iter([dict(read)])  # photographs are read once, all together: there are fewer than are read at once
-    lessons = Lessons.of_own_reading(world, frames, lambda _: next(reader), cameras(truth))
+    lessons = Lessons.of_own_reading(world, frames, lambda _: next(reader), Cameras(cameras(truth)))
     assert lessons is not None
     assert len(lessons) >= FEWEST_AGREED
     taught = matrix_from_rotation_6d(lessons._code[ROTATION_6D][:, 0])

@@ -143,7 +143,9 @@ def test_the_command(
     assert not exit_.value.code
     assert "placed 14 photographs" in capsys.readouterr().out
     assert load_intrinsics(tmp_path / "camera.json").matrix[0, 0] == pytest.approx(FOCAL, rel=0.02)
-    first = np.array(json.loads((tmp_path / "views.json").read_text())["000.png"]["cam_from_world"])
+    view = json.loads((tmp_path / "views.json").read_text())["000.png"]
+    assert view["unit"] == "m"
+    first = np.array(view["cam_from_world"])
     height = -(first[:3, :3].T @ first[:3, 3])[1]
     assert height == pytest.approx(np.linalg.inv(truth[0])[1, 3], abs=0.03), "metres above the ground"
 

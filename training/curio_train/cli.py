@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Literal, get_type_hints
 
 import tyro
 from rich.console import Console
@@ -21,6 +21,9 @@ from curio_train.learning.configuration import load_config, refuse_other, world_
 from curio_train.learning.interruption import Interrupted, Interruption, interruptible
 from curio_train.project_file import with_project
 from curio_train.worlds import WORLDS
+
+if TYPE_CHECKING:
+    from curio_train.capture.structure import Structure
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,12 @@ def train(arguments: Sequence[str] | None = None) -> None:
 def _calibrate(command: CalibrateCommand) -> int:
     from curio_train.capture.command import run
 
-    print(run(command))
+    def by_objects(structure: "Structure", models: Path, data: Path | None) -> "tuple[Structure, str]":
+        from curio_train.evaluation.scene_scale import scale_by_objects
+
+        return scale_by_objects(structure, models, data, _tell)
+
+    print(run(command, by_objects))
     return 0
 
 

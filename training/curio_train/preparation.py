@@ -55,10 +55,14 @@ def _refuse_unreadable(options: LinemodOptions) -> None:
         return
     from curio_train.data.bop import BopDataset
     from curio_train.data.photographs import Photographs, read_frame
+    from curio_train.worlds.linemod import read_cameras
 
     camera = BopDataset(options.data).camera
-    for path in Photographs(options.photos).paths:
+    paths = Photographs(options.photos).paths
+    for path in paths:
         read_frame(path, camera)
+    if options.views is not None:
+        read_cameras(options.views, paths)
 
 
 def _with_paint(options: CaptureOptions, tell: Callable[[str], None]) -> CaptureOptions:

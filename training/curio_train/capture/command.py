@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from curio_train.camera import load_intrinsics
@@ -13,9 +14,17 @@ from curio_train.capture.structure import Structure, every_nth, recover
 from curio_train.data.photographs import Photographs
 from curio_train.errors import DataError, UsageError
 
+ByObjects = Callable[[Structure, Path, Path | None], tuple[Structure, str]]
+"""Brings a structure to metres by models of objects (their folder, their data), and says how; networks are none of this
+module's business."""
 
-def run(command: CalibrateCommand) -> str:
+
+def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
     """Do it, and say in a few lines what was found.
+
+    Args:
+        command: The flags.
+        by_objects: For ``--objects``.
 
     Raises:
         UsageError: Flags that contradict each other.
@@ -25,7 +34,7 @@ def run(command: CalibrateCommand) -> str:
     if command.every < 1:
         raise UsageError(f"--every {command.every}, expected 1 or more")
     if command.board is None:
-        return _from_scene(command)
+        return _from_scene(command, by_objects)
     if command.views_out is not None or command.camera is not None:
         raise UsageError(
             "--views-out and --camera are for photographs of a scene; leave them out, or leave out --board"
@@ -40,9 +49,8 @@ def run(command: CalibrateCommand) -> str:
     )
 
 
-def _from_scene(command: CalibrateCommand) -> str:
-    if command.distance_m is not None and command.views_out is None:
-        raise UsageError(f"--distance-m {command.distance_m} is for poses; name a file for them: --views-out")
+def _from_scene(command: CalibrateCommand, by_objects: ByObjects) -> str:
+    _check_scale(command)
     known = None if command.camera is None else load_intrinsics(command.camera)
     found = recover(every_nth(Photographs(command.images).paths, command.every), known)
     lines = [f"placed {len(found.photographs)} photographs, points off by {found.error_px:.2f} pixels"]
@@ -53,15 +61,30 @@ def _from_scene(command: CalibrateCommand) -> str:
         world = to_world(found)
         if command.distance_m is not None:
             world = scale_by_distance(world, 0, len(world.photographs) - 1, command.distance_m)
-        _save_views(command.views_out, world)
-        unit = "metres" if command.distance_m is not None else "no known unit: give --distance-m for metres"
+        elif command.objects is not None:
+            world, line = by_objects(world, command.objects, command.data)
+            lines.append(line)
+        in_metres = command.distance_m is not None or command.objects is not None
+        _save_views(command.views_out, world, "m" if in_metres else None)
+        unit = "metres" if in_metres else "no known unit: give --distance-m or --objects for metres"
         lines.append(f"{command.views_out}: cam_from_world of each, in {unit}")
     return "\n".join(lines)
 
 
-def _save_views(path: Path, structure: Structure) -> None:
+def _check_scale(command: CalibrateCommand) -> None:
+    ways = {"--distance-m": command.distance_m, "--objects": command.objects}
+    given = [f"{flag} {value}" for flag, value in ways.items() if value is not None]
+    if given and command.views_out is None:
+        raise UsageError(f"{given[0]} is for poses; name a file for them: --views-out")
+    if len(given) > 1:
+        raise UsageError(f"{' and '.join(given)} both say how large the scene is; leave one out")
+    if command.objects is not None and command.camera is None:
+        raise UsageError(f"--objects {command.objects}: give the camera that their networks know, too: --camera")
+
+
+def _save_views(path: Path, structure: Structure, unit: str | None) -> None:
     views = {
-        photo.name: {"cam_from_world": matrix.tolist()}
+        photo.name: {"cam_from_world": matrix.tolist(), "unit": unit}
         for photo, matrix in zip(structure.photographs, structure.cam_from_world, strict=True)
     }
     draft = path.with_name(f"{path.name}.part")

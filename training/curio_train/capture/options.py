@@ -21,6 +21,8 @@ class CalibrateCommand:
         camera: The camera, where it is known and only its places are wanted.
         every: Take each so many-th photograph of a sequence.
         distance_m: Distance of the first and the last camera, for poses in metres.
+        objects: For poses in metres, too: folder with a model or run for each LineMOD object that the scene shows.
+        data: Their data folder.
         camera_out: The camera file to write.
         views_out: File for where each photograph was taken: cam_from_world, y up, origin on the ground.
     """
@@ -34,5 +36,7 @@ class CalibrateCommand:
     camera: Path | None = None
     every: int = 1
     distance_m: float | None = None
+    objects: Path | None = None
+    data: Path | None = None
     camera_out: Path = Path("camera.json")
     views_out: Path | None = None

@@ -33,13 +33,15 @@ class CameraPlaces:
     Attributes:
         file: Where it was read.
         entries: By photograph.
+        flag: That named the file.
     """
 
     file: Path
     entries: Mapping[str, Any]
+    flag: str = "--plane"
 
     @classmethod
-    def read(cls, file: Path) -> "CameraPlaces":
+    def read(cls, file: Path, flag: str = "--plane") -> "CameraPlaces":
         """Read the file.
 
         Raises:
@@ -48,12 +50,12 @@ class CameraPlaces:
         try:
             entries = json.loads(file.read_text(encoding="utf-8"))
         except OSError as exc:
-            raise CameraError(f"--plane {file}: cannot be read ({exc.strerror})") from exc
+            raise CameraError(f"{flag} {file}: cannot be read ({exc.strerror})") from exc
         except (json.JSONDecodeError, UnicodeDecodeError) as exc:
-            raise CameraError(f"--plane {file}: not JSON ({exc})") from exc
+            raise CameraError(f"{flag} {file}: not JSON ({exc})") from exc
         if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
-            raise CameraError(f"--plane {file}: expected an object of photographs, each with its cam_from_world")
-        return cls(file, entries)
+            raise CameraError(f"{flag} {file}: expected an object of photographs, each with its cam_from_world")
+        return cls(file, entries, flag)
 
     def cam_from_world(self, photograph: Path) -> np.ndarray:
         """Where a photograph was taken: rigid [4, 4], from above the plane, looking down on it.
@@ -64,10 +66,10 @@ class CameraPlaces:
         entry = self._entry(photograph)
         if "cam_from_world" not in entry:
             raise CameraError(
-                f"--plane {self.file}: says nothing of {photograph.name}; it has {', '.join([*self.entries][:5])}. "
+                f"{self.flag} {self.file}: says nothing of {photograph.name}; it has {', '.join([*self.entries][:5])}. "
                 "Photographs are named by their path from that file's folder, or by their file name"
             )
-        where = f"--plane {self.file}, {photograph.name}"
+        where = f"{self.flag} {self.file}, {photograph.name}"
         matrix = _rigid(entry["cam_from_world"], where)
         height, forward = (-matrix[:3, :3].T @ matrix[:3, 3])[1], matrix[2, 1]
         if height <= 0 or forward >= 0:
@@ -76,6 +78,10 @@ class CameraPlaces:
                 "; expected one above the plane y = 0 that looks down on it. Is y up, and is it cam_from_world?"
             )
         return matrix
+
+    def in_metres(self, photograph: Path) -> bool:
+        """Whether the file says so of this photograph, and with that where it was taken."""
+        return self._entry(photograph).get("unit") == "m"
 
     def plate(self, photograph: Path) -> Path | None:
         """The photograph's own plate, if it has one."""
@@ -95,9 +101,9 @@ class CameraPlaces:
         heights = [float((-matrix[:3, :3].T @ matrix[:3, 3])[1]) for matrix in (one, other)]
         if tilt > _SAME_TILT_DEG or abs(heights[0] / heights[1] - 1) > _SAME_HEIGHT:
             raise CameraError(
-                f"--plane {self.file}: {photograph.name} was taken {heights[0]:.3g} m above the plane and tilted by "
-                f"{tilt:.1f} degrees to {plate.name}, taken at {heights[1]:.3g} m; a camera that moves has to keep its "
-                f"height within {_SAME_HEIGHT:.0%} and its tilt within {_SAME_TILT_DEG:g} degrees"
+                f"{self.flag} {self.file}: {photograph.name} was taken {heights[0]:.3g} m above the plane and tilted "
+                f"by {tilt:.1f} degrees to {plate.name}, taken at {heights[1]:.3g} m; a camera that moves has to keep "
+                f"its height within {_SAME_HEIGHT:.0%} and its tilt within {_SAME_TILT_DEG:g} degrees"
             )
 
     def _entry(self, photograph: Path) -> Mapping[str, Any]:

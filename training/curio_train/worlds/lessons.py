@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from curio_train.camera import gaze_at, sampling_grid
@@ -26,7 +26,7 @@ from curio_train.networks.gaze import OVERSAMPLING
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.gaze import CROP_PX, FILL, SYMMETRY_STEP, GazeWorld
 from curio_train.worlds.refinement import Refinement
-from curio_train.worlds.still_scene import agreed
+from curio_train.worlds.still_scene import Cameras, agreed
 
 MOST_PHOTOGRAPHS = 300
 """They are kept in memory, and each takes a sixth of a second to be refined."""
@@ -65,7 +65,7 @@ class Lessons:
         world: GazeWorld,
         frames: UInt8[Tensor, "num 3 height width"],
         predict: Callable[[Tensor], SceneCode],
-        cam_from_world: Float[np.ndarray, "num 4 4"] | None = None,
+        cameras: Cameras | None = None,
     ) -> Self | None:
         """Read photographs, refine what was read, and keep what several agree on; or, of single ones, what is better.
 
@@ -73,7 +73,7 @@ class Lessons:
             world: The gaze's.
             frames: Photographs as the world's camera takes them, sRGB.
             predict: Reads images [batch, 3, height, width] in [0, 1].
-            cam_from_world: Where the camera stood, see :func:`~curio_train.worlds.still_scene.agreed`; None: unknown.
+            cameras: Where the camera stood; None: unknown.
 
         Returns:
             What can be learned of photographs whose object stands still among them, if the camera is known to have
@@ -81,11 +81,10 @@ class Lessons:
             picture. None if there is none.
         """
         refine = Refinement(world)
-        read = _joined([predict(chunk.float() / 255) for chunk in frames.split(_READ_AT_ONCE)])
-        refined, taken = _refined(refine, frames, read)
-        if cam_from_world is not None:
+        read, refined, taken = read_twice(refine, frames, predict)
+        if cameras is not None:
             symmetries = symmetry_poses(world.object.kind.info, SYMMETRY_STEP)
-            code, chosen = agreed(refine, frames, cam_from_world, read, (refined, taken), symmetries)
+            code, chosen = agreed(refine, frames, cameras, read, (refined, taken), symmetries)
             if chosen.sum() >= FEWEST_AGREED:
                 return cls(world, frames[chosen], {name: value[chosen] for name, value in code.items()})
         twice, taken_again = _refined(refine, frames, refined)
@@ -99,7 +98,7 @@ class Lessons:
         world: GazeWorld,
         paths: Sequence[Path],
         predict: Callable[[Tensor], SceneCode],
-        cam_from_world: Float[np.ndarray, "num 4 4"] | None = None,
+        cameras: Cameras | None = None,
     ) -> Self | None:
         """The same of photographs in files, :data:`MOST_PHOTOGRAPHS` of them at most, evenly over all.
 
@@ -108,7 +107,7 @@ class Lessons:
         """
         chosen = spread(paths, MOST_PHOTOGRAPHS)
         frames = read_frames(chosen, world.object.camera, world.camera.width, world.camera.height) if chosen else ()
-        return cls.of_own_reading(world, torch.from_numpy(frames), predict, cam_from_world) if len(frames) else None
+        return cls.of_own_reading(world, torch.from_numpy(frames), predict, cameras) if len(frames) else None
 
     def __len__(self) -> int:
         """How many photographs teach."""
@@ -138,6 +137,15 @@ class Lessons:
         gain = torch.from_numpy(random.uniform(*_GAINS, (count, 1, 1, 1))).float()
         crops = (gain * F.avg_pool2d(fine, OVERSAMPLING)).clamp(0, 1)
         return self._look.labelled(code, turned, rotation, assumed[:, None]), crops
+
+
+@torch.no_grad()
+def read_twice(
+    refine: Refinement, frames: UInt8[Tensor, "num 3 height width"], predict: Callable[[Tensor], SceneCode]
+) -> tuple[SceneCode, SceneCode, Bool[Tensor, " num"]]:
+    """What a network reads in photographs, the same after render-and-compare, and where that found something better."""
+    read = _joined([predict(chunk.float() / 255) for chunk in frames.split(_READ_AT_ONCE)])
+    return read, *_refined(refine, frames, read)
 
 
 @torch.enable_grad()

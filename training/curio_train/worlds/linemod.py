@@ -18,17 +18,19 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
+from curio_train.capture.plane import CameraPlaces
 from curio_train.capture.structure import recover
 from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
 from curio_train.data.bop import BopDataset
 from curio_train.data.photographs import Photographs
-from curio_train.errors import CurioError, UsageError
+from curio_train.errors import CameraError, CurioError, UsageError
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.gaze import GazeWorld
 from curio_train.worlds.lessons import MOST_PHOTOGRAPHS, Lessons, spread
 from curio_train.worlds.options import LinemodOptions
 from curio_train.worlds.single_object import Object, SingleObjectWorld, pose_layout, position_field, squeezed
+from curio_train.worlds.still_scene import Cameras
 
 SIDE_PX = 128
 NEAR_M, FAR_M = 0.5, 1.5
@@ -48,11 +50,17 @@ class Linemod(SingleObjectWorld):
 class LinemodGaze(GazeWorld):
     """One LineMOD object read at two looks, in frames of which some may be there without labels."""
 
-    def __init__(self, thing: Object, photographs: Path | None) -> None:
-        """Nothing of the photographs is read before they are asked for."""
+    def __init__(self, thing: Object, photographs: Path | None, views: Path | None = None) -> None:
+        """Nothing of the photographs is read before they are asked for.
+
+        Args:
+            thing: The object.
+            photographs: Their folder.
+            views: File with where their camera stood.
+        """
         super().__init__(Linemod.name, thing)
-        self._folder = photographs
-        self._placed: tuple[list[Path], np.ndarray | None] | None = None
+        self._folder, self._views = photographs, views
+        self._placed: tuple[list[Path], Cameras | None] | None = None
 
     def lessons(self, predict: Callable[[Tensor], SceneCode]) -> Lessons | None:
         """Of the photographs, if there are any; their cameras are placed once."""
@@ -63,16 +71,40 @@ class LinemodGaze(GazeWorld):
             self._placed = paths, self.cameras(paths)
         return Lessons.of_files(self, paths, predict, self._placed[1])
 
-    def cameras(self, paths: list[Path]) -> np.ndarray | None:
-        """Where the camera stood [photographs, 4, 4], NaN where that is not known; None if it is known of none."""
+    def cameras(self, paths: list[Path]) -> Cameras | None:
+        """Where the camera stood; None if it is known of no photograph.
+
+        Raises:
+            CameraError: There is a file that should say it, and it does not do.
+        """
+        if self._views is not None:
+            return read_cameras(self._views, paths)
         try:
             structure = recover(paths, self.object.camera)
         except CurioError as exc:
             _log.warning("photographs teach one by one, because their cameras cannot be placed: %s", exc)
             return None
-        cameras = np.full((len(paths), 4, 4), np.nan)
-        cameras[[paths.index(path) for path in structure.photographs]] = structure.cam_from_world
-        return cameras
+        matrices = np.full((len(paths), 4, 4), np.nan)
+        matrices[[paths.index(path) for path in structure.photographs]] = structure.cam_from_world
+        return Cameras(matrices)
+
+
+def read_cameras(file: Path, paths: list[Path]) -> Cameras:
+    """Where photographs were taken, in metres, by a file of ``--views-out``.
+
+    Raises:
+        CameraError: It cannot be read, says nothing of these photographs in metres, or a place is none.
+    """
+    places = CameraPlaces.read(file, "--views")
+    unknown = np.full((4, 4), np.nan)
+    matrices = [places.cam_from_world(path) if places.in_metres(path) else unknown for path in paths]
+    cameras = Cameras(np.stack(matrices), in_metres=True)
+    if not cameras.known.any():
+        raise CameraError(
+            f'--views {file}: has none of {paths[0].name} and {len(paths) - 1} more with "unit": "m"; write it with '
+            "curio-train capture --calibrate --views-out, with --distance-m or --objects"
+        )
+    return cameras
 
 
 def build(options: LinemodOptions) -> SingleObjectWorld:
@@ -109,8 +141,10 @@ def build(options: LinemodOptions) -> SingleObjectWorld:
         return ClutterBackgrounds.cached(cache, others)
 
     thing = Object(kind, mesh, dataset.camera, NEAR_M, FAR_M, backgrounds)
+    if options.views is not None and options.photos is None:
+        raise UsageError(f"--views {options.views}: they say where photographs were taken; give these, too: --photos")
     if not options.gaze:
         if options.photos is not None:
             raise UsageError(f"--photos {options.photos}: they teach the second look of a gaze; leave out --no-gaze")
         return Linemod(thing)
-    return LinemodGaze(thing, options.photos)
+    return LinemodGaze(thing, options.photos, options.views)

@@ -71,6 +71,8 @@ class LinemodOptions(WorldOptions):
         photos: Folder of unlabelled frames of the data set's camera, from which a gaze learns towards the end, with the
             poses that it reads there itself (--self-training). Frames that show one scene from several sides, in the
             order of their names, correct each other. None are used unless given.
+        views: File with where the camera of --photos stood, in metres, as capture --calibrate --views-out writes it.
+            Found from the photographs unless given, and their scale from what is read in them.
         gaze: Look twice: at the whole frame for the place, at a crop around it for the rest. The other way, the paper's
             one encoder sees the frame squeezed to 128x128.
     """
@@ -82,12 +84,13 @@ class LinemodOptions(WorldOptions):
     data: Path | None = None
     backgrounds: Path | None = None
     photos: Path | None = None
+    views: Path | None = None
     gaze: tyro.conf.FlagCreatePairsOff[bool] = True
     download: tyro.conf.FlagCreatePairsOff[bool] = False
 
     def __post_init__(self) -> None:
         """Make paths absolute."""
-        _make_absolute(self, "data", "backgrounds", "photos")
+        _make_absolute(self, "data", "backgrounds", "photos", "views")
 
 
 @dataclass(frozen=True)

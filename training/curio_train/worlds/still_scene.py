@@ -7,6 +7,8 @@ photographs that agree there are right together (after Labbé et al. 2020, "Cosy
 is then looked for in all photographs. Objects may be moved between photographs; each place is a pose of its own.
 
 Nothing here knows a label: the scale of the scene, which structure from motion leaves open, comes from the readings.
+One object's readings err in depth all to one side, by some per cent, and with them its scale; several objects of one
+scene err each in its own way (decision 68). So the cameras may be given in metres.
 """
 
 from collections.abc import Sequence
@@ -33,6 +35,24 @@ _LARGEST_GAP, _LEAST_BASELINE = 0.6, 0.5  # diameters: of pairs that tell of the
 _SAME_SCALE = 0.05  # logarithms so near vote for each other
 _CREDIBLE, _WEAKER = 0.3, 0.1  # of what a photograph's own reading explains of its silhouette
 _CONTRADICTION = 0.25  # diameters across the view
+
+
+class Cameras(NamedTuple):
+    """Where the camera stood.
+
+    Attributes:
+        cam_from_world: Rigid, [num, 4, 4]; NaN for photographs of which it is not known.
+        in_metres: Else its unit is any.
+    """
+
+    cam_from_world: Float[np.ndarray, "num 4 4"]
+    in_metres: bool = False
+
+    @property
+    def known(self) -> Bool[np.ndarray, " num"]:
+        """Of which photographs."""
+        known: np.ndarray = np.isfinite(self.cam_from_world).all(axis=(1, 2))
+        return known
 
 
 class _Readings(NamedTuple):
@@ -77,7 +97,7 @@ class _Scene(NamedTuple):
 def agreed(
     refine: Refinement,
     frames: Tensor,
-    cam_from_world: Float[np.ndarray, "num 4 4"],
+    cameras: Cameras,
     read: SceneCode,
     refined: tuple[SceneCode, Bool[Tensor, " num"]],
     symmetries: Sequence[Pose],
@@ -87,7 +107,7 @@ def agreed(
     Args:
         refine: Of the object; tells what of a photograph a pose explains.
         frames: uint8 sRGB [num, 3, height, width].
-        cam_from_world: Rigid, of any scale; NaN for photographs whose camera is unknown.
+        cameras: That took them.
         read: What was read in each.
         refined: The same after render-and-compare, and where that found something better.
         symmetries: Of the object.
@@ -96,27 +116,39 @@ def agreed(
         The code with agreed positions and rotations, and which photographs show the object there.
     """
     better, taken = refined
-    known = np.isfinite(cam_from_world).all(axis=(1, 2))
-    sure = known & taken.numpy()  # these tell of the scale, and vote twice
-    sources = _readings(read, known), _readings(better, sure)
-    cameras = np.where(known[:, None, None], cam_from_world, np.eye(4))
+    known = cameras.known
+    sources = _readings(read, known), _readings(better, known & taken.numpy())
     turns = np.stack([pose.rotation for pose in symmetries])
-    scales = [
-        _scale(cameras, _readings(code, sure), refine.diameter_m)
-        or _scale(cameras, _readings(code, known), refine.diameter_m)
-        for code in (read, better)
-    ]
+    scales = [told_scale(cameras, code, taken, refine.diameter_m) for code in (read, better)]
     found = [scale for scale in scales if scale is not None]
     if not found:
         return dict(read), torch.zeros(len(frames), dtype=torch.bool)
-    scale = float(np.exp(np.mean(np.log(found))))
+    scale = 1.0 if cameras.in_metres else float(np.exp(np.mean(np.log(found))))
     # Each kind of reading errs in depth in its own way, which its scale tells.
     pairs = zip(sources, scales, strict=True)
     level = [r._replace(translation_m=r.translation_m * scale / s) for r, s in pairs if s is not None]
     every = _Readings(*(np.concatenate(values) for values in zip(*level, strict=True)))
-    scene = _Scene(cameras, known, scale)
+    scene = _Scene(_without_gaps(cameras), known, scale)
     poses = _clusters(scene, every, refine.diameter_m, turns)
     return _looked_for(refine, frames, scene, poses, read, better, turns)
+
+
+def told_scale(cameras: Cameras, code: SceneCode, taken: Bool[Tensor, " num"], diameter_m: float) -> float | None:
+    """Metres a unit of the scene, by how far an object that was read moved before the camera.
+
+    Args:
+        cameras: Of the photographs.
+        code: What was read in them.
+        taken: Readings that are better than others; these tell, if they are enough.
+        diameter_m: Of the object.
+    """
+    matrices, known = _without_gaps(cameras), cameras.known
+    scale = _scale(matrices, _readings(code, known & taken.numpy()), diameter_m)
+    return scale or _scale(matrices, _readings(code, known), diameter_m)
+
+
+def _without_gaps(cameras: Cameras) -> np.ndarray:
+    return np.where(cameras.known[:, None, None], cameras.cam_from_world, np.eye(4))
 
 
 def _readings(code: SceneCode, chosen: np.ndarray) -> _Readings:

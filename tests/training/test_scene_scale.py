@@ -1,0 +1,60 @@
+"""How large a scene is, by what networks read in photographs of it."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from curio_train import cli
+from curio_train.data.bop import BopDataset
+from curio_train.evaluation.scene_scale import mean_scale
+
+MODELS = Path(__file__).parents[2] / "models"
+
+
+def test_objects_count_alike_and_say_how_far_they_differ() -> None:
+    scale, line = mean_scale({"ape": 0.2 * np.exp(0.03), "cat": 0.2 * np.exp(-0.01), "duck": 0.2 * np.exp(-0.02)})
+    assert scale == pytest.approx(0.2)
+    assert "ape +3.0 %, cat -1.0 %, duck -2.0 %; the mean is good to 1.5 %" in line
+    assert mean_scale({"ape": 0.2}) == (pytest.approx(0.2), "scale by each object beside their mean: ape +0.0 %")
+
+
+def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as exit_:
+        cli.train(["capture", "--calibrate", *map(str, flags)])
+    captured = capsys.readouterr()
+    return int(exit_.value.code or 0), captured.out, captured.err
+
+
+@pytest.mark.skipif("CURIO_DATA" not in os.environ, reason="CURIO_DATA is unset: no real data here")
+def test_real_frames_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By the shipped cat alone, against the labels: as far as an object moved before the camera is known of both."""
+    data = Path(os.environ["CURIO_DATA"]) / "lmo"
+    frames, models, views = data / "test" / "000002" / "rgb", tmp_path / "models", tmp_path / "views.json"
+    models.mkdir()
+    (models / "cat").symlink_to(MODELS / "cat")
+    flags = ["--images", frames, "--every", 2, "--camera", data / "camera.json", "--views-out", views]
+    status, out, err = call(capsys, *flags, "--objects", models, "--data", data)
+    assert status == 0, err
+    assert "beside their mean: cat +0.0 %" in out
+    assert "in metres" in out
+
+    places = json.loads(views.read_text())
+    seen = [a for a in BopDataset(data).annotations("test", "duck") if f"{a.image_id:06}.png" in places]
+    away, centres = [], []
+    for target in seen:
+        matrix = np.array(places[f"{target.image_id:06}.png"]["cam_from_world"])
+        away.append(matrix[:3, :3].T @ target.pose.translation_m)
+        centres.append(-matrix[:3, :3].T @ matrix[:3, 3])
+    # Neighbours: things are moved now and then.
+    moved, differ = np.diff(centres, axis=0), np.diff(away, axis=0)
+    far = np.linalg.norm(moved, axis=1) > 0.1
+    ratio = np.linalg.norm(differ[far], axis=1) / np.linalg.norm(moved[far], axis=1)
+    assert far.sum() > 10
+    assert np.median(ratio) == pytest.approx(1, abs=0.04)
+
+    (models / "cat").unlink()
+    status, _, err = call(capsys, *flags, "--objects", models, "--data", data)
+    assert status == 2
+    assert "error: " in err
