@@ -155,11 +155,11 @@ def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
         prepared(RunConfig(LinemodOptions("ape", data, photos=frames), method="sleep"), tmp_path, print, print)
 
 
-def view(height: float = 0.8) -> list[list[float]]:
-    """From above, half tilted."""
-    turn, s = np.diag([1.0, -1, -1]), np.sqrt(0.5)
-    tilted = turn @ np.array([[1, 0, 0], [0, s, -s], [0, s, s]])
-    return [[*row, shift] for row, shift in zip(tilted, -tilted @ [0, height, 0], strict=True)] + [[0, 0, 0, 1]]
+def view() -> list[list[float]]:
+    """From below, looking up: a camera rolls and tilts as it is carried around."""
+    s = np.sqrt(0.5)
+    tilted = np.array([[1, 0, 0], [0, s, -s], [0, s, s]])
+    return [[*row, shift] for row, shift in zip(tilted, tilted @ [0, 0.8, 0], strict=True)] + [[0, 0, 0, 1]]
 
 
 def test_where_frames_were_taken_is_known_in_metres_or_not_at_all(data, tmp_path):

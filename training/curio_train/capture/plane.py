@@ -57,11 +57,11 @@ class CameraPlaces:
             raise CameraError(f"{flag} {file}: expected an object of photographs, each with its cam_from_world")
         return cls(file, entries, flag)
 
-    def cam_from_world(self, photograph: Path) -> np.ndarray:
-        """Where a photograph was taken: rigid [4, 4], from above the plane, looking down on it.
+    def anywhere(self, photograph: Path) -> np.ndarray:
+        """cam_from_world of a photograph: rigid [4, 4].
 
         Raises:
-            CameraError: The file does not say, or it is no such place.
+            CameraError: The file does not say, or it is not rigid.
         """
         entry = self._entry(photograph)
         if "cam_from_world" not in entry:
@@ -69,12 +69,19 @@ class CameraPlaces:
                 f"{self.flag} {self.file}: says nothing of {photograph.name}; it has {', '.join([*self.entries][:5])}. "
                 "Photographs are named by their path from that file's folder, or by their file name"
             )
-        where = f"{self.flag} {self.file}, {photograph.name}"
-        matrix = _rigid(entry["cam_from_world"], where)
+        return _rigid(entry["cam_from_world"], self._where(photograph))
+
+    def cam_from_world(self, photograph: Path) -> np.ndarray:
+        """The same of a photograph that was taken from above the plane, looking down on it.
+
+        Raises:
+            CameraError: The file does not say, or it is no such place.
+        """
+        matrix = self.anywhere(photograph)
         height, forward = (-matrix[:3, :3].T @ matrix[:3, 3])[1], matrix[2, 1]
         if height <= 0 or forward >= 0:
             raise CameraError(
-                f"{where}: the camera stands at a height of {height:.3g} m and looks {'up' if forward >= 0 else 'down'}"
+                f"{self._where(photograph)}: the camera stands at a height of {height:.3g} m and looks {'up' if forward >= 0 else 'down'}"
                 "; expected one above the plane y = 0 that looks down on it. Is y up, and is it cam_from_world?"
             )
         return matrix
@@ -105,6 +112,9 @@ class CameraPlaces:
                 f"by {tilt:.1f} degrees to {plate.name}, taken at {heights[1]:.3g} m; a camera that moves has to keep "
                 f"its height within {_SAME_HEIGHT:.0%} and its tilt within {_SAME_TILT_DEG:g} degrees"
             )
+
+    def _where(self, photograph: Path) -> str:
+        return f"{self.flag} {self.file}, {photograph.name}"
 
     def _entry(self, photograph: Path) -> Mapping[str, Any]:
         relative = os.path.relpath(photograph, self.file.parent)

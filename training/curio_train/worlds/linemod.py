@@ -97,7 +97,7 @@ def read_cameras(file: Path, paths: list[Path]) -> Cameras:
     """
     places = CameraPlaces.read(file, "--views")
     unknown = np.full((4, 4), np.nan)
-    matrices = [places.cam_from_world(path) if places.in_metres(path) else unknown for path in paths]
+    matrices = [places.anywhere(path) if places.in_metres(path) else unknown for path in paths]
     cameras = Cameras(np.stack(matrices), in_metres=True)
     if not cameras.known.any():
         raise CameraError(
