@@ -82,8 +82,8 @@ class CameraPlaces:
         if height <= 0 or forward >= 0:
             raise CameraError(
                 f"{self._where(photograph)}: the camera stands at a height of {height:.3g} m and looks "
-                f"{'up' if forward >= 0 else 'down'}; expected one above the plane y = 0 that looks down on it. Is y up, "
-                "and is it cam_from_world?"
+                f"{'up' if forward >= 0 else 'down'}; expected one above the plane y = 0 that looks down on it. "
+                "Is y up, and is it cam_from_world?"
             )
         return matrix
 
