@@ -19,6 +19,8 @@ def test_flags_that_contradict_each_other(tmp_path: Path, capsys: pytest.Capture
         ["--every", 0],
         ["--distance-m", 1.0],
         ["--board", 9, 6, *views],
+        ["--board", 9, 6, "--distance-m", 1.0],
+        ["--board", 9, 6, "--objects", tmp_path],
         ["--objects", tmp_path],
         ["--objects", tmp_path, *views],
         ["--objects", tmp_path, "--camera", tmp_path / "camera.json", "--distance-m", 1.0, *views],

@@ -33,6 +33,7 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
     """
     if command.every < 1:
         raise UsageError(f"--every {command.every}, expected 1 or more")
+    _check_scale(command)
     if command.board is None:
         return _from_scene(command, by_objects)
     if command.views_out is not None or command.camera is not None:
@@ -50,7 +51,6 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
 
 
 def _from_scene(command: CalibrateCommand, by_objects: ByObjects) -> str:
-    _check_scale(command)
     known = None if command.camera is None else load_intrinsics(command.camera)
     found = recover(every_nth(Photographs(command.images).paths, command.every), known)
     lines = [f"placed {len(found.photographs)} photographs, points off by {found.error_px:.2f} pixels"]

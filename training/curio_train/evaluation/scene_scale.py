@@ -2,7 +2,7 @@
 
 One object's depth is read with an error of some per cent, all to one side, because its mesh, its surface and the
 camera are never quite what renderings say. Several objects of one scene share its scale and err each in its own way, so
-their mean is better than any (decision 68). No label is opened.
+their mean errs less than most of them (decision 68). No label is opened.
 """
 
 from collections.abc import Callable, Mapping
