@@ -2,13 +2,16 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from curio_train import cli
+from curio_train.capture.structure import Structure
 from curio_train.data.bop import BopDataset
-from curio_train.evaluation.scene_scale import mean_scale
+from curio_train.errors import DataError, UsageError
+from curio_train.evaluation.scene_scale import mean_scale, scale_by_objects
 
 MODELS = Path(__file__).parents[2] / "models"
 
@@ -54,7 +57,20 @@ def test_real_frames_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert far.sum() > 10
     assert np.median(ratio) == pytest.approx(1, abs=0.04)
 
-    (models / "cat").unlink()
-    status, _, err = call(capsys, *flags, "--objects", models, "--data", data)
-    assert status == 2
-    assert "error: " in err
+
+@pytest.mark.skipif("CURIO_DATA" not in os.environ, reason="CURIO_DATA is unset: no real data here")
+def test_what_tells_no_scale_is_said(tmp_path: Path) -> None:
+    data = Path(os.environ["CURIO_DATA"]) / "lmo"
+    photographs = tuple(sorted((data / "test" / "000002" / "rgb").iterdir())[:3])
+    camera = BopDataset(data).camera
+    still = Structure(photographs, np.tile(np.eye(4), (3, 1, 1)), camera, np.zeros((1, 3)), 0.5)
+    told: list[str] = []
+    with pytest.raises(UsageError, match=str(tmp_path)):
+        scale_by_objects(still, tmp_path, data, told.append)
+    (tmp_path / "cat").symlink_to(MODELS / "cat")
+    with pytest.raises(DataError, match=r"none of the objects .*--distance-m"):
+        scale_by_objects(still, tmp_path, data, told.append)
+    assert told == ["cat: seen too seldom to tell"]
+    longer = replace(still, camera=replace(camera, matrix=camera.matrix * [[1.2], [1.2], [1]]))
+    with pytest.raises(UsageError, match=r"focal length of 572\.4 pixels, but --camera has 686\.9"):
+        scale_by_objects(longer, tmp_path, data, told.append)

@@ -25,7 +25,7 @@ _LEAST_SHARE = 0.002  # of the frame
 
 @dataclass(frozen=True, eq=False)
 class CameraPlaces:
-    """The file of ``--plane`` or ``--views``: ``{"plates/a.png": {"cam_from_world": [4x4], "plate": "plates/a.png"}, …}``.
+    """The file of ``--plane`` and ``--views``: ``{"a.png": {"cam_from_world": [4x4], "plate": "plates/a.png"}, …}``.
 
     Photographs are named by their path from the file's folder, or by their file name. Those of a camera that moves may
     name a plate of their own; ``"unit": "m"`` says that the file's writer knew metres, which ``--views`` asks for.
