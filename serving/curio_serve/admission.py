@@ -19,6 +19,9 @@ from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
 from curio_serve.telemetry import Metrics
 
 _PROMISE_S = 1.0
+# How much longer a call is taken to wait than the mean says. Without it every third call that is answered comes late;
+# more only makes a queue shorter that need not be long to be never empty (docs/experiments.md).
+_MARGIN = 1.5
 
 
 class Call(Protocol):
@@ -84,19 +87,25 @@ class WorkQueue:
         """Whether a further call would have to wait for more than one frame."""
         return len(self._waiting) >= self.num_slots
 
-    def promise(self, waiter: Waiter) -> None:
+    def promise(self, waiter: Waiter, remaining_s: float) -> None:
         """Keep a place for a call whose message is still on its way: to refuse it later would cost its reading.
 
         The place is kept for a second, so that callers who never send their message do not fill the queue.
 
+        Args:
+            waiter: Of the call.
+            remaining_s: Until its deadline; infinite without one.
+
         Raises:
-            Overloaded: There is none.
+            Overloaded: There is none, or the deadline would pass before it is answered.
         """
         with self._lock:
-            if not self._has_place():
+            if not self._has_place() or self._comes_too_late(remaining_s):
                 self._drop_old_promises()
                 if not self._has_place():
-                    self._refuse()
+                    self._refuse("which is the limit (--workers, --queue)")
+                if self._comes_too_late(remaining_s):
+                    self._refuse("which takes longer than the call's deadline leaves")
             self._promised[waiter] = time.monotonic()
 
     def enter(self, waiter: Waiter, *, always: bool = False) -> bool:
@@ -115,7 +124,7 @@ class WorkQueue:
                 self._num_free -= 1
                 return True
             if len(self._waiting) >= self._max_waiting and not (is_promised or always):
-                self._refuse()
+                self._refuse("which is the limit (--workers, --queue)")
             self._waiting.append(waiter)
             return False
 
@@ -130,11 +139,16 @@ class WorkQueue:
                 return False
             return True
 
-    def leave(self, worked_s: float) -> Waiter | None:
-        """Hand a slot on to the first in the queue, who is returned and has to be told, or free it."""
+    def leave(self, worked_s: float | None) -> Waiter | None:
+        """Hand a slot on to the first in the queue, who is returned and has to be told, or free it.
+
+        Args:
+            worked_s: How long the slot was taken; None where there was nothing to do.
+        """
         with self._lock:
-            # A smoothed guess is enough to tell clients when to come back.
-            self._mean_work_s += 0.05 * (worked_s - self._mean_work_s)
+            # A smoothed guess is enough to tell who would come too late, and when to come back.
+            if worked_s is not None:
+                self._mean_work_s += 0.05 * (worked_s - self._mean_work_s)
             if self._waiting:
                 return self._waiting.popleft()
             self._num_free += 1
@@ -187,13 +201,23 @@ class WorkQueue:
         while self._promised and self._promised[first := next(iter(self._promised))] < end:
             del self._promised[first]
 
-    def _refuse(self) -> NoReturn:
+    def _comes_too_late(self, remaining_s: float) -> bool:
+        """Whether an answer to a further call would be work for nobody. Where nobody waits, this is not known."""
+        wait_s = self._wait_s()
+        # Twice the work: a call that is being worked on has to end, and its own has to be done.
+        return wait_s > 0 and _MARGIN * wait_s + 2 * self._mean_work_s > remaining_s
+
+    def _wait_s(self) -> float:
+        """How long a further call would wait for its turn behind those that wait."""
+        return self._mean_work_s * (len(self._waiting) + len(self._promised)) / self.num_slots
+
+    def _refuse(self, reason: str) -> NoReturn:
         waiting = len(self._waiting) + len(self._promised)
         # Two digits say enough, and let the answers to a flood be made once for many.
-        retry_s = float(f"{self._mean_work_s * (waiting + 1) / self.num_slots:.2g}")
+        retry_s = float(f"{self._wait_s() + self._mean_work_s / self.num_slots:.2g}")
         raise Overloaded(
-            f"{self.num_slots} requests are being worked on and {waiting} are waiting, which is the limit "
-            f"(--workers, --queue); try again in {retry_s:g} s",
+            f"{self.num_slots} requests are being worked on and {waiting} are waiting, {reason}; "
+            f"try again in {retry_s:g} s",
             retry_s,
         )
 

@@ -139,7 +139,7 @@ class DirectCalls:
         try:
             if len(self._open) > self._max_calls:
                 raise Overloaded(f"{self._max_calls} calls are open, which is the limit (--max-calls)", 1.0)
-            self._work.promise(call)
+            self._work.promise(call, event.call_details.deadline - time.time())
         except Overloaded as exc:
             call.refuse(exc)
             return
@@ -166,21 +166,28 @@ class DirectCalls:
     def work_on(self, call: "_Call") -> None:
         """Answer a call that has a slot, then those that get the slot after it."""
         following: _Call | None = call
+        since = time.monotonic()
         while following is not None:
             self._listeners.watch_out()
-            following = self._listeners.look_up(self._finish(following))
+            following = self._finish(following, since)
+            since = time.monotonic()  # what is heard now keeps the slot from working, too
+            following = self._listeners.look_up(following, is_flooded=self._work.is_long)
 
-    def _finish(self, call: "_Call") -> "_Call | None":
-        """Answer a call and hand its slot on; the call that has it now, if this thread can work on that."""
-        begun = time.monotonic()
-        is_answered = False
+    def _finish(self, call: "_Call", since: float) -> "_Call | None":
+        """Answer a call and hand its slot on; the call that has it now, if this thread can work on that.
+
+        Args:
+            call: Has a slot.
+            since: When this thread had done with the call before.
+        """
+        is_answered = has_worked = False
         try:
-            call.answer(begun)
+            has_worked = call.answer(time.monotonic())
             is_answered = True
         finally:
             if not is_answered:
                 call.break_off()
-            following = self._work.leave(time.monotonic() - begun)
+            following = self._work.leave(time.monotonic() - since if has_worked else None)
             if following is not None and not (is_answered and isinstance(following, _Call)):
                 following.tell()
                 following = None
@@ -252,27 +259,28 @@ class _Call:
         has_passed = time.time() >= self._deadline
         return passed_in_queue(time.monotonic() - self._since) if has_passed else hung_up_in_queue()
 
-    def answer(self, now: float) -> None:
-        """Do the work and send what comes of it."""
+    def answer(self, now: float) -> bool:
+        """Do the work and send what comes of it; False if there was no work."""
         if self._calls.is_stopping:
             self.refuse(Unavailable("the server's grace time is over; nothing was done"))
-            return
+            return False
         if time.time() >= self._deadline:
             self.refuse(passed_in_queue(now - self._since))
-            return
+            return False
         kind = self._method.request
         try:
             request = kind.FromString(self.data)
         except DecodeError:
             self.send_error(unreadable(kind, len(self.data)))
-            return
+            return False
         self.data = b""
         answer = self._method.answer(request, self, now - self._since)
         if isinstance(answer, CurioError):
             self.send_error(answer)
-            return
+            return True
         status = cygrpc.SendStatusFromServerOperation(None, _OK, b"", _NO_FLAGS)
         self._send(cygrpc.SendMessageOperation(answer.SerializeToString(), _NO_FLAGS), status)
+        return True
 
     def refuse(self, error: CurioError) -> None:
         """End the call without an answer."""

@@ -19,7 +19,7 @@ from curio_serve.telemetry import LOGGER
 
 Call = TypeVar("Call")
 _LONG_S = 0.02  # what comes while all work on long calls waits this long at most
-_MAX_EVENTS = 32  # between two calls, so that a flood of them leaves time for work
+_MAX_EVENTS = 64  # between two calls, so that a flood of them leaves time for work
 
 
 class Listeners(Generic[Call]):
@@ -65,11 +65,16 @@ class Listeners(Generic[Call]):
         if not self._waiting and not self._all_work.is_set():
             self._all_work.set()
 
-    def look_up(self, following: Call | None) -> Call | None:
+    def look_up(self, following: Call | None, *, is_flooded: bool) -> Call | None:
         """Hear what has come while all threads worked.
+
+        Whether or not there is a call to go on with, all is heard: what is not waits inside gRPC or on the wire, where
+        no limit of ours holds, and by the time it is heard nobody wants the answer any more.
 
         Args:
             following: What this thread goes on with, if it has anything.
+            is_flooded: Ask gRPC until it has had nothing twice, because it also has nothing when it has read a part of
+                a message.
 
         Returns:
             The same, or else what has come.
@@ -77,18 +82,21 @@ class Listeners(Generic[Call]):
         if self._waiting or not self._looking.acquire(blocking=False):
             return following
         self._num_looks += 1
+        num_misses_left = 2 if is_flooded else 1
         is_over = False
         try:
             for _ in range(_MAX_EVENTS):
                 event = self._events.hear(AT_ONCE)
                 if event is None:
-                    break
+                    num_misses_left -= 1
+                    if not num_misses_left:
+                        break
+                    continue
                 call = event.tag(event)
                 del event
                 if call is not None and following is None:
                     following = call
-                    break  # who is free hears the rest
-                if call is not None:
+                elif call is not None:
                     self._hand_over(call)
                 if self._waiting:
                     break

@@ -1,6 +1,8 @@
 """A fault of ours ends the call that it came up in, and nothing else: no slot is lost, no thread, no other call."""
 
 import threading
+import time
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -103,3 +105,20 @@ def test_who_waits_behind_a_fault_is_answered(log: pytest.LogCaptureFixture) -> 
         assert bad.exception(timeout=30).code() is grpc.StatusCode.CANCELLED
         assert [call.result(timeout=30).request_id for call in waiting] == ["good"] * MAX_WAITING
     assert _num_logged(log) == 2
+
+
+class ShortWork(Work):
+    """Takes so long that calls come faster, and so short that no further thread listens meanwhile."""
+
+    def answer(self, request: pb.DetectRequest, caller: Caller, waited_s: float) -> pb.DetectResponse:
+        time.sleep(0.01)
+        return super().answer(request, caller, waited_s)
+
+
+def test_a_flood_is_refused_while_all_work() -> None:
+    """What is not heard would wait inside gRPC for as long as it likes."""
+    with _served(ShortWork()) as stub:
+        calls = [stub.Detect.future(GOOD, timeout=30) for _ in range(100)]
+        ends = Counter(error.code() if (error := call.exception()) else grpc.StatusCode.OK for call in calls)
+    assert ends.keys() == {grpc.StatusCode.OK, grpc.StatusCode.RESOURCE_EXHAUSTED}
+    assert MAX_WAITING < ends[grpc.StatusCode.OK] < 50
