@@ -1,6 +1,7 @@
 """Frames, a bare loop over them, and load on a server. The functions run in processes of their own."""
 
 import asyncio
+import math
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -75,6 +76,23 @@ def bare_cpu_ms(model_folder: Path, frames: list[bytes], num_threads: int, secon
         return 1000 * (time.process_time() - before) / num_done
 
 
+def bare_latencies_ms(model_folder: Path, frames: list[bytes], rate: float, seconds: float) -> list[float]:
+    """Latencies of the bare loop in one thread over frames that come evenly (infinite rate: one after the other)."""
+    one = bare_loop(model_folder)
+    for frame in frames:
+        one(frame)  # warm
+    latencies_ms = []
+    due = time.perf_counter()
+    end = due + seconds
+    while due < end:
+        time.sleep(max(0.0, due - time.perf_counter()))
+        one(frames[len(latencies_ms) % len(frames)])
+        done = time.perf_counter()
+        latencies_ms.append(1000 * (done - due))
+        due = max(due + 1 / rate, done if rate == math.inf else due)
+    return latencies_ms
+
+
 def bare_folder(model_folder: str, frames: str, num_threads: str) -> None:
     """The bare loop over the files of a folder, as a program of its own."""
     one = bare_loop(Path(model_folder))
@@ -119,9 +137,9 @@ def closed_loop_of(target: Target, concurrency: int, num_calls: int) -> dict[str
     return asyncio.run(_closed_loop_of(target, concurrency, num_calls))
 
 
-def open_loop(target: Target, rate: float, seconds: float) -> dict[str, Any]:
+def open_loop(target: Target, rate: float, seconds: float, deadline_s: float = DEADLINE_S) -> dict[str, Any]:
     """Frames that come evenly, whether or not earlier ones are answered. Latency counts from when one was due."""
-    return asyncio.run(_open_loop(target, rate, seconds))
+    return asyncio.run(_open_loop(target, rate, seconds, deadline_s))
 
 
 async def _closed_loop(target: Target, concurrency: int, seconds: float) -> dict[str, Any]:
@@ -151,9 +169,9 @@ async def _closed_loop_of(target: Target, concurrency: int, num_calls: int) -> d
         return dict(record.codes)
 
 
-async def _open_loop(target: Target, rate: float, seconds: float) -> dict[str, Any]:
+async def _open_loop(target: Target, rate: float, seconds: float, deadline_s: float) -> dict[str, Any]:
     async with grpc.aio.insecure_channel(target.address) as channel:
-        record = _Record(channel, target)
+        record = _Record(channel, target, deadline_s)
         begun = time.perf_counter()
         calls = set()
         due = begun
@@ -171,8 +189,8 @@ async def _open_loop(target: Target, rate: float, seconds: float) -> dict[str, A
 class _Record:
     """Calls on one channel, and what became of them."""
 
-    def __init__(self, channel: grpc.aio.Channel, target: Target) -> None:
-        self._requests = target.requests
+    def __init__(self, channel: grpc.aio.Channel, target: Target, deadline_s: float = DEADLINE_S) -> None:
+        self._requests, self._deadline_s = target.requests, deadline_s
         self._call = channel.unary_unary(target.method)
         self.codes: Counter[str] = Counter()
         self._reasons: dict[str, str] = {}
@@ -181,7 +199,7 @@ class _Record:
     async def call(self, due: float) -> None:
         request = self._requests[self.codes.total() % len(self._requests)]
         try:
-            await self._call(request, timeout=DEADLINE_S)
+            await self._call(request, timeout=self._deadline_s)
         except grpc.aio.AioRpcError as exc:
             self.codes[exc.code().name] += 1
             self._reasons.setdefault(exc.code().name, exc.details() or "")
@@ -191,7 +209,7 @@ class _Record:
 
     def summary(self, seconds: float) -> dict[str, Any]:
         """Codes, what the first call of each bad one was told, latencies of good answers, and rates a second."""
-        good = sum(latency <= 1000 * DEADLINE_S for latency in self._latencies_ms)
+        good = sum(latency <= 1000 * self._deadline_s for latency in self._latencies_ms)
         return {
             "codes": dict(self.codes),
             "reasons": self._reasons,
