@@ -22,6 +22,8 @@ _PROMISE_S = 1.0
 # How much longer a call is taken to wait than the mean says. Without it every third call that is answered comes late;
 # more only makes a queue shorter that need not be long to be never empty (docs/experiments.md).
 _MARGIN = 1.5
+_IS_FULL = "which is the limit (--workers, --queue)"
+_COMES_TOO_LATE = "which takes longer than the call's deadline leaves"
 
 
 class Call(Protocol):
@@ -83,6 +85,11 @@ class WorkQueue:
         metrics.working.set_function(lambda: num_slots - self._num_free)
 
     @property
+    def is_full(self) -> bool:
+        """Whether all slots are taken."""
+        return not self._num_free
+
+    @property
     def is_long(self) -> bool:
         """Whether a further call would have to wait for more than one frame."""
         return len(self._waiting) >= self.num_slots
@@ -100,12 +107,10 @@ class WorkQueue:
             Overloaded: There is none, or the deadline would pass before it is answered.
         """
         with self._lock:
-            if not self._has_place() or self._comes_too_late(remaining_s):
+            if self._why_not(remaining_s):
                 self._drop_old_promises()
-                if not self._has_place():
-                    self._refuse("which is the limit (--workers, --queue)")
-                if self._comes_too_late(remaining_s):
-                    self._refuse("which takes longer than the call's deadline leaves")
+                if reason := self._why_not(remaining_s):
+                    self._refuse(reason)
             self._promised[waiter] = time.monotonic()
 
     def enter(self, waiter: Waiter, *, always: bool = False) -> bool:
@@ -124,7 +129,7 @@ class WorkQueue:
                 self._num_free -= 1
                 return True
             if len(self._waiting) >= self._max_waiting and not (is_promised or always):
-                self._refuse("which is the limit (--workers, --queue)")
+                self._refuse(_IS_FULL)
             self._waiting.append(waiter)
             return False
 
@@ -193,28 +198,26 @@ class WorkQueue:
             raise hung_up_in_queue()
         raise passed_in_queue(remaining_s or 0.0)
 
-    def _has_place(self) -> bool:
-        return len(self._promised) + len(self._waiting) < self._max_waiting + self._num_free
+    def _why_not(self, remaining_s: float) -> str:
+        """Why a further call cannot be answered in time; empty if it can, as far as is known."""
+        num_ahead = len(self._promised) + len(self._waiting) - self._num_free
+        if num_ahead >= self._max_waiting:
+            return _IS_FULL
+        if num_ahead <= 0:
+            return ""
+        # Twice the work: a call that is being worked on has to end, and its own has to be done.
+        needed_s = self._mean_work_s * (_MARGIN * num_ahead / self.num_slots + 2)
+        return _COMES_TOO_LATE if needed_s > remaining_s else ""
 
     def _drop_old_promises(self) -> None:
         end = time.monotonic() - _PROMISE_S
         while self._promised and self._promised[first := next(iter(self._promised))] < end:
             del self._promised[first]
 
-    def _comes_too_late(self, remaining_s: float) -> bool:
-        """Whether an answer to a further call would be work for nobody. Where nobody waits, this is not known."""
-        wait_s = self._wait_s()
-        # Twice the work: a call that is being worked on has to end, and its own has to be done.
-        return wait_s > 0 and _MARGIN * wait_s + 2 * self._mean_work_s > remaining_s
-
-    def _wait_s(self) -> float:
-        """How long a further call would wait for its turn behind those that wait."""
-        return self._mean_work_s * (len(self._waiting) + len(self._promised)) / self.num_slots
-
     def _refuse(self, reason: str) -> NoReturn:
         waiting = len(self._waiting) + len(self._promised)
         # Two digits say enough, and let the answers to a flood be made once for many.
-        retry_s = float(f"{self._wait_s() + self._mean_work_s / self.num_slots:.2g}")
+        retry_s = float(f"{self._mean_work_s * (waiting + 1) / self.num_slots:.2g}")
         raise Overloaded(
             f"{self.num_slots} requests are being worked on and {waiting} are waiting, {reason}; "
             f"try again in {retry_s:g} s",

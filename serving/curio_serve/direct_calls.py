@@ -90,7 +90,7 @@ class DirectCalls:
         self.is_stopping, self._all_ended = False, threading.Event()
         for path in self._begun:
             self._server.register_method(path)
-        self._listeners = Listeners(events, work.num_slots, self.work_on, self.hand_over)
+        self._listeners = Listeners(events, work, self.work_on, self.hand_over)
         # For calls that get the slot of a thread with other duties; see _Call.tell.
         self._spare = ThreadPoolExecutor(work.num_slots, thread_name_prefix="curio-spare")
 
@@ -171,7 +171,7 @@ class DirectCalls:
             self._listeners.watch_out()
             following = self._finish(following, since)
             since = time.monotonic()  # what is heard now keeps the slot from working, too
-            following = self._listeners.look_up(following, is_flooded=self._work.is_long)
+            following = self._listeners.look_up(following)
 
     def _finish(self, call: "_Call", since: float) -> "_Call | None":
         """Answer a call and hand its slot on; the call that has it now, if this thread can work on that.

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Generic, TypeVar
 
+from curio_serve.admission import WorkQueue
 from curio_serve.events import AT_ONCE, Events
 from curio_serve.telemetry import LOGGER
 
@@ -27,7 +28,7 @@ class Listeners(Generic[Call]):
 
     Args:
         events: Where they come from.
-        num_threads: How many calls may be worked on at once.
+        work: Slots and queue: there are as many threads as slots.
         work_on: Works on a call; is to call :meth:`watch_out` before and :meth:`look_up` after.
         hand_over: Has another thread work on a call.
     """
@@ -35,21 +36,21 @@ class Listeners(Generic[Call]):
     def __init__(
         self,
         events: Events,
-        num_threads: int,
+        work: WorkQueue,
         work_on: Callable[[Call], None],
         hand_over: Callable[[Call], None],
     ) -> None:
-        self._events, self._num_threads = events, num_threads
+        self._events, self._work = events, work
         self._work_on, self._hand_over = work_on, hand_over
         self._waiting: set[int] = set()  # threads that wait for an event
         self._all_work, self._num_looks = threading.Event(), 0
         self._looking = threading.Lock()  # of two, one would take calls that the other is free for
         self._is_stopping = False
-        self._threads = ThreadPoolExecutor(num_threads + 1, thread_name_prefix="curio-direct")
+        self._threads = ThreadPoolExecutor(work.num_slots + 1, thread_name_prefix="curio-direct")
 
     def start(self) -> None:
         """Begin to listen."""
-        for _ in range(self._num_threads):
+        for _ in range(self._work.num_slots):
             self._keep_up(self._listen)
         self._keep_up(self._relieve)
 
@@ -65,16 +66,14 @@ class Listeners(Generic[Call]):
         if not self._waiting and not self._all_work.is_set():
             self._all_work.set()
 
-    def look_up(self, following: Call | None, *, is_flooded: bool) -> Call | None:
+    def look_up(self, following: Call | None) -> Call | None:
         """Hear what has come while all threads worked.
 
-        Whether or not there is a call to go on with, all is heard: what is not waits inside gRPC or on the wire, where
-        no limit of ours holds, and by the time it is heard nobody wants the answer any more.
+        While there is no slot to spare, all of it: what is not heard waits inside gRPC or on the wire, where no limit
+        of ours holds, and by the time that it is heard nobody wants the answer any more.
 
         Args:
             following: What this thread goes on with, if it has anything.
-            is_flooded: Ask gRPC until it has had nothing twice, because it also has nothing when it has read a part of
-                a message.
 
         Returns:
             The same, or else what has come.
@@ -82,7 +81,8 @@ class Listeners(Generic[Call]):
         if self._waiting or not self._looking.acquire(blocking=False):
             return following
         self._num_looks += 1
-        num_misses_left = 2 if is_flooded else 1
+        # gRPC also has nothing when it has read a part of a message.
+        num_misses_left = 2 if self._work.is_long else 1
         is_over = False
         try:
             for _ in range(_MAX_EVENTS):
@@ -96,6 +96,8 @@ class Listeners(Generic[Call]):
                 del event
                 if call is not None and following is None:
                     following = call
+                    if not self._work.is_full:
+                        break  # who is free hears the rest
                 elif call is not None:
                     self._hand_over(call)
                 if self._waiting:

@@ -206,10 +206,11 @@ def test_who_would_come_too_late_is_refused_at_once() -> None:
     for _ in range(200):
         assert queue.enter(Place())
         assert queue.leave(0.1) is None
-    # Nobody waits, so there is no telling that it cannot be done.
+    # Nobody is ahead, so there is no telling that it cannot be done.
     queue.promise(first := Place(), 0.001)
     assert queue.enter(first)
-    assert not queue.enter(Place())
+    queue.promise(second := Place(), 0.001)
+    assert not queue.enter(second)
     with pytest.raises(Overloaded, match="1 are waiting, which takes longer than the call's deadline") as caught:
         queue.promise(Place(), 0.3)
     assert caught.value.retry_after_s == pytest.approx(0.2, rel=0.05)
