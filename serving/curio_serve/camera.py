@@ -56,6 +56,11 @@ class PinholeCamera:
         return np.array(self.distortion) if any(self.distortion) else None
 
     @cached_property
+    def focal_lengths(self) -> tuple[float, float]:
+        """Pixels: x and y."""
+        return self._rows[0][0], self._rows[1][1]
+
+    @cached_property
     def _rows(self) -> list[list[float]]:
         """K as plain numbers."""
         rows: list[list[float]] = self.matrix.tolist()

@@ -109,7 +109,8 @@ class Detector:
             camera = camera or canonical.for_frame(width, height)
             if camera is None:
                 return 1
-            ratios = tuple(camera.matrix[i, i] / canonical.matrix[i, i] for i in (0, 1))
+            (fx, fy), (target_fx, target_fy) = camera.focal_lengths, canonical.focal_lengths
+            ratios = fx / target_fx, fy / target_fy
         return next((r for r in _REDUCTIONS if r <= min(ratios)), 1)
 
     def _frame(self, pixels: Array, camera: PinholeCamera | None, reduction: int) -> "PinholeFrame | FlatFrame":

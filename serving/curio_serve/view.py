@@ -24,7 +24,7 @@ from its centre.
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -63,6 +63,12 @@ class CanonicalCamera:
     height: int
     matrix: Array | None = None
     is_default: bool = False
+
+    @cached_property
+    def focal_lengths(self) -> tuple[float, float]:
+        """Of K*, pixels: x and y."""
+        matrix = np.asarray(self.matrix)
+        return float(matrix[0, 0]), float(matrix[1, 1])
 
     @cached_property
     def inverse(self) -> Array:
@@ -108,13 +114,77 @@ class View(ABC):
         """Pixels, x and y in turn, in the full-size frame of points in the frame's camera (or widths of the frame)."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Aim:
+    """How a model's camera looks at a region of a camera's frames.
+
+    Attributes:
+        canonical_from_cam: Rotation [3, 3].
+        cam_from_canonical: Its inverse as plain numbers.
+        homography: From pixels of the view to pixels of the frame as averaged down [3, 3]; None where they are the
+            same, and where the camera distorts.
+        maps: The same for a camera that distorts, as OpenCV's ``remap`` takes it.
+    """
+
+    canonical_from_cam: Array
+    cam_from_canonical: Sequence[Sequence[float]]
+    homography: Array | None = None
+    maps: tuple[Array, Array] | None = None
+
+    def image(self, pixels: Array, size: tuple[int, int]) -> Array:
+        """What is seen, uint8 RGB of that (width, height)."""
+        if self.maps is not None:
+            return cv2.remap(pixels, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return pixels if self.homography is None else _warp(pixels, self.homography, size)
+
+
+@lru_cache(256)
+def _aim(
+    camera: PinholeCamera,
+    canonical: CanonicalCamera,
+    frame_size: tuple[int, int],
+    pixels_size: tuple[int, int],
+    region: Region,
+) -> _Aim:
+    """Kept, because one camera sends many frames, and these few numbers cost as much as half a warp.
+
+    Args:
+        camera: Of the full-size frame.
+        canonical: Of the model; with K*.
+        frame_size: (width, height) of the full-size frame.
+        pixels_size: The same of its pixels as averaged down.
+        region: In pixels of the full-size frame.
+
+    Raises:
+        CameraError: The view would reach behind the frame's camera.
+    """
+    size = canonical.width, canonical.height
+    x, y = (
+        min(max(start + length / 2, 0.0), end) - 0.5
+        for start, length, end in zip(region[:2], region[2:], frame_size, strict=True)
+    )
+    turn = smallest_rotation(camera.ray(x, y), canonical.rays[:, 0])
+    if (turn[:, 2] @ canonical.rays).min() < _MIN_RAY_DEPTH:
+        raise CameraError(
+            "the model's view of this region would reach more than 87 degrees away from the camera's axis; "
+            "choose a region nearer the middle of the frame, or check K's focal length"
+        )
+    matrix = scaling(*np.divide(pixels_size, frame_size)) @ camera.matrix
+    if camera.coefficients is not None:
+        target = np.asarray(canonical.matrix)
+        maps = cv2.initUndistortRectifyMap(matrix, camera.coefficients, turn, target, size, cv2.CV_32FC1)
+        return _Aim(turn, turn.T.tolist(), maps=maps)
+    homography = matrix @ turn.T @ canonical.inverse
+    return _Aim(turn, turn.T.tolist(), None if _changes_nothing(homography, pixels_size, size) else homography)
+
+
 class PinholeView(View):
     """A region of a frame with K."""
 
-    def __init__(self, image: Array, camera: PinholeCamera, canonical_from_cam: Array) -> None:
+    def __init__(self, image: Array, camera: PinholeCamera, aim: _Aim) -> None:
         self.image = image
-        self.canonical_from_cam = canonical_from_cam
-        self._cam_from_canonical: list[list[float]] = canonical_from_cam.T.tolist()
+        self.canonical_from_cam = aim.canonical_from_cam
+        self._cam_from_canonical = aim.cam_from_canonical
         self._camera = camera
 
     def translation(self, found: Sequence[float]) -> Sequence[float]:
@@ -175,11 +245,9 @@ class PinholeFrame:
         camera.check_frame(self.width, self.height)
         if canonical.matrix is None:
             raise CameraError("a 2D model has no camera to look through")
-        self._camera, self._canonical, self._target = camera, canonical, canonical.matrix
-        x_ratio, y_ratio = (self._target[i, i] / camera.matrix[i, i] for i in (0, 1))
+        self._camera, self._canonical = camera, canonical
+        x_ratio, y_ratio = (c / f for c, f in zip(canonical.focal_lengths, camera.focal_lengths, strict=True))
         self._pixels = _average_down(pixels, self.width * x_ratio, self.height * y_ratio)
-        height, width = self._pixels.shape[:2]
-        self._matrix = scaling(width / self.width, height / self.height) @ camera.matrix
 
     def look(self, region: Region) -> PinholeView:
         """The region as the model's camera sees it.
@@ -187,26 +255,10 @@ class PinholeFrame:
         Raises:
             CameraError: The view would reach behind the frame's camera.
         """
-        x = float(np.clip(region.x + region.width / 2, 0, self.width)) - 0.5
-        y = float(np.clip(region.y + region.height / 2, 0, self.height)) - 0.5
-        size = self._canonical.width, self._canonical.height
-        turn = smallest_rotation(self._camera.ray(x, y), self._canonical.rays[:, 0])
-        self._check_in_front(turn)
-        distortion = self._camera.coefficients
-        if distortion is None:
-            image = _sample(self._pixels, self._matrix @ turn.T @ self._canonical.inverse, size)
-        else:
-            maps = cv2.initUndistortRectifyMap(self._matrix, distortion, turn, self._target, size, cv2.CV_32FC1)
-            image = cv2.remap(self._pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return PinholeView(image, self._camera, turn)
-
-    def _check_in_front(self, turn: Array) -> None:
-        depths = turn[:, 2] @ self._canonical.rays
-        if depths.min() < _MIN_RAY_DEPTH:
-            raise CameraError(
-                "the model's view of this region would reach more than 87 degrees away from the camera's axis; "
-                "choose a region nearer the middle of the frame, or check K's focal length"
-            )
+        canonical, pixels = self._canonical, self._pixels
+        height, width = pixels.shape[:2]
+        aim = _aim(self._camera, canonical, (self.width, self.height), (width, height), region)
+        return PinholeView(aim.image(pixels, (canonical.width, canonical.height)), self._camera, aim)
 
 
 class FlatFrame:
@@ -223,8 +275,9 @@ class FlatFrame:
         pixels = _average_down(self._pixels, self.width * x_ratio, self.height * y_ratio)
         to_pixels = scaling(pixels.shape[1] / self.width, pixels.shape[0] / self.height)
         shift = np.array([[1, 0, region.x], [0, 1, region.y], [0, 0, 1]])
-        image = _sample(pixels, to_pixels @ shift @ scaling(1 / x_ratio, 1 / y_ratio), size)
-        return FlatView(image, region, (self.width, self.height))
+        homography = to_pixels @ shift @ scaling(1 / x_ratio, 1 / y_ratio)
+        same = _changes_nothing(homography, (pixels.shape[1], pixels.shape[0]), size)
+        return FlatView(pixels if same else _warp(pixels, homography, size), region, (self.width, self.height))
 
 
 def _average_down(pixels: Array, width: float, height: float) -> Array:
@@ -238,10 +291,13 @@ def _average_down(pixels: Array, width: float, height: float) -> Array:
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
-def _sample(pixels: Array, pixels_from_view: Array, size: tuple[int, int]) -> Array:
+def _changes_nothing(pixels_from_view: Array, pixels_size: tuple[int, int], view_size: tuple[int, int]) -> bool:
+    """Whether a homography between two images is the identity."""
+    same_size = pixels_size == view_size
+    return same_size and bool(np.abs(pixels_from_view / pixels_from_view[2, 2] - np.eye(3)).max() < 1e-6)
+
+
+def _warp(pixels: Array, pixels_from_view: Array, size: tuple[int, int]) -> Array:
     """Image of ``size`` whose pixel p shows ``pixels`` at the homography's ``pixels_from_view`` p."""
-    same_size = size == (pixels.shape[1], pixels.shape[0])
-    if same_size and np.abs(pixels_from_view / pixels_from_view[2, 2] - np.eye(3)).max() < 1e-6:
-        return pixels
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpPerspective(pixels, pixels_from_view, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
