@@ -1,6 +1,6 @@
 """What serving costs over the bare model, and how it behaves below and beyond its limit.
 
-    python benchmarks/serving.py [--json] [--seconds 6] [--rounds 3] [--peers]
+    python benchmarks/serving.py [--json] [--seconds 6] [--rounds 9] [--peers]
 
 Everything is measured on this machine, over the loopback: 640x480 JPEGs, the paper's network, a real ``curio-serve``
 process, and a load generator in a process of its own.
@@ -75,8 +75,9 @@ class Arguments:
     """Print one JSON object on the last line instead of a table."""
     seconds: float = 6.0
     """Length of each measurement."""
-    rounds: int = 3
-    """How often bare loop and server are measured in turn."""
+    rounds: int = 9
+    """How often bare loop and server are measured in turn, a third as long each: what neighbours on the machine do
+    changes within seconds."""
     peers: bool = False
     """Put the same load on other servers too; installs them into the user's cache folder the first time."""
 
@@ -108,19 +109,18 @@ def cost(models: Path, frames: list[bytes], arguments: Arguments) -> dict[str, A
         running_server(models, cores) as (address, pid),
         plain_server(models / MODEL, len(cores)) as (plain_address, plain_pid),
         worker(cores) as load,
+        worker(cores) as bare,
     ):
         target, plain = pose_target(address, frames, pid), pose_target(plain_address, frames, plain_pid)
         for warm in (target, plain):
             load(closed_loop, warm, 4, _WARM_UP_S)
         alone = load(closed_loop, target, 1, arguments.seconds)
-        with worker(cores) as bare:
-            bare_alone = bare(bare_latencies_ms, models / MODEL, frames, math.inf, arguments.seconds)
+        bare_alone = bare(bare_latencies_ms, models / MODEL, frames, math.inf, arguments.seconds)
         for _ in range(arguments.rounds):
-            with worker(cores) as bare:
-                raw_ms.append(bare(bare_cpu_ms, models / MODEL, frames, len(cores), arguments.seconds))
+            raw_ms.append(bare(bare_cpu_ms, models / MODEL, frames, len(cores), arguments.seconds / 3))
             for figures, server in ((served_ms, target), (plain_ms, plain)):
                 before_s = sum(map(cpu_s, server.processes))
-                served = load(closed_loop, server, 4, arguments.seconds)
+                served = load(closed_loop, server, 4, arguments.seconds / 3)
                 figures.append(1000 * (sum(map(cpu_s, server.processes)) - before_s) / served["codes"]["OK"])
         rss_mb, peak_rss_mb = memory_mb(pid)
     return {

@@ -174,23 +174,25 @@ class PoseService(PoseDetectorServicer):
         begun = time.perf_counter()
         limits = self._limits
         camera = wire.camera_from_message(request.camera) if request.HasField("camera") else None
+        regions = list(map(wire.region_from_message, request.regions))
+        min_confidence = request.min_confidence if request.HasField("min_confidence") else limits.min_confidence
         frame, camera = _decode(request, camera, detectors, limits)
         decoded = time.perf_counter()
-        regions = list(map(wire.region_from_message, request.regions))
-        answer = messages.DetectResponse(
-            request_id=request.request_id or new_request_id(), width=frame.width, height=frame.height
-        )
+        answer = messages.DetectResponse()
         for detector in detectors:
             detector.detect(
                 frame.pixels,
                 camera,
                 regions=regions,
-                min_confidence=request.min_confidence if request.HasField("min_confidence") else limits.min_confidence,
+                min_confidence=min_confidence,
                 max_detections=request.max_detections or None,
                 reduction=frame.reduction,
                 results=answer.results,
             )
         inferred = time.perf_counter()
+        # Only now: what writes messages has gone cold by the time that a network has run.
+        answer.request_id = request.request_id or new_request_id()
+        answer.width, answer.height = frame.width, frame.height
         spent = answer.milliseconds
         spent.queue, spent.decode, spent.inference = waited_s * 1e3, (decoded - begun) * 1e3, (inferred - decoded) * 1e3
         self._metrics.phases.observe(waited_s, decoded - begun, inferred - decoded)
@@ -198,20 +200,18 @@ class PoseService(PoseDetectorServicer):
 
     def _detectors(self, request: messages.DetectRequest) -> list[Detector]:
         """The models that a request names; refuses what can be refused without work."""
-        limits = self._limits
-        if not 1 <= len(request.models) <= limits.max_models:
+        limits, models, num_regions = self._limits, request.models, len(request.regions)
+        if not 1 <= len(models) <= limits.max_models:
+            raise ArgumentError(f"models names {len(models)} models; expected 1 to {limits.max_models} (--max-models)")
+        if num_regions > limits.max_regions:
             raise ArgumentError(
-                f"models names {len(request.models)} models; expected 1 to {limits.max_models} (--max-models)"
-            )
-        if len(request.regions) > limits.max_regions:
-            raise ArgumentError(
-                f"regions has {len(request.regions)} entries; at most {limits.max_regions} are accepted (--max-regions)"
+                f"regions has {num_regions} entries; at most {limits.max_regions} are accepted (--max-regions)"
             )
         if len(request.request_id) > _MAX_ID_LENGTH:
             raise ArgumentError(f"request_id has {len(request.request_id)} characters; at most {_MAX_ID_LENGTH}")
         if request.HasField("max_detections") and not request.max_detections:
             raise ArgumentError("max_detections is 0; leave it out for no limit, or give at least 1")
-        return [Detector(self._repository.get(model.name, model.version)) for model in request.models]
+        return [Detector(self._repository.get(model.name, model.version)) for model in models]
 
 
 def new_request_id() -> str:

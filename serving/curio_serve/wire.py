@@ -64,15 +64,17 @@ def camera_from_message(message: CameraMessage) -> PinholeCamera:
     Raises:
         CameraError: Not nine values, or an impossible camera.
     """
-    return _camera(tuple(message.camera_matrix), tuple(message.distortion))
+    return _camera(message.SerializeToString())
 
 
 @lru_cache(256)
-def _camera(values: tuple[float, ...], distortion: tuple[float, ...]) -> PinholeCamera:
-    """One camera sends many frames, so its intrinsics are checked once."""
+def _camera(data: bytes) -> PinholeCamera:
+    """One camera sends many frames, so its intrinsics are read and checked once."""
+    message = CameraMessage.FromString(data)
+    values = message.camera_matrix
     if len(values) != 9:
         raise CameraError(f"camera.camera_matrix has {len(values)} values; expected 9: K row after row")
-    return PinholeCamera(np.reshape(values, (3, 3)), distortion)
+    return PinholeCamera(np.reshape(values, (3, 3)), tuple(message.distortion))
 
 
 def region_from_message(message: RegionMessage) -> Region:
