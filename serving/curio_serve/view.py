@@ -36,6 +36,7 @@ from curio_serve.rotation import smallest_rotation
 
 Array = np.ndarray
 _MIN_RAY_DEPTH = 0.05  # cosine to the optical axis: 87 degrees
+_MAX_AIMS = 32  # where a camera distorts, each holds two numbers a pixel
 
 
 class Region(NamedTuple):
@@ -85,9 +86,13 @@ class CanonicalCamera:
 
     def for_frame(self, width: int, height: int) -> PinholeCamera | None:
         """K* scaled to a frame's size, where the model allows that as a default."""
-        if self.matrix is None or not self.is_default:
-            return None
-        return PinholeCamera(scaling(width / self.width, height / self.height) @ self.matrix)
+        return _default_camera(self, width, height) if self.matrix is not None and self.is_default else None
+
+
+@lru_cache(_MAX_AIMS)
+def _default_camera(canonical: CanonicalCamera, width: int, height: int) -> PinholeCamera:
+    """Kept, so that it is one camera that sends many frames."""
+    return PinholeCamera(scaling(width / canonical.width, height / canonical.height) @ np.asarray(canonical.matrix))
 
 
 class View(ABC):
@@ -138,7 +143,7 @@ class _Aim:
         return pixels if self.homography is None else _warp(pixels, self.homography, size)
 
 
-@lru_cache(256)
+@lru_cache(_MAX_AIMS)
 def _aim(
     camera: PinholeCamera,
     canonical: CanonicalCamera,

@@ -1,5 +1,7 @@
 """The canonical camera: a scene seen by the frame's camera and by the model's agree, and poses come back."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from curio_serve.camera import PinholeCamera, scaling
@@ -81,6 +83,20 @@ def test_poses_come_back(region: Region) -> None:
     rotations = np.stack([np.eye(3), smallest_rotation(np.array([0, 0, 1.0]), np.array([0.6, 0, 0.8]))])
     for rotation in rotations:
         np.testing.assert_allclose(view.turn((turn @ rotation).tolist()), rotation.ravel(), atol=1e-12)
+
+
+@pytest.mark.parametrize("distortion", [(), DISTORTION])
+def test_one_camera_looks_as_a_new_one_does(distortion: tuple[float, ...]) -> None:
+    """What is kept of a camera belongs to that size, region and model alone."""
+    camera, random = PinholeCamera(K, distortion), np.random.default_rng(2)
+    large = CanonicalCamera(160, 120, scaling(1.25, 1.25) @ np.asarray(CANONICAL.matrix))
+    frames = [(random.integers(0, 255, (480 // r, 640 // r, 3)).astype(np.uint8), r) for r in (1, 2, 1)]
+    regions = [Region(0, 0, 640, 480), Region(400, 100, 150, 120)]
+    for (pixels, reduction), region, canonical in product(frames, regions, (CANONICAL, large)):
+        kept = PinholeFrame(pixels, camera, canonical, reduction).look(region)
+        new = PinholeFrame(pixels, PinholeCamera(K, distortion), canonical, reduction).look(region)
+        np.testing.assert_array_equal(kept.image, new.image)
+        np.testing.assert_array_equal(kept.canonical_from_cam, new.canonical_from_cam)
 
 
 def test_a_region_brings_its_centre_to_the_middle() -> None:
