@@ -89,7 +89,7 @@ def bare_latencies_ms(model_folder: Path, frames: list[bytes], rate: float, seco
         one(frames[len(latencies_ms) % len(frames)])
         done = time.perf_counter()
         latencies_ms.append(1000 * (done - due))
-        due = max(due + 1 / rate, done if rate == math.inf else due)
+        due = done if rate == math.inf else due + 1 / rate
     return latencies_ms
 
 

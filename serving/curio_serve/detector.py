@@ -127,7 +127,7 @@ class Detector:
 
 
 def _check_arguments(pixels: Array, regions: Sequence[Region], min_confidence: float) -> None:
-    if pixels.dtype.char != "B" or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
         raise ImageError(f"pixels are {pixels.dtype} {pixels.shape}; expected uint8 RGB [height, width, 3]")
     if not 0 <= min_confidence <= 1:
         raise ArgumentError(f"min_confidence is {min_confidence}; expected 0 to 1")
