@@ -19,7 +19,7 @@ from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
 from curio_serve.telemetry import Metrics
 
 _PROMISE_S = 1.0
-# How much longer a call is taken to wait than the mean says. Without it a quarter or more of the calls that are
+# How much longer a call is taken to wait than the mean says. Without it a fifth or more of the calls that are
 # answered come late; more only makes a queue shorter that need not be long to be never empty (docs/experiments.md).
 _MARGIN = 1.5
 _IS_FULL = "which is the limit (--workers, --queue)"
