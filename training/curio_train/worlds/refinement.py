@@ -135,7 +135,7 @@ class Refinement:
         start = view.scene(code)
         moves = Moves.none(len(images))
         rates = [_LEARNING_RATES[name] for name in vars(moves)]
-        optimizer, schedule = _descent([[value] for value in vars(moves).values()], rates, number)
+        optimizer, schedule = _descent(list(vars(moves).values()), rates, number)
         response = self._response(view, start)
         for _ in range(_STEPS):
             optimizer.zero_grad()
@@ -165,7 +165,7 @@ class Refinement:
             view = self._view(images, start, margin_px).blurred(times)
             response = self._response(view, view.scene(start))
             moves = [move.clone().requires_grad_() for move in moves]
-            optimizer, schedule = _descent([[move] for move in moves], _COMMON_RATES, number)
+            optimizer, schedule = _descent(moves, _COMMON_RATES, number)
             for _ in range(_STEPS):
                 optimizer.zero_grad()
                 scene = view.scene(_evenly_lit(placed(*moves)))
@@ -277,10 +277,10 @@ class Refinement:
 
 
 def _descent(
-    parameters: Sequence[Sequence[Tensor]], rates: Sequence[float], number: int
+    parameters: Sequence[Tensor], rates: Sequence[float], number: int
 ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
     """One of the rounds' Adam; its rates fall over all rounds as a cosine."""
-    groups = [{"params": list(group), "lr": rate} for group, rate in zip(parameters, rates, strict=True)]
+    groups = [{"params": [value], "lr": rate} for value, rate in zip(parameters, rates, strict=True)]
     optimizer = torch.optim.Adam(groups, betas=_BETAS)
     done = [(number * _STEPS + step) / (len(_ROUNDS) * _STEPS) for step in range(_STEPS + 1)]
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: (1 + math.cos(math.pi * done[step])) / 2)
