@@ -10,10 +10,9 @@ from curio_train.camera import Intrinsics
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.data.shapes import chair
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
-from curio_train.metrics.poses import rotation_error_deg, symmetry_poses, translation_error_m
+from curio_train.metrics.poses import symmetry_poses
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.common_poses import Photographs, settled
 from curio_train.worlds.gaze import SYMMETRY_STEP, GazeWorld
 from curio_train.worlds.lessons import FEWEST_AGREED, Lessons
 from curio_train.worlds.linemod import LinemodGaze
@@ -98,34 +97,6 @@ def test_what_most_read_rightly_corrects_the_others(world: GazeWorld, truth: Sce
     assert degrees[chosen].max() < 5
     assert depth_m[chosen].median() < before_depth_m.median()
     assert set(code) == set(read)
-
-
-def in_one_scene(truth: SceneCode, frames: Tensor) -> tuple[Photographs, Pose]:
-    """The photographs, and the pose that they show."""
-    matrices = cameras(truth)
-    matrices[:, :3, 3] *= SCALE
-    first, shown = matrices[0], matrix_from_rotation_6d(truth[ROTATION_6D][0, 0]).double().numpy()
-    position_m = truth[TRANSLATION][0, 0].double().numpy() - first[:3, 3]
-    pose = Pose(first[:3, :3].T @ shown, first[:3, :3].T @ position_m)
-    return Photographs(frames, torch.from_numpy(matrices).float(), truth), pose
-
-
-def test_photographs_settle_a_pose_together(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
-    """It is off in all of them, each sees it from another side."""
-    photographs, pose = in_one_scene(truth, frames)
-    shift_m = np.array([0.02, -0.02, 0.02]) * MESH.diameter_m
-    off = Pose(Rotation.from_rotvec([0.03, -0.03, 0.03]).as_matrix() @ pose.rotation, pose.translation_m + shift_m)
-    found = settled(Refinement(world), photographs, off)
-    assert rotation_error_deg(off, pose) > 2.5
-    assert rotation_error_deg(found, pose) < 1
-    assert translation_error_m(found, pose) < translation_error_m(off, pose) / 3
-
-
-@pytest.mark.parametrize("num", [0, 3])
-def test_too_few_photographs_settle_nothing(world: GazeWorld, truth: SceneCode, frames: Tensor, num: int) -> None:
-    photographs, pose = in_one_scene(truth, frames)
-    found = settled(Refinement(world), photographs.of(np.arange(num)), pose)
-    assert found is pose
 
 
 def test_metres_correct_what_an_object_is_read_too_far_by(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:

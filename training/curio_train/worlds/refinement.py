@@ -13,7 +13,7 @@ of the silhouette must be what the background alone does not explain. Else the e
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -57,7 +57,6 @@ class _Round(NamedTuple):
 _ROUNDS = (_Round(2, 2), _Round(1, 1), _Round(0, 1), _Round(0, 1))
 _STEPS = 12  # a round
 _LEARNING_RATES = {"across": 0.01, "log_depth": 0.015, "turn": 0.03, "light": 0.05}
-_COMMON_RATES = 0.03, 0.02  # of a turn and a shift that several pictures have in common
 _BETAS = (0.8, 0.95)  # of Adam: there are few steps
 LEAST_SEEN = 0.3
 """Of the silhouette: more in most renderings where the object is (0.5 to 0.9), less on nine of ten of clutter alone."""
@@ -134,46 +133,19 @@ class Refinement:
         view = self._view(images, code, margin_px).blurred(times)
         start = view.scene(code)
         moves = Moves.none(len(images))
-        rates = [_LEARNING_RATES[name] for name in vars(moves)]
-        optimizer, schedule = _descent(list(vars(moves).values()), rates, number)
+        groups = [{"params": [value], "lr": _LEARNING_RATES[name]} for name, value in vars(moves).items()]
+        optimizer = torch.optim.Adam(groups, betas=_BETAS)
+        done = [(number * _STEPS + step) / (len(_ROUNDS) * _STEPS) for step in range(_STEPS + 1)]
+        rates = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: (1 + math.cos(math.pi * done[step])) / 2)
         response = self._response(view, start)
         for _ in range(_STEPS):
             optimizer.zero_grad()
             scene = start.moved(moves, self.diameter_m)
             view.share(view.missed(self._rendered(view, scene, response))).sum().backward()
             optimizer.step()
-            schedule.step()
+            rates.step()
         with torch.no_grad():
             return view.code(start.moved(moves, self.diameter_m))
-
-    @torch.enable_grad()
-    def in_common(
-        self, images: Tensor, placed: Callable[[Tensor, Tensor], SceneCode]
-    ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-        """One move of an object that several pictures show, after which they miss least together.
-
-        Args:
-            images: uint8 sRGB [num, 3, height, width].
-            placed: What they show after a rotation vector [3] and a shift [3] in diameters; differentiable.
-
-        Returns:
-            That rotation vector and that shift.
-        """
-        moves = [torch.zeros(3), torch.zeros(3)]
-        for number, (times, margin_px) in enumerate(_ROUNDS):
-            start = _evenly_lit(placed(*moves))
-            view = self._view(images, start, margin_px).blurred(times)
-            response = self._response(view, view.scene(start))
-            moves = [move.clone().requires_grad_() for move in moves]
-            optimizer, schedule = _descent(moves, _COMMON_RATES, number)
-            for _ in range(_STEPS):
-                optimizer.zero_grad()
-                scene = view.scene(_evenly_lit(placed(*moves)))
-                view.share(view.missed(self._rendered(view, scene, response))).mean().backward()
-                optimizer.step()
-                schedule.step()
-            moves = [move.detach() for move in moves]
-        return moves[0], moves[1]
 
     @torch.no_grad()
     def explained(self, images: Tensor, code: SceneCode) -> Float[Tensor, " batch"]:
@@ -183,7 +155,8 @@ class Refinement:
         """
         shares = []
         for first in range(0, len(images), _AT_ONCE):
-            part = _evenly_lit({name: value[first : first + _AT_ONCE] for name, value in code.items()})
+            part = {name: value[first : first + _AT_ONCE] for name, value in code.items()}
+            part[LIGHT] = part[LIGHT].new_tensor(_EVEN_LIGHT).expand_as(part[LIGHT])
             view = self._view(images[first : first + _AT_ONCE], part, _ROUNDS[0].margin_px).blurred(1)
             scene = view.scene(part)
             missed = view.missed(self._rendered(view, scene, self._response(view, scene)))
@@ -274,18 +247,3 @@ class Refinement:
         near &= (across < LARGEST_SHIFT) & (log_depth.abs() < LARGEST_LOG_DEPTH)
         near &= view.explained(missed[1]) > LEAST_SEEN * silhouette.sum((1, 2, 3))
         return near & (view.share(missed[1]) < view.share(missed[0]))
-
-
-def _descent(
-    parameters: Sequence[Tensor], rates: Sequence[float], number: int
-) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-    """One of the rounds' Adam; its rates fall over all rounds as a cosine."""
-    groups = [{"params": [value], "lr": rate} for value, rate in zip(parameters, rates, strict=True)]
-    optimizer = torch.optim.Adam(groups, betas=_BETAS)
-    done = [(number * _STEPS + step) / (len(_ROUNDS) * _STEPS) for step in range(_STEPS + 1)]
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: (1 + math.cos(math.pi * done[step])) / 2)
-    return optimizer, schedule
-
-
-def _evenly_lit(code: SceneCode) -> dict[str, Tensor]:
-    return dict(code) | {LIGHT: code[LIGHT].new_tensor(_EVEN_LIGHT).expand_as(code[LIGHT])}

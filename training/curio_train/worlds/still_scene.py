@@ -20,9 +20,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from curio_train.geometry import Pose, matrix_from_rotation_6d
+from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode
-from curio_train.worlds.common_poses import Photographs, settled
 from curio_train.worlds.refinement import LEAST_SEEN, Refinement
 
 _FEWEST = 3  # photographs that a pose is agreed on by
@@ -89,12 +88,10 @@ class _Scene(NamedTuple):
         rotation = np.einsum("nji,njk->nik", turn, readings.rotation)
         return rotation, np.einsum("nji,nj->ni", turn, readings.translation_m - self.scale * shift)
 
-    @property
-    def in_metres(self) -> np.ndarray:
-        """Cameras, [num, 4, 4]."""
-        matrices = self.cam_from_world.copy()
-        matrices[:, :3, 3] *= self.scale
-        return matrices
+    def seen_from(self, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations and positions, metres, in each camera's frame."""
+        turn, shift = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
+        return turn @ pose.rotation, turn @ pose.translation_m + self.scale * shift
 
 
 def agreed(
@@ -132,13 +129,8 @@ def agreed(
     level = [r._replace(translation_m=r.translation_m * scale / s) for r, s in pairs if s is not None]
     every = _Readings(*(np.concatenate(values) for values in zip(*level, strict=True)))
     scene = _Scene(_without_gaps(cameras), known, scale)
-    photographs = Photographs(frames, torch.from_numpy(scene.in_metres).float(), read)
-    poses = []
-    for pose in _clusters(scene, every, refine.diameter_m, turns):
-        position_m = photographs.showing_pose(pose)[TRANSLATION][:, 0].double().numpy()
-        seen = np.flatnonzero(known & refine.in_view(position_m))
-        poses.append(settled(refine, photographs.of(seen), pose))
-    return _looked_for(refine, photographs, known, poses, better, turns)
+    poses = _clusters(scene, every, refine.diameter_m, turns)
+    return _looked_for(refine, frames, scene, poses, read, better, turns)
 
 
 def told_scale(cameras: Cameras, code: SceneCode, taken: Bool[Tensor, " num"], diameter_m: float) -> float | None:
@@ -243,9 +235,10 @@ def _mean(rotations: np.ndarray, positions: np.ndarray, spread: np.ndarray, turn
 
 def _looked_for(
     refine: Refinement,
-    photographs: Photographs,
-    known: np.ndarray,
-    poses: Sequence[Pose],
+    frames: Tensor,
+    scene: _Scene,
+    poses: list[Pose],
+    read: SceneCode,
     better: SceneCode,
     turns: np.ndarray,
 ) -> tuple[dict[str, Tensor], Tensor]:
@@ -254,27 +247,33 @@ def _looked_for(
     Where the photograph's own reading explains something, the pose is to lie there, too, and to explain nearly as much;
     where it is turned otherwise, more.
     """
-    frames = photographs.frames
     own = refine.explained(frames, better).numpy()
-    best, code = np.zeros(len(frames)), {name: value.clone() for name, value in photographs.code.items()}
+    best, code = np.zeros(len(frames)), {name: value.clone() for name, value in read.items()}
     _, read_rotation, read_m = _readings(better, np.ones(len(frames), dtype=bool))
     for pose in poses:
-        placed = photographs.showing_pose(pose)
-        _, rotation, translation_m = _readings(placed, np.ones(len(frames), dtype=bool))
+        rotation, translation_m = scene.seen_from(pose)
         turned = _angles_deg(rotation, read_rotation, turns)[0] > 2 * _LARGEST_TURN_DEG
         apart = np.linalg.norm(translation_m[:, :2] - read_m[:, :2] * (translation_m[:, 2:] / read_m[:, 2:]), axis=1)
         elsewhere = (own > _CREDIBLE) & (apart > _CONTRADICTION * refine.diameter_m)
         least = np.maximum(LEAST_SEEN, np.where(turned, own, own - _WEAKER))
-        chosen = torch.from_numpy(np.flatnonzero(known & refine.in_view(translation_m) & ~elsewhere))
+        chosen = torch.from_numpy(np.flatnonzero(scene.known & refine.in_view(translation_m) & ~elsewhere))
         if len(chosen) == 0:
             continue
-        explained = np.zeros(len(frames))
+        placed, explained = _placed(read, rotation, translation_m), np.zeros(len(frames))
         parts = {name: value[chosen] for name, value in placed.items()}
         explained[chosen.numpy()] = refine.explained(frames[chosen], parts).numpy()
         wins = torch.from_numpy(explained > np.maximum(best, least))
         best = np.where(wins.numpy(), explained, best)
         code = {name: torch.where(_like(wins, value), placed[name], value) for name, value in code.items()}
     return code, torch.from_numpy(best > 0)
+
+
+def _placed(code: SceneCode, rotation: np.ndarray, translation_m: np.ndarray) -> dict[str, Tensor]:
+    pose = {
+        TRANSLATION: torch.from_numpy(translation_m).float()[:, None],
+        ROTATION_6D: rotation_6d_from_matrix(torch.from_numpy(rotation).float())[:, None],
+    }
+    return dict(code) | pose
 
 
 def _like(chosen: Tensor, value: Tensor) -> Tensor:
