@@ -204,6 +204,8 @@ def test_networks_that_saw_real_frames_are_a_row_of_their_own(
     (tmp_path / "with" / "config.json").write_text(json.dumps(written))
     methods = {candidate.path.name: candidate.method for candidate in candidates(tmp_path)}
     assert methods == {"with": "noncur, self-trained", "without": "noncur"}
+    with pytest.raises(UsageError, match=r"--objects .*: found with and without, both ape; expected one of each"):
+        candidates(tmp_path, "--objects", of_any_method=False)
 
 
 @pytest.mark.parametrize("content", ["{", '{"sleep": {"ape": {"rendered": {}}}}', "[1]"])

@@ -53,24 +53,30 @@ class Candidate:
     weights_sha256: str
 
 
-def candidates(folder: Path) -> list[Candidate]:
+def candidates(folder: Path, flag: str = "--runs", *, of_any_method: bool = True) -> list[Candidate]:
     """The LineMOD runs and models in a folder, or the one that it is.
 
+    Args:
+        folder: Where they lie.
+        flag: That named it, for messages.
+        of_any_method: A class may be there once a method; else once.
+
     Raises:
-        UsageError: There is none, or there are several of one class and method.
+        UsageError: There is none, or there are several of one kind.
         CheckpointError: A run is damaged or has no checkpoint.
         ExportError: A model is damaged.
     """
     found = list(_found(folder))
     if not found:
-        raise UsageError(f"--runs {folder}: found no run folder and no model of linemod; expected one a class")
-    first: dict[tuple[str, str], Candidate] = {}
+        raise UsageError(f"{flag} {folder}: found no run folder and no model of linemod; expected one a class")
+    first: dict[str, Candidate] = {}
     for one in found:
-        other = first.setdefault((one.method, one.name), one)
+        kind = f"{one.name} by {one.method}" if of_any_method else one.name
+        other = first.setdefault(kind, one)
         if other is not one:
+            expected = "one run a class and method" if of_any_method else "one of each object"
             raise UsageError(
-                f"--runs {folder}: found {other.path.name} and {one.path.name}, both {one.name} by {one.method}; "
-                "expected one run a class and method"
+                f"{flag} {folder}: found {other.path.name} and {one.path.name}, both {kind}; expected {expected}"
             )
     return found
 

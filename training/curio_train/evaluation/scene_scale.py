@@ -43,12 +43,12 @@ def scale_by_objects(
         The same in metres, and a line about how well the objects agree.
 
     Raises:
-        UsageError: No model there, or one that cannot be used for this.
+        UsageError: No model there, two of one object, or one that cannot be used for this.
         ExportError: A model is broken.
         DataError: A photograph or the data cannot be read, or no object tells a scale.
     """
     told = {}
-    for candidate in candidates(models):
+    for candidate in candidates(models, "--objects", of_any_method=False):
         scale = _told_by(candidate.path, data, structure)
         tell(f"{candidate.name}: {'seen too seldom to tell' if scale is None else f'{scale:.4g} m a unit'}")
         if scale is not None:
