@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from curio_train import cli
+from curio_train.camera import Intrinsics
 from curio_train.capture.structure import Structure
 from curio_train.data.bop import BopDataset
 from curio_train.errors import DataError, UsageError
@@ -21,6 +22,17 @@ def test_objects_count_alike_and_say_how_far_they_differ() -> None:
     assert scale == pytest.approx(0.2)
     assert "ape +3.0 %, cat -1.0 %, duck -2.0 %; the mean is good to 1.5 %" in line
     assert mean_scale({"ape": 0.2}) == (pytest.approx(0.2), "scale by each object beside their mean: ape +0.0 %")
+
+
+def test_two_networks_of_one_object_are_refused(tmp_path: Path) -> None:
+    """Neither is to count silently, and nothing is read before."""
+    for name in ("first", "second"):
+        (tmp_path / name).symlink_to(MODELS / "cat")
+    nothing = Structure((), np.zeros((0, 4, 4)), Intrinsics(np.eye(3), 640, 480), np.zeros((0, 3)), 0.5)
+    with pytest.raises(
+        UsageError, match=r"^--objects .*: found first and second, both cat; expected one of each"
+    ):
+        scale_by_objects(nothing, tmp_path, None, pytest.fail)
 
 
 def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, str]:
