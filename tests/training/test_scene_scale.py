@@ -29,9 +29,7 @@ def test_two_networks_of_one_object_are_refused(tmp_path: Path) -> None:
     for name in ("first", "second"):
         (tmp_path / name).symlink_to(MODELS / "cat")
     nothing = Structure((), np.zeros((0, 4, 4)), Intrinsics(np.eye(3), 640, 480), np.zeros((0, 3)), 0.5)
-    with pytest.raises(
-        UsageError, match=r"^--objects .*: found first and second, both cat; expected one of each"
-    ):
+    with pytest.raises(UsageError, match=r"^--objects .*: found first and second, both cat; expected one of each"):
         scale_by_objects(nothing, tmp_path, None, pytest.fail)
 
 
