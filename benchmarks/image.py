@@ -4,7 +4,7 @@
 
 install_mb        of ``deploy/install.sh`` into an empty folder: all the image has over its base
 parts_mb          its largest packages
-image_mb          with the base image's BASE_MB, which is not measured here: no registry is asked
+image_mb          with the base image's BASE_MB, which is not measured here (container.py builds it)
 starts_read_only  the installed server serves a model from there, and not one file of the folder changes by it
 """
 

@@ -14,6 +14,8 @@ find "$site" -depth -type d \( -name tests -o -name include -o -name __pycache__
 find "$site" -type f \( -name '*.pyi' -o -name '*.a' \) -delete
 # What onnxruntime brings for making models, not for running them.
 rm -rf "$site"/onnxruntime/{transformers,quantization,tools,datasets}
+# A second copy of the runtime, for programs in C++; Python's extension has it all within itself.
+rm -f "$site"/onnxruntime/capi/libonnxruntime.so.*
 # Byte code now: the image's root cannot be written to later.
 "$prefix/bin/python" -m compileall -q "$site" > /dev/null || true
 "$prefix/bin/curio-serve" --help > /dev/null

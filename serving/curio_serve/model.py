@@ -5,6 +5,7 @@ The only file that imports onnxruntime, and that when a model is loaded.
 
 import hashlib
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -160,6 +161,9 @@ def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAUL
 
 def _open(data: bytes, path: Path, providers: Sequence[str]) -> "onnxruntime.InferenceSession":
     """One thread a call: parallel calls share the session, which holds the weights once."""
+    # Before the import: unless told not to, onnxruntime from 1.29 on writes an identifier into the user's cache folder
+    # and sends names and hashes of models to its makers (its Privacy.md).
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     import onnxruntime
 
     missing = set(providers) - set(onnxruntime.get_available_providers())

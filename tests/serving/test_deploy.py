@@ -1,4 +1,4 @@
-"""What deploy/ promises, as far as it can be held to it without a container engine."""
+"""What deploy/ promises, held to it without a container engine (with one: benchmarks/container.py)."""
 
 import json
 import re

@@ -1,6 +1,7 @@
 """ONNX files: a torch module written as one, and one run by onnxruntime."""
 
 import logging
+import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -9,12 +10,10 @@ from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 from google.protobuf import json_format
 from onnx import TensorProto, helper, numpy_helper
-from onnxruntime.capi import onnxruntime_pybind11_state as runtime
 from torch import Tensor, nn
 
 from curio_train.errors import ExportError
@@ -24,7 +23,6 @@ SPEC_KEY = "curio.model_spec"
 SCHEMA_VERSION = 1
 OPSET = 18
 _SMALLEST_HALF = 256  # values; below, a Cast costs more than it saves
-_RUNTIME_ERRORS = (runtime.Fail, runtime.InvalidArgument, runtime.InvalidGraph, runtime.InvalidProtobuf)
 
 
 def to_onnx(network: nn.Module, width: int, height: int, outputs: Sequence[str]) -> onnx.ModelProto:
@@ -125,11 +123,16 @@ class OnnxModel:
         Raises:
             ExportError: Not an exported model, or one that onnxruntime refuses.
         """
+        # Before the import: unless told not to, onnxruntime from 1.29 on writes an identifier into the user's cache
+        # folder and sends names and hashes of models to its makers (its Privacy.md).
+        os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+        import onnxruntime
+
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
         try:
             self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        except _RUNTIME_ERRORS as exc:
+        except _runtime_errors() as exc:
             raise ExportError(f"{where}: onnxruntime refuses the graph ({exc}); export it again") from exc
         self.spec = _read_spec(self._session.get_modelmeta().custom_metadata_map, where)
         self._where = where
@@ -158,9 +161,16 @@ class OnnxModel:
         names = [output.name for output in self._session.get_outputs()]
         try:
             values = self._session.run(names, {INPUT: images})
-        except _RUNTIME_ERRORS as exc:
+        except _runtime_errors() as exc:
             raise ExportError(f"{self._where}: onnxruntime failed on {images.shape} images ({exc})") from exc
         return {name: torch.from_numpy(value) for name, value in zip(names, values, strict=True)}
+
+
+def _runtime_errors() -> tuple[type[Exception], ...]:
+    """Onnxruntime's exceptions, which share no base."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as runtime
+
+    return (runtime.Fail, runtime.InvalidArgument, runtime.InvalidGraph, runtime.InvalidProtobuf)
 
 
 def _read_spec(metadata: Mapping[str, str], where: str) -> ModelSpec:
