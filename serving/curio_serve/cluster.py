@@ -10,17 +10,15 @@ import socket
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeAlias
 
 import cv2
 
 from curio_serve.errors import CurioError, Unavailable, UsageError
 from curio_serve.sources import SourceImage
-from curio_serve.writers import ImageResult
+from curio_serve.writers import ImageLines
 
-if TYPE_CHECKING:
-    from curio_serve.estimators import Estimator
-
+Opening: TypeAlias = Callable[[], Callable[[SourceImage], ImageLines]]
 # One data set after another, so that memory does not depend on the number of images; large, because each starts actors.
 _IMAGES_A_DATA_SET = 1 << 16
 _IMAGES_A_BLOCK = 64
@@ -30,32 +28,32 @@ _REACH_TIMEOUT_S = 10.0
 class _Worker:
     """A Ray actor: the model is opened once, where it runs."""
 
-    def __init__(self, open_estimator: "Callable[[], Estimator]") -> None:
+    def __init__(self, open_answering: Opening) -> None:
         cv2.setNumThreads(1)
-        self._estimator = open_estimator()
+        self._answer = open_answering()
 
     def __call__(self, row: dict[str, Any]) -> dict[str, bytes]:
         try:
-            return {"answer": pickle.dumps(self._estimator(pickle.loads(row["image"])))}
+            return {"answer": pickle.dumps(self._answer(pickle.loads(row["image"])))}
         except CurioError as exc:  # raised again on this side, as what it is
             return {"answer": pickle.dumps(exc)}
 
 
 def over_cluster(
-    address: str, open_estimator: "Callable[[], Estimator]", images: Iterable[SourceImage]
-) -> Generator[ImageResult, None, None]:
+    address: str, open_answering: Opening, images: Iterable[SourceImage]
+) -> Generator[ImageLines, None, None]:
     """The answers in the order of the images.
 
     Args:
         address: ``local`` for a cluster of this machine alone, ``auto`` for the one this machine is part of, or
             ``HOST:PORT``.
-        open_estimator: Called on the nodes.
+        open_answering: Called on the nodes.
         images: May be endless; taken in large portions.
 
     Raises:
         UsageError: Ray is not installed.
         Unavailable: The cluster is out of reach or broke down.
-        CurioError: What an estimator raised.
+        CurioError: What was raised there.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
@@ -74,7 +72,7 @@ def over_cluster(
         context.enable_progress_bars = False
         remaining = iter(images)
         while portion := list(islice(remaining, _IMAGES_A_DATA_SET)):
-            yield from _answers(ray, open_estimator, portion)
+            yield from _answers(ray, open_answering, portion)
     except ray.exceptions.RayError as exc:
         raise Unavailable(f"--ray {address}: the cluster broke down: {exc}") from exc
     finally:
@@ -93,14 +91,14 @@ def _check_reachable(address: str) -> None:
         socket.create_connection((host, int(port)), timeout=_REACH_TIMEOUT_S).close()
 
 
-def _answers(ray: Any, open_estimator: "Callable[[], Estimator]", portion: list[SourceImage]) -> Iterator[ImageResult]:
+def _answers(ray: Any, open_answering: Opening, portion: list[SourceImage]) -> Iterator[ImageLines]:
     num_blocks = max(1, len(portion) // _IMAGES_A_BLOCK)
     # other nodes have another working folder
     rows = [{"image": pickle.dumps(replace(image, path=os.path.abspath(image.path)))} for image in portion]
     num_actors = max(1, int(ray.cluster_resources().get("CPU", 1)))
     answered = ray.data.from_items(rows, override_num_blocks=num_blocks).map(
         _Worker,
-        fn_constructor_args=(open_estimator,),
+        fn_constructor_args=(open_answering,),
         compute=ray.data.ActorPoolStrategy(min_size=1, max_size=num_actors),
     )
     for row in answered.iter_rows():

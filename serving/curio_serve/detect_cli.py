@@ -17,11 +17,14 @@ from curio_serve.arguments import parse
 from curio_serve.errors import CameraError, CurioError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from curio_proto.v1.model_spec_pb2 import ModelSpec
 
     from curio_serve.client import PoseClient
     from curio_serve.estimators import Estimator, Settings
-    from curio_serve.writers import ResultFormat
+    from curio_serve.sources import SourceImage
+    from curio_serve.writers import ImageLines, ResultFormat
 
 _SERVED_MODEL = re.compile(r"(?P<address>(?:\[[^\]]+\]|[^/:\[\]]+):\d{1,5})/(?P<model>[^/]+(?:/\d+)?)")
 
@@ -119,11 +122,11 @@ def run(arguments: DetectArguments) -> int:
     with ResultFile(arguments.out, form, model, overwrite=arguments.overwrite) as output:
         remaining = output.unanswered(images(arguments.images))
         if arguments.ray is None:
-            results = in_order(estimator, remaining, arguments.jobs)
+            results = in_order(partial(_answer, estimator, form), remaining, arguments.jobs)
         else:  # other nodes have another working folder
             is_path = os.path.exists(arguments.model)
             there = replace(arguments, model=os.path.abspath(arguments.model)) if is_path else arguments
-            results = over_cluster(arguments.ray, partial(_estimator, there, settings), remaining)
+            results = over_cluster(arguments.ray, partial(_answering, there, settings), remaining)
         with (
             closing(results),
             Progress(output.num_images, output.num_errors, is_shown=arguments.out is not None) as progress,
@@ -201,6 +204,17 @@ def _estimator(arguments: DetectArguments, settings: "Settings") -> "Estimator":
             "curio-export wrote, such as models/ape"
         )
     return RemoteEstimator(_client(arguments, served["address"]), served["model"], settings)
+
+
+def _answering(arguments: DetectArguments, settings: "Settings") -> "Callable[[SourceImage], ImageLines]":
+    """What answers images in another process."""
+    estimator = _estimator(arguments, settings)
+    return partial(_answer, estimator, _format(arguments, estimator.spec))
+
+
+def _answer(estimator: "Estimator", form: "ResultFormat", image: "SourceImage") -> "ImageLines":
+    """What is written of an image. One thread that made the lines of all images would keep the others waiting."""
+    return form.lines(estimator(image))
 
 
 def _client(arguments: DetectArguments, address: str) -> "PoseClient":

@@ -2,23 +2,14 @@
 
 import sys
 import time
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-from rich.console import Console
-from rich.progress import Progress as Bar
-from rich.progress import ProgressColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
-from rich.text import Text
+from curio_serve.writers import ImageLines
 
-from curio_serve.writers import ImageResult
+if TYPE_CHECKING:
+    from curio_serve.detect_bar import Bar
 
 _NUM_PROBLEMS_SHOWN = 20
-
-
-class _Rate(ProgressColumn):
-    """Images a second, of late."""
-
-    def render(self, task: Task) -> Text:
-        return Text(f"{task.speed or 0.0:.1f} images/s")
 
 
 class Progress:
@@ -31,39 +22,29 @@ class Progress:
     """
 
     def __init__(self, num_before: int, num_errors_before: int, *, is_shown: bool) -> None:
-        console = Console(stderr=True)
-        self._bar = Bar(
-            SpinnerColumn(),
-            TextColumn("{task.completed} images"),
-            _Rate(),
-            TextColumn("{task.fields[num_errors]} without an answer"),
-            TimeElapsedColumn(),
-            console=console,
-            disable=not (is_shown and console.is_terminal),
-        )
+        self._bar = _bar(num_before, num_errors_before) if is_shown and sys.stderr.isatty() else None
         self._num_before = num_before
         self._num_new = 0
         self._num_errors = num_errors_before
         self._problems: list[str] = []
-        self._task = self._bar.add_task("detect", total=None, completed=num_before, num_errors=num_errors_before)
         self._start_s = time.perf_counter()
 
     def __enter__(self) -> Self:
-        self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+        if self._bar is not None:
+            self._bar.stop()
 
-    def count(self, result: ImageResult) -> None:
+    def count(self, lines: ImageLines) -> None:
         """One more image."""
         self._num_new += 1
-        if result.error:
+        if lines.error:
             self._num_errors += 1
             if len(self._problems) < _NUM_PROBLEMS_SHOWN:
-                self._problems.append(f"{result.image}: {result.error}")
-        if not self._bar.disable:
-            self._bar.update(self._task, advance=1, num_errors=self._num_errors)
+                self._problems.append(f"{lines.image}: {lines.error}")
+        if self._bar is not None:
+            self._bar.advance(self._num_errors)
 
     def report(self, label: str) -> None:
         """Sums up, with the first problems of this run."""
@@ -78,6 +59,12 @@ class Progress:
             print(f"  {problem}", file=sys.stderr)
         if len(self._problems) < self._num_errors and self._problems:
             print(f"  ... and {self._num_errors - len(self._problems)} more", file=sys.stderr)
+
+
+def _bar(num_images: int, num_errors: int) -> "Bar":
+    from curio_serve.detect_bar import Bar
+
+    return Bar(num_images, num_errors)
 
 
 def _say(text: str) -> None:

@@ -122,7 +122,7 @@ class Estimator(ABC):
     def _camera(self, image: SourceImage) -> PinholeCamera | None:
         if self.canonical.matrix is None or self.settings.cameras is None:
             return None
-        return self.settings.cameras.camera_for(str(image.relative_name))
+        return self.settings.cameras.camera_for(image.relative_name)
 
     def _frame(
         self, image: SourceImage, data: bytes, header: Header | None = None, max_reduction: int = 1

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO, Protocol, TypeVar
 
 from curio_serve.errors import OutputError, UsageError
-from curio_serve.writers import ImageResult, Line, ResultFormat
+from curio_serve.writers import ImageLines, Line, ResultFormat
 
 
 class Named(Protocol):
@@ -87,16 +87,16 @@ class ResultFile:
             self._append(self._form.header)
         return images
 
-    def write(self, result: ImageResult) -> None:
+    def write(self, lines: ImageLines) -> None:
         """Appends one image.
 
         Raises:
             OutputError: The disk is full or the file cannot be written; its earlier lines stay valid.
             BrokenPipeError: Whoever read standard output has gone.
         """
-        self._append(self._form.encode(result))
+        self._append(lines.data)
         self.num_images += 1
-        self.num_errors += bool(result.error)
+        self.num_errors += bool(lines.error)
 
     def _append(self, data: bytes) -> None:
         rest = memoryview(data)

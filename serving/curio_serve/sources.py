@@ -61,11 +61,9 @@ class SourceImage:
             raise ImageError(f"cannot be read: {reason}") from exc
 
     @property
-    def relative_name(self) -> PurePath:
+    def relative_name(self) -> str:
         """The path in which a file of its own, such as a drawing, may be kept apart from all others'."""
-        if self.video_frame is None:
-            return PurePath(self.path)
-        return PurePath(self.path) / f"{self.video_frame:06d}.jpg"
+        return self.path if self.video_frame is None else os.path.join(self.path, f"{self.video_frame:06d}.jpg")
 
 
 def check_arguments(arguments: Sequence[str]) -> None:

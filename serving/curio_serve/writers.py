@@ -75,6 +75,21 @@ class ImageResult:
 
 
 @dataclass(frozen=True)
+class ImageLines:
+    """What a result file gets of one image.
+
+    Attributes:
+        image: Its path as given.
+        error: Why there is no answer.
+        data: The lines, each with its newline.
+    """
+
+    image: str
+    error: str
+    data: bytes
+
+
+@dataclass(frozen=True)
 class Line:
     """One line of an existing result file.
 
@@ -105,6 +120,10 @@ class ResultFormat(ABC):
     header: bytes = b""
     has_line_for_every_image: bool = True
     is_one_line_an_image: bool = False
+
+    def lines(self, result: ImageResult) -> ImageLines:
+        """What a file gets of an image."""
+        return ImageLines(result.image, result.error, self.encode(result))
 
     @abstractmethod
     def encode(self, result: ImageResult) -> bytes:

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -123,3 +124,17 @@ def test_errors_are_one_clear_line_and_the_right_status(models_dir: Path, frames
         assert done.stderr.startswith("curio-detect: error: ")
         assert done.stderr.count("\n") == 1
         assert done.stdout == ""
+
+
+def test_a_terminal_sees_how_far_it_is(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    ours, terminal = os.openpty()
+    out = tmp_path / "out.jsonl"
+    with subprocess.Popen(command(models_dir / "flat", frames, "--out", out), stderr=terminal) as process:
+        os.close(terminal)
+        shown = b""
+        with suppress(OSError), open(ours, "rb", buffering=0) as screen:  # it fails once the other side has gone
+            while part := screen.read(1 << 16):
+                shown += part
+        assert process.wait() == 0
+    assert f"{len(read(out))} images".encode() in shown
+    assert b"0 without an answer" in shown

@@ -46,7 +46,7 @@ def run(
         for count, image in enumerate(output.unanswered(iter(images))):
             if count == stop_after:
                 break
-            output.write(result(image))
+            output.write(form.lines(result(image)))
     return output
 
 
@@ -159,9 +159,10 @@ def test_a_pipe_is_written_through() -> None:
         "from pathlib import Path\n"
         "from curio_serve.result_file import ResultFile\n"
         "from curio_serve.writers import ImageResult, Csv\n"
-        "with ResultFile(None, Csv(), ('ape', 1)) as output:\n"
+        "form = Csv()\n"
+        "with ResultFile(None, form, ('ape', 1)) as output:\n"
         "    list(output.unanswered(iter([])))\n"
-        "    output.write(ImageResult('x.png', 'ape', 1, error='no'))\n"
+        "    output.write(form.lines(ImageResult('x.png', 'ape', 1, error='no')))\n"
     )
     done = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=True, env=os.environ)
     header, row = done.stdout.splitlines()

@@ -111,7 +111,7 @@ def test_a_video_gives_its_frames(clip: Path) -> None:
         assert frame.pixels is not None
         assert frame.pixels.shape == (48, 64, 3)
         assert abs(frame.pixels.mean() - 40 * i) < 4
-    assert frames[3].relative_name == clip / "000003.jpg"
+    assert frames[3].relative_name == str(clip / "000003.jpg")
 
 
 def test_a_video_that_is_none_gives_one_error(tmp_path: Path) -> None:
