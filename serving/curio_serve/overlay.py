@@ -36,7 +36,9 @@ _FARTHEST_PX = 1e6  # a corner just before the camera's plane projects to anywhe
 def draw(
     pixels: Pixels, results: Iterable[RegionResult], spec: ModelSpec, camera: PinholeCamera | None = None
 ) -> Pixels:
-    """A copy of the frame with every detection drawn on it.
+    """A copy of the frame with every detection drawn on it, but those whose confidence is 0 to two digits.
+
+    These are the slots of a model for several objects that it knows to be empty.
 
     Args:
         pixels: [height, width, 3] RGB.
@@ -52,6 +54,8 @@ def draw(
     stroke_px = max(1, round(min(canvas.shape[:2]) / 240))
     # the most confident last: on top
     for detection in sorted((d for result in results for d in result.detections), key=lambda d: d.confidence):
+        if round(detection.confidence, 2) == 0:
+            continue
         kind, color = objects.get(detection.object, (ObjectModel(), _PALETTE[0]))
         corners_px = np.array(detection.box_px, float).reshape(-1, 2)
         if camera is None:

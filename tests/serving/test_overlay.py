@@ -100,3 +100,12 @@ def test_an_object_the_spec_does_not_know_is_still_labelled() -> None:
     found = pose(TILTED, (0, 0, 0.6))
     found.detections[0].object = "stranger"
     assert draw(frame, [found], spec(), CAMERA).any()
+
+
+def test_a_slot_that_is_empty_to_two_digits_is_not_drawn() -> None:
+    frame = np.zeros((480, 640, 3), np.uint8)
+    found = pose(TILTED, (0, 0, 0.6))
+    found.detections[0].confidence = 0.004
+    assert not draw(frame, [found], spec(), CAMERA).any()
+    found.detections[0].confidence = 0.006
+    assert draw(frame, [found], spec(), CAMERA).any()
