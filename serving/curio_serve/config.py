@@ -158,7 +158,8 @@ def _environment_arguments(environment: Mapping[str, str]) -> list[str]:
         if not variable.startswith(ENV_PREFIX) or name in ("config", "dump_config"):
             continue
         if name not in known:
-            raise UsageError(f"environment variable {variable} is no setting; known are {sorted(known)}")
+            names = ", ".join(sorted(ENV_PREFIX + name.upper() for name in known))
+            raise UsageError(f"environment variable {variable} is no setting; known are {names}")
         value: Any = text
         if isinstance(getattr(ServeConfig, name), bool):
             if text.lower() not in ("true", "false", "1", "0"):

@@ -12,6 +12,8 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
+from curio_serve.config import read_config
+from curio_serve.errors import UsageError
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -41,6 +43,14 @@ def test_manifests_select_the_pods_of_the_deployment() -> None:
     assert _manifest("disruption")["spec"]["selector"]["matchLabels"] == pod
     assert _manifest("network")["spec"]["podSelector"]["matchLabels"] == pod
     assert _manifest("service")["spec"]["selector"] == pod
+
+
+def test_services_do_not_pass_for_settings(models_dir: Path) -> None:
+    pod = _manifest("deployment")["spec"]["template"]["spec"]
+    assert pod["enableServiceLinks"] is False
+    name = _manifest("service")["metadata"]["name"].upper().replace("-", "_")
+    with pytest.raises(UsageError, match="SERVICE_HOST is no setting"):  # what a link would do
+        read_config([str(models_dir)], {f"{name}_SERVICE_HOST": "10.0.0.1"})
 
 
 def test_what_the_image_and_compose_take_is_there() -> None:
