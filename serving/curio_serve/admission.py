@@ -5,14 +5,12 @@ interpreter's lock), and gives it back after; the one that has waited longest ge
 refused at once: an answer that would come too late costs everyone.
 """
 
-import os
 import queue
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import NoReturn, Protocol
 
 from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
@@ -41,16 +39,6 @@ class Waiter(Protocol):
 
     def tell(self) -> None:
         """It has a slot now."""
-
-
-def num_cores() -> int:
-    """Cores this process may use: its affinity, and the quota of its container where it has one (cgroup v2)."""
-    cores = len(os.sched_getaffinity(0))
-    try:
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-    except (OSError, ValueError):
-        return cores
-    return cores if quota == "max" else max(1, min(cores, round(int(quota) / int(period))))
 
 
 class _Thread:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 import tyro
 
 from curio_serve.arguments import parse
+from curio_serve.cores import num_cores
 from curio_serve.errors import CameraError, CurioError, UsageError
 
 if TYPE_CHECKING:
@@ -60,8 +61,8 @@ class DetectArguments:
     """Keep that many of an image, the most confident. None: all."""
     exif_rotation: bool = False
     """Turn images as EXIF says, and K with them. Otherwise pixels are taken as stored, to which K belongs."""
-    jobs: int = len(os.sched_getaffinity(0))
-    """Images worked on at the same time; by default the number of processors."""
+    jobs: int = num_cores()
+    """Images worked on at the same time; by default the number of cores that there are for it."""
     ray: str | None = None
     """Do it on a Ray cluster: HOST:PORT, auto for the one this machine is in, local for this machine's processors."""
     token_file: Path | None = None

@@ -14,8 +14,9 @@ from grpc_health.v1 import health, health_pb2
 from grpc_reflection.v1alpha import reflection, reflection_pb2
 from prometheus_client import CollectorRegistry, start_http_server
 
-from curio_serve.admission import WorkQueue, num_cores
+from curio_serve.admission import WorkQueue
 from curio_serve.config import ServeConfig
+from curio_serve.cores import num_cores
 from curio_serve.direct_calls import DirectCalls
 from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.events import share_events

@@ -58,6 +58,8 @@ def test_what_the_image_and_compose_take_is_there() -> None:
     missing = [name for line in copied for name in line.split() if not (ROOT / name).exists()]
     assert copied
     assert not missing
+    sent = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    assert sent == {name.partition("/")[0] for line in copied for name in line.split()}
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
     mounts = [volume.split(":")[0] for service in services.values() for volume in service.get("volumes", [])]
     files = [mount for mount in mounts if mount.startswith("./")]

@@ -1,0 +1,31 @@
+"""How many cores this process may use."""
+
+import os
+from pathlib import Path
+
+_CGROUP = Path("/sys/fs/cgroup")
+# Quota and period in microseconds, as cgroup v2 and v1 tell a container of its own.
+_QUOTA_FILES = (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"))
+_UNLIMITED = ("max", "-1")
+
+
+def num_cores(cgroup: Path = _CGROUP) -> int:
+    """Those of its affinity, or as many as its container's quota amounts to where that is less; at least 1.
+
+    Args:
+        cgroup: Where control groups are mounted.
+    """
+    cores = len(os.sched_getaffinity(0))
+    quota = _quota(cgroup)
+    return cores if quota is None else max(1, min(cores, round(quota)))
+
+
+def _quota(cgroup: Path) -> float | None:
+    """Cores that the quota amounts to; None without one."""
+    for names in _QUOTA_FILES:
+        try:
+            quota, period = " ".join((cgroup / name).read_text() for name in names).split()
+            return None if quota in _UNLIMITED else int(quota) / int(period)
+        except (OSError, ValueError):
+            continue
+    return None
