@@ -98,7 +98,9 @@ def running_peer(peer: Peer, python: Path, model: Path, frames: list[bytes], num
     mark, port = uuid.uuid4().hex, _free_port()
     view_from_reduced = _homography().ravel().tolist()
     program = [python, _PROGRAMS / f"{peer.name}_server.py", model, port, num_workers, *view_from_reduced]
-    environment = {**os.environ, **dict(peer.environment), _MARK: mark, "PYTHONPATH": str(_MESSAGES)}
+    # As our own processes are: nothing is reported about models.
+    environment = {**os.environ, "ORT_DISABLE_TELEMETRY": "1", **dict(peer.environment)}
+    environment |= {_MARK: mark, "PYTHONPATH": str(_MESSAGES)}
     log = sys.stderr if os.environ.get("CURIO_PEER_LOG") else subprocess.DEVNULL
     process = subprocess.Popen(list(map(str, program)), env=environment, stdout=log, stderr=log)
     try:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import urllib.request
@@ -79,6 +80,11 @@ def test_dashboard_and_alerts_ask_for_metrics_that_the_server_has(server: Any) -
     asked = {name for text in texts for name in re.findall(r"curio_\w+", text)}
     assert len(asked) >= 7
     assert asked <= exposed
+
+
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, which comes with Prometheus, is not installed")
+def test_alerts_fire_when_they_should_and_else_not() -> None:
+    subprocess.run(["promtool", "test", "rules", str(DEPLOY / "alerts_test.yml")], check=True, timeout=60)
 
 
 def test_the_health_check_tells_a_server_from_none(start_server: Callable[..., Any], models_dir: Path) -> None:
