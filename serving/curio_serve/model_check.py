@@ -31,7 +31,11 @@ class ChildCheck:
             ModelError: What the child said, or how it died.
         """
         command = [sys.executable, "-m", "curio_serve.model_check", str(folder), str(version)]
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as child:
+        try:
+            child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        except OSError as exc:  # no memory, no process, no file left for it
+            raise ModelError(f"{folder / str(version)}: its check could not be started: {exc.strerror}") from exc
+        with child:
             self._child = child
             try:
                 _, said = child.communicate(timeout=TIMEOUT_S)

@@ -6,6 +6,7 @@ that the network gives those outputs on this machine.
 """
 
 import re
+import stat
 import zipfile
 from pathlib import Path
 
@@ -28,15 +29,29 @@ def is_model_name(name: str) -> bool:
 
 
 def versions(folder: Path) -> list[int]:
-    """Versions in a model's folder, ascending."""
+    """Versions in a model's folder, ascending.
+
+    Raises:
+        ModelError: It cannot be read.
+    """
     try:
         return sorted(
             int(entry.name)
             for entry in folder.iterdir()
-            if entry.name.isdecimal() and int(entry.name) > 0 and (entry / MODEL_FILE).is_file()
+            if entry.name.isdecimal() and int(entry.name) > 0 and _has_model(entry)
         )
     except OSError as exc:
         raise ModelError(f"model folder {folder} cannot be read: {exc.strerror}") from exc
+
+
+def _has_model(version: Path) -> bool:
+    """Whether a version's folder has a model, or may have: what cannot be looked at is for the load to say."""
+    try:
+        return stat.S_ISREG((version / MODEL_FILE).stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
 
 
 def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
@@ -47,9 +62,12 @@ def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME)
     """
     path = folder / str(version) / MODEL_FILE
     model = load(path, folder.name, version, runtime)
-    _check_sum(folder, f"{version}/{MODEL_FILE}", model.sha256)
-    _check_config(folder, model)
-    _check_golden(folder / str(version) / GOLDEN_FILE, model)
+    try:
+        _check_sum(folder, f"{version}/{MODEL_FILE}", model.sha256)
+        _check_config(folder, model)
+        _check_golden(folder / str(version) / GOLDEN_FILE, model)
+    except OSError as exc:
+        raise ModelError(f"{exc.filename} cannot be read: {exc.strerror}") from exc
     return model
 
 

@@ -15,6 +15,7 @@ from curio_serve.model_folder import GOLDEN_FILE, MODEL_FILE, is_model_name, loa
 
 Key = tuple[str, int]
 Signature = tuple[tuple[int, int, int], ...]
+_FOLDER = 0  # in place of a version: the model's folder itself
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Change:
 
     Attributes:
         name: Of the model.
-        version: Of the model.
+        version: Of the model; 0: its folder cannot be read.
         event: "loaded", "unloaded" or "refused".
         reason: Why it was refused.
     """
@@ -79,23 +80,49 @@ class Repository:
             ModelError: The folder itself cannot be read.
         """
         changes: list[Change] = []
-        models: dict[str, dict[int, Model]] = {}
+        models: dict[str, Mapping[int, Model]] = {}
         seen: dict[Key, Signature] = {}
         for folder in self._folders():
-            loaded: dict[int, Model] = {}
-            for version in reversed(versions(folder)):
-                if len(loaded) == self._num_versions:
-                    break
-                seen[folder.name, version] = _signature(folder, version)
-                model = self._current(folder, version, seen[folder.name, version], check, changes)
-                if model is not None:
-                    loaded[version] = model
-            if loaded:
+            if loaded := self._versions(folder, check, seen, changes):
                 models[folder.name] = loaded
         for name, previous in self._models.items():
             changes += [Change(name, v, "unloaded") for v in previous if v not in models.get(name, {})]
         self._seen, self._models = seen, models
         return changes
+
+    def _versions(
+        self,
+        folder: Path,
+        check: Callable[[Path, int], None] | None,
+        seen: dict[Key, Signature],
+        changes: list[Change],
+    ) -> Mapping[int, Model]:
+        """What shall serve of a model: its newest versions that can; where its folder cannot be read, what serves now.
+
+        Args:
+            folder: Of the model.
+            check: See :meth:`refresh`.
+            seen: Gets what was found.
+            changes: Gets what changed.
+        """
+        name = folder.name
+        try:
+            found = versions(folder)
+        except ModelError as exc:
+            seen |= {key: signature for key, signature in self._seen.items() if key[0] == name}
+            if (name, _FOLDER) not in seen:
+                changes.append(Change(name, _FOLDER, "refused", str(exc)))
+            seen[name, _FOLDER] = ()
+            return self._models.get(name, {})
+        loaded: dict[int, Model] = {}
+        for version in reversed(found):
+            if len(loaded) == self._num_versions:
+                break
+            seen[name, version] = _signature(folder, version)
+            model = self._current(folder, version, seen[name, version], check, changes)
+            if model is not None:
+                loaded[version] = model
+        return loaded
 
     def _current(
         self,
@@ -142,5 +169,6 @@ def _signature(folder: Path, version: int) -> Signature:
         except OSError:
             signature.append((0, 0, 0))
         else:
-            signature.append((stat.st_mtime_ns, stat.st_size, stat.st_ino))
+            # When it was last changed in any way: another owner or mode may be what makes it fit to be read.
+            signature.append((stat.st_ctime_ns, stat.st_size, stat.st_ino))
     return tuple(signature)

@@ -2,7 +2,8 @@
 
 import os
 import shutil
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from curio_serve.repository import Repository
 
 MakeOnnx = Callable[..., onnx.ModelProto]
 WriteFolder = Callable[..., Path]
+_NOBODY = 65534
 
 
 @pytest.fixture
@@ -36,6 +38,55 @@ def test_models_are_found_and_named(root: Path) -> None:
     assert repository.get("flat").version == 1
     assert repository.get("flat", 1) is repository.get("flat")
     assert _events(repository) == set()
+
+
+@pytest.fixture
+def guarded(models_dir: Path) -> Iterator[Path]:
+    """Models in a folder where modes of files hold, also for tests that root runs."""
+    is_root = os.geteuid() == 0
+    Repository(models_dir).refresh()  # loads what nobody may not import
+    with tempfile.TemporaryDirectory() as name:
+        shutil.copytree(models_dir, Path(name) / "models")
+        for path in (Path(name), *Path(name).rglob("*")):
+            path.chmod(0o755)
+            os.chown(path, _NOBODY if is_root else -1, -1)
+        try:
+            os.seteuid(_NOBODY if is_root else os.geteuid())
+            yield Path(name) / "models"
+        finally:
+            os.seteuid(os.getuid())
+
+
+def test_a_model_that_cannot_be_read_stops_no_other(guarded: Path) -> None:
+    (guarded / "flat").chmod(0)
+    repository = Repository(guarded)
+    changes = {change.name: change for change in repository.refresh()}
+    assert changes["pinhole"].event == "loaded"
+    assert (changes["flat"].event, changes["flat"].version) == ("refused", 0)
+    assert changes["flat"].reason == f"model folder {guarded / 'flat'} cannot be read: Permission denied"
+    assert repository.refresh() == [], "it was said already"
+    (guarded / "flat").chmod(0o755)
+    assert _events(repository) == {("loaded", "flat", 1)}
+    loaded = repository.get("flat")
+    (guarded / "flat").chmod(0)
+    assert _events(repository) == {("refused", "flat", 0)}
+    assert repository.get("flat") is loaded
+    (guarded / "flat").chmod(0o755)
+    assert _events(repository) == set()
+
+
+@pytest.mark.parametrize("name", ["config.pbtxt", "1", "1/model.onnx"])
+def test_what_cannot_be_read_is_refused_until_it_can(guarded: Path, name: str) -> None:
+    path = guarded / "flat" / name
+    path.chmod(0)
+    repository = Repository(guarded)
+    changes = {change.name: change for change in repository.refresh()}
+    assert changes["pinhole"].event == "loaded"
+    assert (changes["flat"].event, changes["flat"].version) == ("refused", 1)
+    assert "Permission denied" in changes["flat"].reason
+    assert repository.refresh() == []
+    path.chmod(0o755)
+    assert _events(repository) == {("loaded", "flat", 1)}
 
 
 @pytest.mark.parametrize("name", ["", "nothing", "../flat", "flat/1", "flat\0", "x" * 10_000])
