@@ -27,7 +27,7 @@ from curio_serve.registration import register
 from curio_serve.repository import Change, Repository
 from curio_serve.security import TokenInterceptor, Tokens, read_tokens, server_credentials
 from curio_serve.service import Limits, PoseService
-from curio_serve.telemetry import LOGGER, Metrics, log
+from curio_serve.telemetry import Metrics, log
 
 _POSE = detector_pb2.DESCRIPTOR.services_by_name["PoseDetector"]
 _INFERENCE = inference_pb2.DESCRIPTOR.services_by_name["GRPCInferenceService"]
@@ -183,11 +183,8 @@ class PoseServer:
             before = {name for name, _ in self._repository}
             try:
                 self._report(self._repository.refresh(self._check))
-            except ModelError as exc:
+            except (ModelError, OSError) as exc:
                 log(logging.ERROR, "models folder unreadable; serving what is loaded", reason=str(exc))
-                continue
-            except Exception:  # noqa: BLE001 - a fault of ours, which must not end the watch
-                LOGGER.exception("models folder could not be looked at; serving what is loaded")
                 continue
             self._announce()
             for gone in before - {name for name, _ in self._repository}:
