@@ -86,6 +86,8 @@ def main() -> None:
     engine = Engine(arguments.engine)
     image = "curio-serve:benchmark"
     built = ("--file", str(_ROOT / "deploy" / "Dockerfile"), "--tag", image)
+    if not engine.succeeds("image", "inspect", arguments.base):
+        engine("pull", arguments.base)
     print(engine("build", "--build-arg", f"BASE={arguments.base}", *built, str(_ROOT)), file=sys.stderr)
     figures = {"engine": engine("--version"), "base": arguments.base, "base_mb": engine.megabytes(arguments.base)}
     figures |= {"image_mb": engine.megabytes(image), **asdict(seen(engine, image))}

@@ -162,7 +162,7 @@ def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAUL
 def _open(data: bytes, path: Path, providers: Sequence[str]) -> "onnxruntime.InferenceSession":
     """One thread a call: parallel calls share the session, which holds the weights once."""
     # Before the import: unless told not to, onnxruntime from 1.29 on writes an identifier into the user's cache folder
-    # and sends names and hashes of models to its makers (its Privacy.md).
+    # and uploads events to its makers (its Privacy.md).
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     import onnxruntime
 

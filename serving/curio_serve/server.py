@@ -183,7 +183,7 @@ class PoseServer:
             before = {name for name, _ in self._repository}
             try:
                 self._report(self._repository.refresh(self._check))
-            except (ModelError, OSError) as exc:
+            except ModelError as exc:
                 log(logging.ERROR, "models folder unreadable; serving what is loaded", reason=str(exc))
                 continue
             self._announce()

@@ -1,6 +1,7 @@
 """Models found, loaded, replaced and refused while others go on serving."""
 
 import os
+import resource
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ import onnx
 import pytest
 from curio_serve.errors import ModelError, ModelNotFound
 from curio_serve.model_check import ChildCheck
+from curio_serve.model_folder import load_version
 from curio_serve.repository import Repository
 
 MakeOnnx = Callable[..., onnx.ModelProto]
@@ -44,15 +46,20 @@ def test_models_are_found_and_named(root: Path) -> None:
 def guarded(models_dir: Path) -> Iterator[Path]:
     """Models in a folder where modes of files hold, also for tests that root runs."""
     is_root = os.geteuid() == 0
-    Repository(models_dir).refresh()  # loads what nobody may not import
     with tempfile.TemporaryDirectory() as name:
-        shutil.copytree(models_dir, Path(name) / "models")
+        models = Path(shutil.copytree(models_dir, Path(name) / "models"))
+        model = load_version(models / "flat", 1)
+        image = np.zeros((model.camera.height, model.camera.width, 3), np.uint8)
+        outputs = {output: value[0] for output, value in model.run(image[None]).items()}
+        np.savez(models / "flat" / "1" / "golden.npz", image=image, **outputs)
+        # Now, because nobody may not read the packages and codecs that this imports.
+        assert len(Repository(models).refresh()) == 2
         for path in (Path(name), *Path(name).rglob("*")):
             path.chmod(0o755)
             os.chown(path, _NOBODY if is_root else -1, -1)
         try:
             os.seteuid(_NOBODY if is_root else os.geteuid())
-            yield Path(name) / "models"
+            yield models
         finally:
             os.seteuid(os.getuid())
 
@@ -75,7 +82,7 @@ def test_a_model_that_cannot_be_read_stops_no_other(guarded: Path) -> None:
     assert _events(repository) == set()
 
 
-@pytest.mark.parametrize("name", ["config.pbtxt", "1", "1/model.onnx"])
+@pytest.mark.parametrize("name", ["config.pbtxt", "SHA256SUMS", "1", "1/model.onnx", "1/golden.npz"])
 def test_what_cannot_be_read_is_refused_until_it_can(guarded: Path, name: str) -> None:
     path = guarded / "flat" / name
     path.chmod(0)
@@ -83,7 +90,7 @@ def test_what_cannot_be_read_is_refused_until_it_can(guarded: Path, name: str) -
     changes = {change.name: change for change in repository.refresh()}
     assert changes["pinhole"].event == "loaded"
     assert (changes["flat"].event, changes["flat"].version) == ("refused", 1)
-    assert "Permission denied" in changes["flat"].reason
+    assert "cannot be read: Permission denied" in changes["flat"].reason
     assert repository.refresh() == []
     path.chmod(0o755)
     assert _events(repository) == {("loaded", "flat", 1)}
@@ -174,6 +181,16 @@ def test_a_check_that_is_killed_refuses_the_candidate(root: Path) -> None:
             check.stop()
         assert isinstance(waiting.exception(), ModelError)
         assert "its check ended with status -9" in str(waiting.exception())
+
+
+def test_a_check_that_cannot_be_started_refuses_the_candidate(root: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+    try:
+        with pytest.raises(ModelError, match="its check could not be started: Too many open files"):
+            ChildCheck()(root / "flat", 1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_many_replacements(root: Path, spot_onnx: MakeOnnx, write_folder: WriteFolder) -> None:

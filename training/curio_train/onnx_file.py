@@ -124,7 +124,7 @@ class OnnxModel:
             ExportError: Not an exported model, or one that onnxruntime refuses.
         """
         # Before the import: unless told not to, onnxruntime from 1.29 on writes an identifier into the user's cache
-        # folder and sends names and hashes of models to its makers (its Privacy.md).
+        # folder and uploads events to its makers (its Privacy.md).
         os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
         import onnxruntime
 
