@@ -7,8 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import pytest
-from curio_serve.admission import WorkQueue
 from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
+from curio_serve.server.admission import WorkQueue
 from curio_serve.telemetry import Metrics
 from prometheus_client import CollectorRegistry
 
@@ -192,7 +192,7 @@ def test_promises_end(monkeypatch: pytest.MonkeyPatch) -> None:
     slow = [Place(), Place()]
     for place in slow:
         queue.promise(place, math.inf)
-    monkeypatch.setattr("curio_serve.admission._PROMISE_S", 0.0)
+    monkeypatch.setattr("curio_serve.server.admission._PROMISE_S", 0.0)
     queue.promise(quick := Place(), math.inf)
     assert queue.enter(quick)
     # Their messages come late; they find a place where there is one.

@@ -11,10 +11,10 @@ import grpc
 import pytest
 from curio_proto.v1 import detector_pb2 as pb
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
-from curio_serve.admission import WorkQueue
-from curio_serve.direct_calls import Caller, DirectCalls, Metadata, Method
 from curio_serve.errors import CurioError
-from curio_serve.events import share_events
+from curio_serve.server.admission import WorkQueue
+from curio_serve.server.direct_calls import Caller, DirectCalls, Metadata, Method
+from curio_serve.server.events import share_events
 from curio_serve.telemetry import LOGGER, Metrics
 from prometheus_client import CollectorRegistry
 

@@ -9,15 +9,15 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.config import RunConfig, WorldOptions
 from curio_train.data.backgrounds import ClutterBackgrounds
-from curio_train.data.shapes import box
-from curio_train.learning.checkpoint import RunFolder
-from curio_train.learning.provenance import note_sitting
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.provenance import note_sitting
 from curio_train.learning.state import Course, TrainState
+from curio_train.meshes.shapes import box
 from curio_train.worlds import build
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.gaze import GazeWorld
 from curio_train.worlds.options import CirclesOptions
-from curio_train.worlds.single_object import Object
+from curio_train.worlds.single_object.two_stage import GazeWorld
+from curio_train.worlds.single_object.world import Object
 
 
 @pytest.fixture(scope="session")

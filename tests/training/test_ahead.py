@@ -10,20 +10,20 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.config import ConvStack, NetworkConfig, Recipe, RunConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
-from curio_train.data.shapes import box
 from curio_train.errors import DataError
-from curio_train.learning.ahead import Ahead
-from curio_train.learning.checkpoint import RunFolder
-from curio_train.learning.interruption import Interruption
 from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
-from curio_train.learning.session import learn
+from curio_train.learning.prefetch import Ahead
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.interruption import Interruption
+from curio_train.learning.runs.session import learn
 from curio_train.learning.state import TrainState
+from curio_train.meshes.shapes import box
 from curio_train.worlds.base import Batch, ImageSource, ObjectKind
-from curio_train.worlds.circles import Circles
-from curio_train.worlds.gaze import GazeWorld
+from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions
-from curio_train.worlds.single_object import Object
+from curio_train.worlds.single_object.two_stage import GazeWorld
+from curio_train.worlds.single_object.world import Object
 from torch import Tensor
 
 CONFIG = RunConfig(

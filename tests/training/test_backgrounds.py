@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 from curio_train.data.backgrounds import POOL_HEIGHT, POOL_WIDTH, ClutterBackgrounds, PhotographBackgrounds, render_pool
-from curio_train.data.leaves import scatter_leaves
+from curio_train.data.clutter import scatter_leaves
 from curio_train.data.photographs import Photographs
-from curio_train.data.shapes import sphere
 from curio_train.errors import DataError
+from curio_train.meshes.shapes import sphere
 
 
 @pytest.fixture(scope="module")

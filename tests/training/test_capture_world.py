@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train import cli
 from curio_train.camera import Intrinsics
+from curio_train.commands import cli
 from curio_train.config import NetworkConfig
 from curio_train.data import backgrounds
-from curio_train.data.plate import MixedBackgrounds, PlateBackgrounds
+from curio_train.data.background_image import MixedBackgrounds, PlateBackgrounds
 from curio_train.doctor.before_training import refuse_unfit
 from curio_train.errors import CameraError, DataError, MeshError, UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.subject import load_subject
-from curio_train.export import export
+from curio_train.export.graph import export
 from curio_train.geometry import matrix_from_rotation_6d
-from curio_train.learning.checkpoint import RunFolder
+from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
-from curio_train.worlds.capture import NUM_JUDGED, Capture
 from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.single_object.capture import NUM_JUDGED, Capture
 from torch import Tensor
 
 WIDTH, HEIGHT = 160, 120

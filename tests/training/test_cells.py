@@ -10,12 +10,12 @@ from curio_train.errors import UsageError
 from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
 from curio_train.metrics.assignment import scene_error
-from curio_train.networks.cells import AMOUNTS, cell_error, fill_slots
 from curio_train.networks.grid import STRIDE, CellGrid, of_cells
+from curio_train.networks.set_detector import AMOUNTS, cell_error, fill_slots
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, SceneCode, index
 from curio_train.worlds import WORLDS, build
-from curio_train.worlds.mesh_world import MeshWorld
-from curio_train.worlds.stored import StoredImages
+from curio_train.worlds.generated.mesh_world import MeshWorld
+from curio_train.worlds.image_sets import StoredImages
 from torch import Tensor
 
 CELLS = NetworkConfig(reading="cells")

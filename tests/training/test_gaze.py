@@ -14,15 +14,15 @@ from curio_train.geometry import (
     rotation_angle_deg,
     rotation_between,
 )
-from curio_train.networks.crop import SURFACE
-from curio_train.networks.gaze import SCALES
-from curio_train.networks.look import Look
-from curio_train.networks.places import AMOUNTS, CANDIDATE_LOG_WEIGHTS, CANDIDATES, NUM_CANDIDATES, PLACES
+from curio_train.networks.base import Look
+from curio_train.networks.two_stage.crop_pose import SURFACE
+from curio_train.networks.two_stage.localise import AMOUNTS, CANDIDATE_LOG_WEIGHTS, CANDIDATES, NUM_CANDIDATES, PLACES
+from curio_train.networks.two_stage.network import SCALES
+from curio_train.rendering.object_coordinates import SurfaceMap
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, index
-from curio_train.worlds.calibration import calibrate
-from curio_train.worlds.gaze import ASSUMED_M, CROP_PX, FirstLook, GazeWorld, SecondLook, gaze_camera
-from curio_train.worlds.single_object import EXPOSURE, Object
-from curio_train.worlds.surface import SurfaceMap
+from curio_train.worlds.single_object.confidence import calibrate
+from curio_train.worlds.single_object.two_stage import ASSUMED_M, CROP_PX, FirstLook, GazeWorld, SecondLook, gaze_camera
+from curio_train.worlds.single_object.world import EXPOSURE, Object
 from torch import Tensor, nn
 
 

@@ -3,12 +3,12 @@
 import torch
 from curio_train.config import NetworkConfig
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
-from curio_train.networks.crop import SURFACE
 from curio_train.networks.grid import of_cells
-from curio_train.networks.places import AMOUNTS, PLACES
+from curio_train.networks.two_stage.crop_pose import SURFACE
+from curio_train.networks.two_stage.localise import AMOUNTS, PLACES
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
-from curio_train.worlds.gaze import FirstLook, GazeWorld
-from curio_train.worlds.single_object import Object
+from curio_train.worlds.single_object.two_stage import FirstLook, GazeWorld
+from curio_train.worlds.single_object.world import Object
 from torch import Tensor, nn
 
 

@@ -9,16 +9,16 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig, Recipe
 from curio_train.data.backgrounds import ClutterBackgrounds
-from curio_train.data.shapes import chair
 from curio_train.errors import UsageError
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
 from curio_train.learning.self_training import STUDIES, STUDIES_OF_TRAINED, SelfTraining
-from curio_train.networks.crop import SURFACE
+from curio_train.meshes.shapes import chair
+from curio_train.networks.two_stage.crop_pose import SURFACE
+from curio_train.refinement.pseudo_labels import Lessons
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.gaze import ASSUMED_M, CROP_PX, LARGEST_LOG_SCALE, LARGEST_OFFSET, GazeWorld
-from curio_train.worlds.lessons import Lessons
-from curio_train.worlds.single_object import Object
+from curio_train.worlds.single_object.two_stage import ASSUMED_M, CROP_PX, LARGEST_LOG_SCALE, LARGEST_OFFSET, GazeWorld
+from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from curio_train.commands.prepare import prepared
 from curio_train.config import RunConfig, preset_recipe
 from curio_train.errors import CameraError, DataError, UsageError
-from curio_train.export import export
+from curio_train.export.graph import export
 from curio_train.geometry import matrix_from_rotation_6d
-from curio_train.preparation import prepared
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
-from curio_train.worlds.linemod import FAR_M, NEAR_M, read_cameras
 from curio_train.worlds.options import LinemodOptions
-from curio_train.worlds.single_object import EXPOSURE
-from curio_train.worlds.views import STRONGEST_LIGHT, WEAKEST_LIGHT
+from curio_train.worlds.single_object.linemod import FAR_M, NEAR_M, read_cameras
+from curio_train.worlds.single_object.viewpoints import STRONGEST_LIGHT, WEAKEST_LIGHT
+from curio_train.worlds.single_object.world import EXPOSURE
 
 
 @pytest.fixture(scope="module")

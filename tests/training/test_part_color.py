@@ -10,15 +10,15 @@ import pytest
 import torch
 import trimesh
 from curio_train.camera import load_intrinsics
+from curio_train.commands.prepare import prepared
 from curio_train.config import RunConfig, WorldOptions
 from curio_train.data.part_color import find_color
 from curio_train.errors import UsageError
-from curio_train.preparation import prepared
 from curio_train.scene_code import COLOR, CONFIDENCE
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.paints import paints_like
-from curio_train.worlds.single_object import any_paint
+from curio_train.worlds.single_object.base_colors import paints_like
+from curio_train.worlds.single_object.world import any_paint
 
 WIDTH, HEIGHT = 160, 120
 SRGB = {"red": (0.78, 0.2, 0.16), "pale": (0.8, 0.78, 0.7), "black": (0.08, 0.08, 0.1), "teal": (0.1, 0.5, 0.5)}

@@ -9,19 +9,19 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.data.bop import ModelInfo
-from curio_train.data.shapes import chair
 from curio_train.errors import UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.scores import add_errors
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.meshes.shapes import chair
+from curio_train.refinement.crops import rotation_from_vector
+from curio_train.refinement.inpainting import filled_in
+from curio_train.refinement.render_and_compare import Refinement
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, poses
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.circles import Circles
-from curio_train.worlds.comparison import rotation_from_vector
-from curio_train.worlds.gaze import GazeWorld
-from curio_train.worlds.inpainting import filled_in
-from curio_train.worlds.refinement import Refinement
-from curio_train.worlds.single_object import Object
+from curio_train.worlds.generated.circles import Circles
+from curio_train.worlds.single_object.two_stage import GazeWorld
+from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 

@@ -8,17 +8,17 @@ import pytest
 import torch
 from curio_train.camera import Intrinsics
 from curio_train.data.backgrounds import ClutterBackgrounds
-from curio_train.data.shapes import chair
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
+from curio_train.meshes.shapes import chair
 from curio_train.metrics.poses import symmetry_poses
+from curio_train.refinement.multi_view import Cameras, agreed, told_scale
+from curio_train.refinement.pseudo_labels import FEWEST_AGREED, Lessons
+from curio_train.refinement.render_and_compare import Refinement
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.gaze import SYMMETRY_STEP, GazeWorld
-from curio_train.worlds.lessons import FEWEST_AGREED, Lessons
-from curio_train.worlds.linemod import LinemodGaze
-from curio_train.worlds.refinement import Refinement
-from curio_train.worlds.single_object import Object
-from curio_train.worlds.still_scene import Cameras, agreed, told_scale
+from curio_train.worlds.single_object.linemod import LinemodGaze
+from curio_train.worlds.single_object.two_stage import SYMMETRY_STEP, GazeWorld
+from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train.data.meshes import Mesh
-from curio_train.rendering.differences import central_differences, cosine, gradients
-from curio_train.rendering.finish import FINISH_SIZE, NUM_WAVES, finishes, random_finishes
+from curio_train.meshes.meshes import Mesh
+from curio_train.rendering.materials import FINISH_SIZE, NUM_WAVES, finishes, random_finishes
 from curio_train.rendering.renderer import Renderer
+from stock.gradient_check import central_differences, cosine, gradients
 from torch import Tensor
 
 SIZE = 48

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train.data.meshes import Mesh
+from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.bounds import enclosing_polytope, project_bounds
-from curio_train.rendering.edges import build_edges
+from curio_train.rendering.instances import Rows
 from curio_train.rendering.renderer import Renderer
-from curio_train.rendering.rows import Rows
+from curio_train.rendering.silhouette_edges import build_edges
 from curio_train.rendering.topology import adjacency, smooth_normals
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -19,12 +19,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from curio_train.data.leaves import scatter_leaves
-from curio_train.data.meshes import Mesh
+from curio_train.data.clutter import scatter_leaves
 from curio_train.data.photographs import Photographs
-from curio_train.data.shapes import box, capsule, cone, sphere
 from curio_train.errors import DataError
 from curio_train.geometry import random_rotations
+from curio_train.meshes.meshes import Mesh
+from curio_train.meshes.shapes import box, capsule, cone, sphere
 from curio_train.rendering.renderer import Renderer
 
 POOL_SIZE = 240

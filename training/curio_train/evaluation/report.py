@@ -19,10 +19,10 @@ from curio_train.evaluation import report_figures as figures
 from curio_train.evaluation.photographed import Judgement, judge
 from curio_train.evaluation.subject import Subject, load_subject
 from curio_train.evaluation.tables import label
-from curio_train.learning.checkpoint import CONFIG_FILE
-from curio_train.learning.configuration import world_name
-from curio_train.learning.progress import read_history
-from curio_train.learning.provenance import Sitting, sittings
+from curio_train.learning.runs.checkpoint import CONFIG_FILE
+from curio_train.learning.runs.configuration import world_name
+from curio_train.learning.runs.progress import read_history
+from curio_train.learning.runs.provenance import Sitting, sittings
 from curio_train.metrics.images import dssim
 from curio_train.worlds.base import Split
 

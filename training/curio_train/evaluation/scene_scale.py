@@ -15,12 +15,12 @@ from curio_train.capture.ground import scaled
 from curio_train.capture.structure import Structure
 from curio_train.data.photographs import read_frames
 from curio_train.errors import DataError, UsageError
-from curio_train.evaluation.linemod_table import candidates
+from curio_train.evaluation.candidates import candidates
 from curio_train.evaluation.subject import load_subject
-from curio_train.worlds.lessons import read_twice, spread
-from curio_train.worlds.linemod import LinemodGaze
-from curio_train.worlds.refinement import Refinement
-from curio_train.worlds.still_scene import Cameras, told_scale
+from curio_train.refinement.multi_view import Cameras, told_scale
+from curio_train.refinement.pseudo_labels import read_twice, spread
+from curio_train.refinement.render_and_compare import Refinement
+from curio_train.worlds.single_object.linemod import LinemodGaze
 
 MOST_PHOTOGRAPHS = 100
 """More tell little more: what one object errs by is the same in all."""

@@ -17,19 +17,19 @@ from torch import Tensor
 
 from curio_train.config import Recipe, RunConfig
 from curio_train.errors import TrainingError, UsageError
-from curio_train.learning.ahead import Ahead
-from curio_train.learning.checkpoint import RunFolder
 from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, gradient_penalty
-from curio_train.learning.interruption import Interruption
 from curio_train.learning.losses import image_loss
 from curio_train.learning.parallel import Ranks
 from curio_train.learning.precision import autocast
-from curio_train.learning.progress import Reporter
+from curio_train.learning.prefetch import Ahead
 from curio_train.learning.recoloring import recolored
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.interruption import Interruption
+from curio_train.learning.runs.progress import Reporter
 from curio_train.learning.self_training import SelfTraining
 from curio_train.learning.sleep import sleep_codes
 from curio_train.learning.state import TrainState
-from curio_train.networks.look import Look
+from curio_train.networks.base import Look
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import Batch, ImageSource, World
 

@@ -1,11 +1,11 @@
-"""When photographs are read for self-training, and how they come among the renderings: see ``worlds/lessons.py``."""
+"""When photographs are read for self-training, and how they come among the renderings: see ``pseudo_labels``."""
 
 import torch
 from torch import Tensor, nn
 
+from curio_train.refinement.pseudo_labels import Lessons
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
-from curio_train.worlds.lessons import Lessons
 
 STUDIES, STUDIES_OF_TRAINED = (0.6, 0.8), (0.2, 0.5, 0.8)
 """Shares of the budget after which photographs are read: late, when what is read is worth it, and once more; sooner by

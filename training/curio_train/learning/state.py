@@ -10,7 +10,7 @@ from torch.optim import Adam, Optimizer
 from curio_train.config import RunConfig
 from curio_train.errors import UsageError
 from curio_train.learning.muon import Muon
-from curio_train.networks.critic import Critic
+from curio_train.networks.paper.critic import Critic
 from curio_train.worlds.base import World
 
 N = TypeVar("N", bound=nn.Module)

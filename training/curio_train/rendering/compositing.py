@@ -8,8 +8,8 @@ can be added to the image by itself.
 from types import ModuleType
 from typing import Any
 
+from curio_train.rendering.instances import Rows
 from curio_train.rendering.pixels import Place
-from curio_train.rendering.rows import Rows
 
 
 class Occlusion:

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from curio_train.rendering.edges import CLUSTER_SIZE, EdgeTable
-from curio_train.rendering.rows import Rows
+from curio_train.rendering.instances import Rows
+from curio_train.rendering.silhouette_edges import CLUSTER_SIZE, EdgeTable
 
 
 class EdgeSearch:

@@ -7,11 +7,11 @@ from typing import Any
 
 from curio_train.rendering.bounds import ImageBounds
 from curio_train.rendering.compositing import Occlusion
-from curio_train.rendering.layers import LayerTracer, Sight
+from curio_train.rendering.edge_sampling import OutlineSampler
+from curio_train.rendering.instances import Rows
 from curio_train.rendering.pixels import Place
-from curio_train.rendering.rows import Rows
 from curio_train.rendering.shadows import Blockers
-from curio_train.rendering.silhouettes import OutlineSampler
+from curio_train.rendering.tracing import LayerTracer, Sight
 
 Places = Callable[[Any], tuple[Place, Any]]
 """From the numbers of rays to their places and whether they are inside the image."""

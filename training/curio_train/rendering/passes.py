@@ -3,10 +3,10 @@
 from dataclasses import replace
 from typing import Any
 
+from curio_train.rendering.edge_gradients import Outlines
+from curio_train.rendering.instances import Rows
 from curio_train.rendering.launch import Hits, Launch, Setting, View
-from curio_train.rendering.outlines import Outlines
 from curio_train.rendering.pixels import PixelSamples
-from curio_train.rendering.rows import Rows
 
 
 class Pass:

@@ -8,20 +8,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from curio_train.data.meshes import Mesh
-from curio_train.data.simplification import simplified
+from curio_train.color import linear_from_srgb
 from curio_train.errors import RendererError
+from curio_train.meshes.meshes import Mesh
+from curio_train.meshes.simplification import simplified
 from curio_train.rendering.bounds import project_bounds
-from curio_train.rendering.color import linear_from_srgb
-from curio_train.rendering.finish import in_object_frame
+from curio_train.rendering.edge_sampling import OutlineSampler
 from curio_train.rendering.ground import Ground
+from curio_train.rendering.instances import ROW_SIZE
 from curio_train.rendering.launch import Setting, View
-from curio_train.rendering.layers import LayerTracer, Objects, Sight
+from curio_train.rendering.materials import in_object_frame
+from curio_train.rendering.parts import build_scene
 from curio_train.rendering.passes import Pass
-from curio_train.rendering.rows import ROW_SIZE
-from curio_train.rendering.scene import build_scene
 from curio_train.rendering.shadows import GroundShadows, fallen
-from curio_train.rendering.silhouettes import OutlineSampler
+from curio_train.rendering.tracing import LayerTracer, Objects, Sight
 from curio_train.rendering.variant import Variant, load_mitsuba
 
 MAX_RAYS = 4_000_000

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from curio_train.rendering.ground import Ground
-from curio_train.rendering.layers import LayerTracer, Sight
+from curio_train.rendering.instances import Rows
 from curio_train.rendering.pixels import Place
-from curio_train.rendering.rows import Rows
+from curio_train.rendering.tracing import LayerTracer, Sight
 
 _LOWEST_SUN = 1e-3
 """Sine of the elevation below which there are no shadows: they would be endless."""

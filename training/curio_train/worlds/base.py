@@ -19,13 +19,13 @@ from curio_train.data.bop import ModelInfo
 from curio_train.errors import UsageError
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.metrics.assignment import scene_error
-from curio_train.networks.look import Look
-from curio_train.networks.pose import PoseNetwork
+from curio_train.networks.base import Look
+from curio_train.networks.paper.pose import PoseNetwork
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 
 if TYPE_CHECKING:
-    from curio_train.data.meshes import Mesh
-    from curio_train.worlds.lessons import Lessons
+    from curio_train.meshes.meshes import Mesh
+    from curio_train.refinement.pseudo_labels import Lessons
 
 Split = Literal["train", "validation", "test"]
 
