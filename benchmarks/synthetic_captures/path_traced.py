@@ -34,7 +34,7 @@ class Thing:
     color_srgb: tuple[float, float, float] = (0.6, 0.6, 0.6)
 
 
-class StandinScene:
+class PathTracedScene:
     """A table under a lamp, with things that can be moved. World frame: y up, the table's top at y = 0, metres."""
 
     def __init__(

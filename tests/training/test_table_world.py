@@ -169,12 +169,12 @@ def test_a_few_steps_bring_photographs_or_dreams_nearer(world: Table, folder: Pa
 
         def image_error() -> float:
             with torch.no_grad():
-                read = trainer.state.looks[0](source.images / 255)
+                read = trainer.state.stages[0](source.images / 255)
                 return float((world.compared(world.render(read)) - world.compared(source.images / 255)).square().mean())
 
         def dream_error() -> float:
             with torch.no_grad():
-                return float(world.code_loss(trainer.state.looks[0](world.render(fixed)), fixed))
+                return float(world.code_loss(trainer.state.stages[0](world.render(fixed)), fixed))
 
         error = image_error if "image" in METHODS[method] else dream_error
         before = error()

@@ -283,7 +283,7 @@ def reading_error(world: MeshWorld, trainer: Trainer) -> Callable[[], float]:
 
     @torch.no_grad()
     def error() -> float:
-        network = copy.deepcopy(trainer.state.looks[0])  # normalises by this batch, and the statistics of runs stay
+        network = copy.deepcopy(trainer.state.stages[0])  # normalises by this batch, and the statistics of runs stay
         return scene_error(world.layout, network(images), code, groups).mean().item()
 
     return error

@@ -10,7 +10,7 @@ import torch
 Item = TypeVar("Item")
 
 
-class Ahead(Generic[Item]):
+class Prefetcher(Generic[Item]):
     """A row of items, made one at a time and at most one ahead of what was taken; the thread ends with the block.
 
     Items must depend on their number alone: then those taken are the same as without a thread.
@@ -53,7 +53,7 @@ class Ahead(Generic[Item]):
         self._begin(number + self._stride)
         return item
 
-    def settle(self) -> None:
+    def wait_idle(self) -> None:
         """Wait until the thread rests, so that the caller is alone with what items are made with."""
         if self._coming is not None:
             wait([self._coming[1]])

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 
-class Look(nn.Module, ABC):
+class StageNetwork(nn.Module, ABC):
     """Image to scene code in two parts, of which the first may be computed with fewer digits.
 
     Attributes:

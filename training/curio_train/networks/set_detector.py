@@ -14,12 +14,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from curio_train.metrics.assignment import canonical
-from curio_train.networks.base import Look
-from curio_train.networks.grid import STRIDE, CellGrid, Share, amounts_error, of_cells, said_by
+from curio_train.networks.base import StageNetwork
+from curio_train.networks.grid import STRIDE, CellGrid, Share, gather_cells, heat_map_loss, of_cells
 from curio_train.networks.layers import convolution
 from curio_train.scene_code import CONFIDENCE, TRANSLATION, Layout, SceneCode
 
-AMOUNTS = "cell_amounts"
+HEAT_MAP = "cell_amounts"
 """What :meth:`CellNetwork.decode` gives beside the code: logits of how much of an object of each kind is at each cell
 [batch, kinds, cells]; under :func:`of_cells` what it would be like [batch, kinds, cells, size]."""
 
@@ -33,7 +33,7 @@ _PREFERENCE = 0.01  # by which the first cell's amount counts for more than the 
 _SAME_PX = 0.75 * STRIDE  # cells that put an object this near to each other mean the same one
 
 
-class CellNetwork(Look):
+class CellNetwork(StageNetwork):
     """Image to scene code by way of cells."""
 
     has_raw_values = False
@@ -90,7 +90,7 @@ class CellNetwork(Look):
         if CONFIDENCE not in self.layout and not self.training:
             del code[CONFIDENCE]
         known = {of_cells(name): value for name, value in values.items()}
-        return {}, {**code, AMOUNTS: amounts[..., 0], **known}
+        return {}, {**code, HEAT_MAP: amounts[..., 0], **known}
 
     def _physical(self, name: str, raw: Tensor) -> Tensor:
         if name != TRANSLATION:
@@ -145,13 +145,13 @@ def cell_error(
     of_slot = torch.cat([torch.full((len(slots),), kind) for kind, slots in enumerate(kinds)])
     here = grid.share(grid.project(true[TRANSLATION]))
     present = true[CONFIDENCE] if CONFIDENCE in layout else torch.ones_like(true[TRANSLATION][..., :1])
-    num_cells = predicted[AMOUNTS].shape[2]
+    num_cells = predicted[HEAT_MAP].shape[2]
     here = Share(of_slot.to(here.cell)[:, None] * num_cells + here.cell, here.weight * present)
     names = [field.name for field in layout.fields if of_cells(field.name) in predicted]
-    truth, error = canonical(true), amounts_error(predicted[AMOUNTS].flatten(1), here)
+    truth, error = canonical(true), heat_map_loss(predicted[HEAT_MAP].flatten(1), here)
     for name in names:
         field = layout[name]
-        said = said_by(predicted[of_cells(name)].flatten(1, 2), here)
+        said = gather_cells(predicted[of_cells(name)].flatten(1, 2), here)
         distance = (field.relative(said) - field.relative(truth[name])[:, :, None]).norm(dim=-1)
         error = error + (distance * here.weight).sum(dim=(1, 2))
     for field in layout.fields:

@@ -11,8 +11,8 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.initial import begin_with
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.progress import reporting
-from curio_train.learning.runs.provenance import note_sitting
-from curio_train.learning.state import Course
+from curio_train.learning.runs.provenance import record_session
+from curio_train.learning.state import TrainingProgress
 from curio_train.learning.threads import choose_threads
 from curio_train.worlds import build
 
@@ -26,7 +26,7 @@ def learn(
     cache: Path,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     checkpoint_minutes: float = 1.0,
-) -> tuple[Outcome, Course]:
+) -> tuple[Outcome, TrainingProgress]:
     """Train, alone or as one of torchrun's processes.
 
     Args:
@@ -48,17 +48,17 @@ def learn(
         # The world comes first: what is wrong with its data shows before a run folder is there.
         world = build(config.world)
         labelled = "label" in config.terms
-        sources = [look.source("train", config.seed, with_code=labelled, cache=cache) for look in world.looks]
+        sources = [look.source("train", config.seed, with_code=labelled, cache=cache) for look in world.stages]
         if config.labels < 1:
             sources = [source.subset(config.labels) for source in sources]
         run = RunFolder(path, config)
         if here.leads:
             run.write_config(new=not resume)
-            note_sitting(path)
+            record_session(path)
         trainer = Trainer(config, world, sources, here)
         if here.device.type == "cpu":
             # A run that only sleeps draws its images in a thread of its own.
-            choose_threads(trainer.rehearse, reserved=int(config.terms == {"sleep"}))
+            choose_threads(trainer.warm_up, reserved=int(config.terms == {"sleep"}))
         if resume and run.checkpoints():
             run.restore(trainer.state)
         elif config.init is not None:

@@ -11,17 +11,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from curio_train.networks.base import Look
+from curio_train.networks.base import StageNetwork
 from curio_train.networks.grid import STRIDE, CellGrid, of_cells
 from curio_train.networks.layers import Residual, convolution
 from curio_train.scene_code import ROTATION_6D, TRANSLATION, Layout
 
-SURFACE = "surface"
-"""What :meth:`CropNetwork.decode` gives beside the code: [batch, 4, 16, 16], the point of the object each patch sees
+OBJECT_COORDINATES = "surface"
+"""What ``CropPoseNetwork.decode`` gives beside the code: [batch, 4, 16, 16], the point of the object each patch sees
 (three coordinates, in half extents from the middle of its box), then the logit of seeing the object at all. Under
 :func:`~curio_train.networks.grid.of_cells` stand position and rotation as each cell says them [batch, cells, size]."""
 
-SURFACE_SHARE = 4
+OBJECT_COORDINATES_STRIDE = 4
 """Pixels a side of a patch."""
 
 _WIDTHS = (48, 64, 128)
@@ -31,7 +31,7 @@ _HIDDEN = 256
 _FIRST_SAY = 0.1
 
 
-class CropNetwork(Look):
+class CropPoseNetwork(StageNetwork):
     """Crop to scene code."""
 
     has_raw_values = False
@@ -40,7 +40,7 @@ class CropNetwork(Look):
         """Build for crops of the grid's camera."""
         super().__init__()
         self.layout, self.grid = layout, grid
-        patches_a_cell = (STRIDE // SURFACE_SHARE) ** 2
+        patches_a_cell = (STRIDE // OBJECT_COORDINATES_STRIDE) ** 2
         self._num_described = _PATCH_VALUES * patches_a_cell
         self.encoder = nn.Sequential(
             convolution(3, _WIDTHS[0], 5, 2),
@@ -51,7 +51,7 @@ class CropNetwork(Look):
             Residual(_WIDTHS[2]),
             _Described(_WIDTHS[2], self._num_described),
         )
-        self.unfold = nn.PixelShuffle(STRIDE // SURFACE_SHARE)
+        self.unfold = nn.PixelShuffle(STRIDE // OBJECT_COORDINATES_STRIDE)
         inputs = _WIDTHS[2] + self._num_described, _CONTEXT
         self.context = nn.Sequential(
             *(convolution(num, _CONTEXT, 3, 1, by) for num, by in zip(inputs, _CONTEXT_DILATIONS, strict=True))
@@ -64,7 +64,7 @@ class CropNetwork(Look):
     def decode(
         self, features: Float[Tensor, "batch channels rows columns"]
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """No raw values, and the code with :data:`SURFACE` and what cells say beside it."""
+        """No raw values, and the code with :data:`OBJECT_COORDINATES` and what cells say beside it."""
         each = self.cells(self.context(features)).flatten(2).transpose(1, 2)
         weight, *values = each.split([1, *self._sizes.values()], dim=-1)
         said = dict(zip(self._sizes, values, strict=True))
@@ -77,7 +77,7 @@ class CropNetwork(Look):
             value = mean if field.name == TRANSLATION else field.activate(mean)
             code[field.name] = value[:, None] if field.per_object else value
         pose = {of_cells(name): said[name] for name in (TRANSLATION, ROTATION_6D)}
-        return {}, {**code, **pose, SURFACE: self.unfold(features[:, -self._num_described :])}
+        return {}, {**code, **pose, OBJECT_COORDINATES: self.unfold(features[:, -self._num_described :])}
 
     def _begin_with_identity(self, last: nn.Conv2d) -> None:
         """A rotation of zeros has no gradient worth following: start small, from the identity."""

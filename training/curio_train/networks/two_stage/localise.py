@@ -9,14 +9,14 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from curio_train.networks.base import Look
+from curio_train.networks.base import StageNetwork
 from curio_train.networks.grid import STRIDE, CellGrid
 from curio_train.networks.layers import convolution
 from curio_train.scene_code import TRANSLATION
 
-PLACES, AMOUNTS = "places_m", "place_amounts"
+PROPOSALS, HEAT_MAP = "places_m", "place_amounts"
 CANDIDATES, CANDIDATE_LOG_WEIGHTS = "candidates_m", "candidate_log_weights"
-"""What :meth:`PlaceNetwork.decode` gives beside the place: all hypotheses [batch, cells, 3] with the logits of how
+"""What ``LocalisationNetwork.decode`` gives beside the place: all hypotheses [batch, cells, 3] with the logits of how
 much of an object is there [batch, cells], and the likeliest places that are not beside each other
 [batch, NUM_CANDIDATES, 3] with the logarithm of the weight around each."""
 
@@ -29,7 +29,7 @@ _SCARCE = -4.0  # logit of an amount at the start: most cells hold nothing
 _APART = 2  # cells that candidates are at least apart, across or down
 
 
-class PlaceNetwork(Look):
+class LocalisationNetwork(StageNetwork):
     """Frame to position."""
 
     def __init__(self, grid: CellGrid) -> None:
@@ -61,7 +61,7 @@ class PlaceNetwork(Look):
         weights = amounts.sigmoid()
         around = F.avg_pool2d(weights.unflatten(1, (self.grid.rows, self.grid.columns))[:, None], 3, 1, 1).flatten(1)
         candidates, of_candidates = self._candidates(places, around + weights)
-        known = {PLACES: places, AMOUNTS: amounts}
+        known = {PROPOSALS: places, HEAT_MAP: amounts}
         known |= {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: of_candidates.clamp(min=_LEAST_WEIGHT).log()}
         return {}, {TRANSLATION: candidates[:, :1], **known}
 

@@ -9,10 +9,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from curio_train.camera import gaze_at, sampling_grid
+from curio_train.camera import crop_camera_at, sampling_grid
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
-from curio_train.networks.base import Look
-from curio_train.networks.two_stage.crop_pose import SURFACE
+from curio_train.networks.base import StageNetwork
+from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import CANDIDATE_LOG_WEIGHTS, CANDIDATES
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
@@ -42,12 +42,12 @@ class Optics:
     matrix: np.ndarray
     diameter_m: float
     near_m: float
-    first_look_share: int
+    localisation_stride: int
     crop_px: int
     fill: float
 
 
-class Signs(NamedTuple):
+class CalibrationFeatures(NamedTuple):
     """What the confidence is made of: the probability that the object is there, times that of reading it rightly then.
 
     Attributes:
@@ -59,7 +59,7 @@ class Signs(NamedTuple):
     there: Float[Tensor, "batch 2"]
 
 
-class GazeNetwork(nn.Module):
+class TwoStageNetwork(nn.Module):
     """Whole frame to scene code, all in one graph.
 
     A glance at each of the likeliest places. Where the first look's weight and what the second look sees of the object
@@ -73,7 +73,7 @@ class GazeNetwork(nn.Module):
         presence: Weights and offset that do so with the signs that the object is there.
     """
 
-    def __init__(self, first: Look, second: Look, optics: Optics) -> None:
+    def __init__(self, first: StageNetwork, second: StageNetwork, optics: Optics) -> None:
         super().__init__()
         self.first, self.second = first, second
         self._optics = optics
@@ -90,15 +90,15 @@ class GazeNetwork(nn.Module):
         sure = _probability(signs.right, self.rightness) * _probability(signs.there, self.presence)
         return code | {CONFIDENCE: sure[:, None, None]}
 
-    def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], Signs]:
+    def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code without its confidence's calibration, and what that is made of."""
-        seen = self.first(F.avg_pool2d(images, self._optics.first_look_share))
+        seen = self.first(F.avg_pool2d(images, self._optics.localisation_stride))
         glances = self._glance(images, seen[CANDIDATES])
         likeliest, log_weight = _likeliest(glances[TRANSLATION], glances[_EVIDENCE], seen[CANDIDATE_LOG_WEIGHTS])
         last = self._glance(images, likeliest * likeliest.new_tensor(SCALES)[:, None])
         logit, evidence = torch.logit(last[CONFIDENCE].flatten(), 1e-6), last.pop(_EVIDENCE)
         logit, evidence = (of_all.view(-1, len(SCALES)).mean(dim=1, keepdim=True) for of_all in (logit, evidence))
-        return _position_of_all(last), Signs(logit, torch.cat([evidence, log_weight], dim=1))
+        return _position_of_all(last), CalibrationFeatures(logit, torch.cat([evidence, log_weight], dim=1))
 
     def _glance(self, images: Tensor, places: Float[Tensor, "batch num 3"]) -> dict[str, Tensor]:
         """Look at crops around places, and turn what is read there back into the frame's camera.
@@ -110,7 +110,7 @@ class GazeNetwork(nn.Module):
         depth = place.norm(dim=1, keepdim=True).clamp(min=optics.near_m)  # along the crop camera's axis
         matrix = self._matrix.expand(place.shape[0], 3, 3)
         side = OVERSAMPLING * optics.crop_px
-        gaze = gaze_at(place, optics.fill * side * depth[:, 0] / optics.diameter_m, side, matrix)
+        gaze = crop_camera_at(place, optics.fill * side * depth[:, 0] / optics.diameter_m, side, matrix)
         grid = sampling_grid(gaze, matrix, side, images.shape[3], images.shape[2])
         # The crops of an image in one tall grid: no frame is copied.
         tall = grid.view(-1, places.shape[1] * side, side, 2)
@@ -122,7 +122,7 @@ class GazeNetwork(nn.Module):
         back = gaze.rotation.transpose(1, 2)
         rotation = back @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
         return {name: code[name] for name in (COLOR,) if name in code} | {
-            _EVIDENCE: _evidence(code[SURFACE]),
+            _EVIDENCE: _evidence(code[OBJECT_COORDINATES]),
             TRANSLATION: (back @ seen[..., None])[:, None, :, 0],
             ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None],
             CONFIDENCE: code[CONFIDENCE],

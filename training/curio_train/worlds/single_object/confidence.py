@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from curio_train.metrics.certainty import calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
-from curio_train.networks.two_stage.network import GazeNetwork, Signs
+from curio_train.networks.two_stage.network import CalibrationFeatures, TwoStageNetwork
 from curio_train.scene_code import poses
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
@@ -22,13 +22,13 @@ def calibrate(network: nn.Module, world: SingleObjectWorld, cache: Path) -> None
 
     Rightness is judged where the object is; as many empty frames tell what it looks like to the network if it is not.
     """
-    assert isinstance(network, GazeNetwork)
+    assert isinstance(network, TwoStageNetwork)
     source, kind = world.source("validation", 0, with_code=True, cache=cache), world.object.kind
     points = world.object.mesh.vertices_m[:: max(1, len(world.object.mesh.vertices_m) // _NUM_POINTS)]
     network.eval()
     steps = _NUM_FRAMES // _BATCH_SIZE
-    full: list[Signs] = []
-    empty: list[Signs] = []
+    full: list[CalibrationFeatures] = []
+    empty: list[CalibrationFeatures] = []
     right: list[bool] = []
     for step in range(steps):
         batch = source.batch(step, _BATCH_SIZE)
