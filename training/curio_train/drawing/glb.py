@@ -1,0 +1,204 @@
+"""Writes a scene as a GLB file, which Blender and other 3D applications open, and reads its scene code back.
+
+glTF is in metres with y up, and its cameras look along −z. The file's root frame is therefore the scene's camera frame
+(OpenCV: y down, z forward) turned so that the scene's up direction points along +y; the camera has a node of its own.
+What glTF has no field for (K, colour, confidence, the ambient light) is in the ``extras`` of the nodes.
+"""
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from curio_train.color import linear_from_srgb
+from curio_train.drawing.pictures import LIGHT, SceneContext
+from curio_train.drawing.scenes import Placed, Scene
+from curio_train.errors import DataError
+from curio_train.geometry import Pose
+from curio_train.meshes.meshes import Mesh
+
+_GLTF_FROM_CV = np.diag([1.0, -1.0, -1.0])
+_Y = np.array([0.0, 1.0, 0.0])
+_LUX = math.pi  # of a directional light of strength 1: the irradiance of a surface that faces it
+_CAMERA, _SUN = "camera", "light"
+_EXTRAS = "curio"
+
+
+def to_glb(scene: Scene, context: SceneContext) -> bytes:
+    """A scene as the bytes of a GLB file.
+
+    Each object is a node whose matrix is its pose; meshes have their own colours times the object's.
+
+    Raises:
+        DataError: An object has no mesh.
+    """
+    out = trimesh.Scene(base_frame="world")
+    root = _root_from_camera(context)
+    for number, item in enumerate(scene.objects):
+        matrix = root @ _matrix(item.pose)
+        extras = {"object": item.kind, "color": list(item.color_srgb), "confidence": item.confidence}
+        name = f"{number:02d}-{item.kind}"
+        geometry = _geometry(context.mesh(item.kind), item)
+        out.add_geometry(geometry, geom_name=name, node_name=name, transform=matrix, metadata={_EXTRAS: extras})
+    light = scene.light if scene.light is not None else context.light
+    light = np.array(LIGHT) if light is None else light
+
+    def add_camera_and_light(tree: dict[str, Any]) -> None:
+        _add_camera(tree, scene, root, context.ambient)
+        _add_light(tree, root[:3, :3] @ light)
+
+    content: bytes = trimesh.exchange.gltf.export_glb(out, tree_postprocessor=add_camera_and_light)
+    return content
+
+
+def from_glb(path: Path) -> Scene:
+    """The scene of a file that :func:`to_glb` wrote, with whatever was moved in it since.
+
+    Raises:
+        DataError: The file cannot be read, or was not written by curio.
+    """
+    tree = _tree(path)
+    nodes = {node["name"]: node for node in tree.get("nodes", ()) if _EXTRAS in node.get("extras", {})}
+    camera = nodes.pop(_CAMERA, None)
+    if camera is None:
+        raise DataError(f"{path}: found no camera written by curio; expected a file of curio-render --format glb")
+    cam_from_root = np.linalg.inv(_node_matrix(camera) @ _embed(_GLTF_FROM_CV))
+    sun = nodes.pop(_SUN)
+    strength = tree["extensions"]["KHR_lights_punctual"]["lights"][0]["intensity"] / _LUX
+    about = camera["extras"][_EXTRAS]
+    return Scene(
+        path.stem,
+        about["width"],
+        about["height"],
+        np.array(about["camera_matrix"]),
+        tuple(_placed(node, cam_from_root) for node in nodes.values()),
+        strength * (cam_from_root @ _node_matrix(sun))[:3, 2],
+        None if about["photograph"] is None else Path(about["photograph"]),
+        about["world"],
+    )
+
+
+def _root_from_camera(context: SceneContext) -> np.ndarray:
+    """Rotation of the camera's axes to glTF's with the scene's up direction along +y, [4, 4]."""
+    up = _GLTF_FROM_CV @ np.asarray(context.up, dtype=np.float64)
+    return _embed(_rotation_onto(up, _Y) @ _GLTF_FROM_CV)
+
+
+def _rotation_onto(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """A rotation [3, 3] that turns one direction into another."""
+    rotation, _ = Rotation.align_vectors(target[None], source[None])
+    matrix: np.ndarray = rotation.as_matrix()
+    return matrix
+
+
+def _linear(srgb: object) -> np.ndarray:
+    values: np.ndarray = linear_from_srgb(torch.as_tensor(np.array(srgb, dtype=np.float64))).numpy()
+    return values
+
+
+def _embed(rotation: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    return matrix
+
+
+def _matrix(pose: Pose) -> np.ndarray:
+    matrix = _embed(pose.rotation)
+    matrix[:3, 3] = pose.translation_m
+    return matrix
+
+
+def _geometry(mesh: Mesh, item: Placed) -> Any:
+    """The mesh in its own colours times the object's, as transparent as the object is uncertain."""
+    factor = [*_linear(item.color_srgb), item.confidence]
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=factor,
+        baseColorTexture=None if mesh.texture is None else Image.fromarray(mesh.texture),
+        alphaMode="OPAQUE" if item.confidence >= 1 else "BLEND",
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+    )
+    out = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
+    if mesh.texture is not None or mesh.vertex_colors_srgb is None:
+        out.visual = trimesh.visual.TextureVisuals(uv=mesh.uv, material=material)
+        return out
+    # glTF multiplies a vertex's colour in linear light.
+    albedo = _linear(mesh.vertex_colors_srgb) * factor[:3]
+    alpha = np.full((len(albedo), 1), item.confidence)
+    out.visual = trimesh.visual.ColorVisuals(
+        out, vertex_colors=np.rint(255 * np.hstack([albedo, alpha])).astype(np.uint8)
+    )
+    return out
+
+
+def _add_camera(tree: dict[str, Any], scene: Scene, root: np.ndarray, ambient: float) -> None:
+    focal = float(scene.camera_matrix[1, 1])
+    perspective = {
+        "yfov": 2 * math.atan(scene.height / 2 / focal),
+        "aspectRatio": scene.width / scene.height,
+        "znear": 0.01,
+    }
+    tree["cameras"] = [{"type": "perspective", "perspective": perspective}]
+    about = {
+        "camera_matrix": np.asarray(scene.camera_matrix).tolist(),
+        "width": scene.width,
+        "height": scene.height,
+        "ambient": ambient,
+        "photograph": None if scene.photograph is None else str(scene.photograph),
+        "world": scene.world,
+    }
+    # A glTF camera looks along −z with y up, the scene's along +z with y down.
+    _add_node(tree, _CAMERA, root @ _embed(_GLTF_FROM_CV), {"camera": 0, "extras": {_EXTRAS: about}})
+
+
+def _add_light(tree: dict[str, Any], light: np.ndarray) -> None:
+    """A directional light, which shines along −z of its node; ``light`` points towards it, in glTF's frame."""
+    strength = float(np.linalg.norm(light))
+    towards = light / strength if strength else _Y
+    matrix = _embed(_rotation_onto(np.array([0.0, 0.0, 1.0]), towards))
+    lights = [{"type": "directional", "intensity": strength * _LUX}]
+    tree.setdefault("extensions", {})["KHR_lights_punctual"] = {"lights": lights}
+    tree.setdefault("extensionsUsed", []).append("KHR_lights_punctual")
+    extension = {"extensions": {"KHR_lights_punctual": {"light": 0}}, "extras": {_EXTRAS: {}}}
+    _add_node(tree, _SUN, matrix, extension)
+
+
+def _add_node(tree: dict[str, Any], name: str, matrix: np.ndarray, more: dict[str, Any]) -> None:
+    tree["nodes"].append({"name": name, "matrix": matrix.T.ravel().tolist(), **more})
+    tree["scenes"][0]["nodes"].append(len(tree["nodes"]) - 1)
+
+
+def _tree(path: Path) -> dict[str, Any]:
+    """The JSON chunk of a GLB file."""
+    try:
+        content = path.read_bytes()
+        magic, _, _, length, _ = struct.unpack_from("<4sIIII", content)
+        tree = json.loads(content[20 : 20 + length])
+    except (OSError, struct.error, ValueError) as exc:
+        raise DataError(f"{path}: not a readable GLB file ({exc})") from exc
+    if magic != b"glTF" or not isinstance(tree, dict):
+        raise DataError(f"{path}: found no glTF header, expected a GLB file")
+    return tree
+
+
+def _node_matrix(node: dict[str, Any]) -> np.ndarray:
+    """A node's transform, as a matrix or as translation, rotation (quaternion xyzw) and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"]).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    matrix: np.ndarray = trimesh.transformations.quaternion_matrix([w, x, y, z])
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return matrix
+
+
+def _placed(node: dict[str, Any], cam_from_root: np.ndarray) -> Placed:
+    matrix, extras = cam_from_root @ _node_matrix(node), node["extras"][_EXTRAS]
+    pose = Pose(matrix[:3, :3], matrix[:3, 3])
+    return Placed(extras["object"], pose, tuple(extras["color"]), extras["confidence"])
