@@ -33,7 +33,7 @@ def draw(
     """
     if meshes and world:
         raise UsageError("--mesh and --world exclude each other: a world brings its own meshes")
-    given = _surroundings(meshes, mesh_unit, world)
+    given = SceneContext.of_world(mesh_world(world)) if world else scene_context(meshes, mesh_unit)
     for scene in read_scenes(scenes):
         around = SceneContext.of_world(mesh_world(scene.world)) if scene.world else given
         if around is None:
@@ -43,9 +43,13 @@ def draw(
         yield path
 
 
-def _surroundings(meshes: Sequence[str], mesh_unit: Unit | None, world: str | None) -> SceneContext | None:
-    if world:
-        return SceneContext.of_world(mesh_world(world))
+def scene_context(meshes: Sequence[str], mesh_unit: Unit | None) -> SceneContext | None:
+    """The meshes of objects, given as FILE or NAME=FILE; None if none is given.
+
+    Raises:
+        UsageError: Two of them have the same name.
+        MeshError: A mesh cannot be read.
+    """
     files = {name if divided else "": Path(file if divided else name) for name, divided, file in map(_parts, meshes)}
     if len(files) < len(meshes):
         raise UsageError(f"--mesh {' '.join(meshes)}: expected one FILE, or NAME=FILE with different names")

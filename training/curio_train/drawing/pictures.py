@@ -99,15 +99,25 @@ class RenderOptions:
             raise UsageError("--over-photograph and --turn-deg exclude each other: the photograph shows one side alone")
 
 
-def picture(scene: Scene, around: SceneContext, wish: RenderOptions) -> np.ndarray:
+def picture(
+    scene: Scene, around: SceneContext, wish: RenderOptions, photograph: np.ndarray | None = None
+) -> np.ndarray:
     """Draw a scene: [height, width, 3] uint8 sRGB.
+
+    Args:
+        scene: What to draw.
+        around: What the scene itself does not say.
+        wish: How to draw it.
+        photograph: [height, width, 3] uint8 sRGB to draw over, in place of the scene's file.
 
     Raises:
         DataError: An object without a mesh, or a photograph that is missing or of another size.
         RendererError: No usable libLLVM, or a mesh that cannot be rendered.
     """
     scene, around = _resized(scene, wish.height), _with_light(scene, around)
-    behind = _photograph(scene) if wish.over_photograph else None
+    behind = _fitted(photograph, scene) if photograph is not None else None
+    if wish.over_photograph:
+        behind = _photograph(scene)
     if behind is not None:
         around = replace(around, ground=None)
     scene, around = _carried(scene, around, wish.turn_deg)
@@ -140,6 +150,11 @@ def _photograph(scene: Scene) -> np.ndarray:
             f"{scene.photograph}: found {pixels.shape[1]}x{pixels.shape[0]} pixels, expected the shape of the frame "
             f"that was detected in, {scene.width}x{scene.height}; is it another file by now?"
         )
+    return _fitted(pixels, scene)
+
+
+def _fitted(pixels: np.ndarray, scene: Scene) -> np.ndarray:
+    """An image in the scene's size, in [0, 1]."""
     return cv2.resize(pixels, (scene.width, scene.height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
 
 

@@ -14,8 +14,9 @@ import torch
 from curio_train.camera import check_matrix
 from curio_train.errors import DataError
 from curio_train.geometry import Pose
-from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION
+from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, SceneCode
 from curio_train.worlds import WORLDS, build
+from curio_train.worlds.base import World
 from curio_train.worlds.generated.mesh_world import MeshWorld
 
 EXPECTED = 'a line of curio-detect with "detections", or {"world": NAME, "code": {FIELD: numbers}}'
@@ -149,6 +150,17 @@ def _from_code(record: Mapping[str, Any], number: int) -> Scene:
     world = mesh_world(str(record["world"]))
     code = {name: torch.tensor([values], dtype=torch.float32) for name, values in record["code"].items()}
     world.layout.check(code)
+    return scene_of_code(world, code, number)
+
+
+def scene_of_code(world: World, code: SceneCode, number: int) -> Scene:
+    """The scene of a code.
+
+    Args:
+        world: Before a pinhole camera.
+        code: Of one image (batch size 1).
+        number: Goes into the scene's name.
+    """
     seen = {name: values[0].double().numpy() for name, values in world.exported(code).items()}
     slots = len(seen[TRANSLATION])
     rotation = seen.get("rotation", np.broadcast_to(np.eye(3), (slots, 3, 3)))
@@ -159,10 +171,11 @@ def _from_code(record: Mapping[str, Any], number: int) -> Scene:
         for i in range(slots)
     ]
     camera = world.camera
-    assert camera.matrix is not None  # every stage has a pinhole camera
+    assert camera.matrix is not None  # only worlds with a pinhole camera come here
     name = f"{number:06d}-{world.name}"
     light = seen.get(LIGHT)
-    return Scene(name, camera.width, camera.height, camera.matrix, tuple(objects), light, world=world.name)
+    named = world.name if isinstance(world, MeshWorld) else None
+    return Scene(name, camera.width, camera.height, camera.matrix, tuple(objects), light, world=named)
 
 
 def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:

@@ -1,0 +1,161 @@
+"""What ``curio-view`` can open, as pages: a result file, photographs read by a model, a run folder, or a world."""
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from curio_train.data.photographs import read_photograph
+from curio_train.drawing.album import scene_context
+from curio_train.drawing.pictures import SceneContext
+from curio_train.drawing.scenes import Scene, mesh_world, read_scenes, scene_of_code
+from curio_train.errors import CurioError, DataError, UsageError
+from curio_train.evaluation.subject import load_subject
+from curio_train.learning.runs.configuration import CONFIG_FILE
+from curio_train.meshes.meshes import Unit
+from curio_train.worlds import WORLDS
+from curio_train.worlds.generated.mesh_world import MeshWorld
+
+NUM_DRAWN = 8
+"""Scenes that a world or a run shows."""
+
+_SEED = 7
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """One image with the scene code that was read in it.
+
+    ``image`` is [height, width, 3] uint8 sRGB: a photograph, or the rendering that a run was validated with.
+    """
+
+    scene: Scene
+    context: SceneContext
+    image: np.ndarray
+    over_image: bool
+    """Whether objects are drawn over the image (photographs), or over the world's own background."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What to open; see :func:`open_pages`."""
+
+    path: str
+    meshes: tuple[str, ...] = ()
+    mesh_unit: Unit | None = None
+    model: str | None = None
+    camera: Path | None = None
+
+
+def open_pages(opening: Opening) -> list[Page]:
+    """The pages of what a path or a name means.
+
+    A JSON Lines file of ``curio-detect`` has a page for each image; a photograph, or a folder of them, is read by
+    ``--model`` first; a run folder shows validation images of its newest checkpoint; the name of a generated world
+    draws scenes of it.
+
+    Raises:
+        UsageError: The path is none of these, or a flag is missing.
+        DataError: A file cannot be read, or holds no scene.
+        MeshError: A mesh cannot be read.
+        CheckpointError: The run folder is damaged or has no checkpoint.
+    """
+    path = Path(opening.path)
+    if not path.exists() and opening.path in WORLDS:
+        return list(_of_world(opening.path))
+    if not path.exists():
+        raise UsageError(f"{path}: there is no such file or folder, and no world of that name; expected {_EXPECTED}")
+    if (path / CONFIG_FILE).exists():
+        return list(_of_run(path))
+    if path.suffix in (".json", ".jsonl"):
+        return _of_results(path, opening)
+    return _of_photographs(path, opening)
+
+
+_EXPECTED = f"a result file of curio-detect, a photograph, a run folder, or one of the worlds {', '.join(WORLDS)}"
+
+
+def _of_world(name: str) -> Iterator[Page]:
+    world = mesh_world(name)
+    codes = world.sample(NUM_DRAWN, (_SEED,))
+    images = world.render(codes).clamp(0, 1)
+    for number in range(NUM_DRAWN):
+        scene = scene_of_code(world, {field: values[number : number + 1] for field, values in codes.items()}, number)
+        yield Page(scene, SceneContext.of_world(world), _uint8(images[number]), over_image=False)
+
+
+def _of_run(path: Path) -> Iterator[Page]:
+    """Validation images, and what the network of the newest checkpoint reads in them."""
+    subject = load_subject(path)
+    world = subject.world
+    if world.camera.matrix is None or not (isinstance(world, MeshWorld) or world.mesh):
+        raise UsageError(f"{path}: world {world.name} is flat; curio-view shows scenes in three dimensions")
+    cache = Path("~/.cache/curio-pose").expanduser()
+    images = world.source("validation", 0, with_code=False, cache=cache).batch(0, NUM_DRAWN).images
+    codes = subject.predict((images * 255).round().byte())
+    flat = isinstance(world, MeshWorld)
+    for number in range(NUM_DRAWN):
+        scene = scene_of_code(world, {field: values[number : number + 1] for field, values in codes.items()}, number)
+        context = SceneContext.of_world(world) if isinstance(world, MeshWorld) else SceneContext({"": world.mesh})
+        yield Page(scene, context, _uint8(images[number]), over_image=not flat)
+
+
+def _of_results(path: Path, opening: Opening) -> list[Page]:
+    pages = []
+    given = scene_context(opening.meshes, opening.mesh_unit)
+    for scene in read_scenes(path):
+        context = SceneContext.of_world(mesh_world(scene.world)) if scene.world else given
+        if context is None:
+            raise UsageError(f"{path}: detections do not hold the shape of the objects; add --mesh FILE or NAME=FILE")
+        for item in scene.objects:
+            context.mesh(item.kind)
+        photograph = None if scene.photograph is None else _photograph(scene.photograph, path.parent)
+        if photograph is None:
+            photograph = np.zeros((scene.height, scene.width, 3), np.uint8)
+        pages.append(Page(scene, context, photograph, over_image=scene.photograph is not None))
+    if not pages:
+        raise DataError(f"{path}: every line reports an error; there is nothing to show")
+    return pages
+
+
+def _photograph(path: Path, beside: Path) -> np.ndarray:
+    """A photograph by the path in a result file, which counts from where ``curio-detect`` was called."""
+    found = path if path.exists() else beside / path
+    return read_photograph(found if found.exists() else path)
+
+
+def _of_photographs(path: Path, opening: Opening) -> list[Page]:
+    """Read photographs with ``curio-detect``, in a process of its own, and open its result file."""
+    if opening.model is None:
+        raise UsageError(f"{path}: photographs are read by a model: add --model MODEL (and --camera FILE)")
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "found.jsonl"
+        camera: Sequence[str] = () if opening.camera is None else ("--camera", str(opening.camera))
+        script = "from curio_serve.batch.detect_cli import main; main()"
+        command = [sys.executable, "-c", script, opening.model, str(path), *camera, "--out", str(out)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode or not out.exists():
+            raise DataError(f"curio-detect {opening.model} {path} failed: {done.stderr.strip() or done.returncode}")
+        errors = [row["error"] for row in map(json.loads, out.read_text().splitlines()) if "error" in row]
+        try:
+            return _of_results(out, opening)
+        except CurioError:
+            if errors:
+                raise DataError(f"{path}: {errors[0]}") from None
+            raise
+
+
+def with_scene(page: Page, scene: Scene) -> Page:
+    """The page with another scene in front of the same image."""
+    return replace(page, scene=scene)
+
+
+def _uint8(image: torch.Tensor) -> np.ndarray:
+    pixels: np.ndarray = (image.detach().permute(1, 2, 0) * 255).round().byte().numpy()
+    return np.ascontiguousarray(pixels)
