@@ -9,6 +9,7 @@ import torch
 from curio_train.camera import Intrinsics, project
 from curio_train.config import NetworkConfig
 from curio_train.geometry import (
+    Pose,
     matrix_from_rotation_6d,
     rotation_6d_from_matrix,
     rotation_angle_deg,
@@ -133,7 +134,7 @@ def test_surface_points_project_to_the_patches_that_see_them(brick_world: TwoSta
     for image in range(8):
         v, u = torch.nonzero(seen[image], as_tuple=True)  # those at the rim, too
         metres = points[image][:, v, u].T * surface_map.half_extent_m + torch.from_numpy(surface_map.center_m).float()
-        camera = metres @ rotation[image].T + place[image]
+        camera = Pose(rotation[image], place[image]).apply(metres)
         pixels = project(camera[None], torch.from_numpy(matrices[image]).float()[None])[0]
         assert (pixels - torch.stack([u, v], dim=1)).abs().mean() < 0.3
 

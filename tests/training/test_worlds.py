@@ -65,7 +65,7 @@ def pixels_of(world: MeshWorld, code: dict[str, Tensor], novel: bool) -> np.ndar
     )
     for slot, kind in enumerate(meshes):
         own = np.einsum("bij,nj->bni", turns[:, slot], kind.mesh.vertices_m) + code[TRANSLATION][:, slot, None].numpy()
-        projected = (own @ pose.rotation.T + pose.translation_m) @ world.camera.matrix.T
+        projected = (pose.apply(own)) @ world.camera.matrix.T
         found.append((projected[..., :2] / projected[..., 2:]).reshape(-1, 2))
     return np.concatenate(found)
 

@@ -57,14 +57,13 @@ class CellGrid(nn.Module):
         self.columns, self.rows = math.ceil(width / STRIDE), math.ceil(height / STRIDE)
         self._on_plane = on_plane
         row, column = np.meshgrid(np.arange(self.rows), np.arange(self.columns), indexing="ij")
-        turn, shift = (np.asarray(part) for part in cam_from_world)
         corners = np.stack(np.meshgrid(*zip(field.lower, field.upper, strict=True)), axis=-1).reshape(-1, 3)
-        depth = (corners @ turn.T + shift)[:, 2]
+        depth = cam_from_world.apply(corners)[:, 2]
         low, high = (field.lower[1], field.upper[1]) if on_plane else (depth.min(), depth.max())
         self._middle, self._half = (low + high) / 2, (high - low) / 2
         self.pixels = self._constant(np.stack([column, row], axis=-1).reshape(-1, 2) * STRIDE)
         self._matrix, self._inverse = self._constant(matrix), self._constant(np.linalg.inv(matrix))
-        self._turn, self._shift = self._constant(turn), self._constant(shift)
+        self._rotation, self._translation = (self._constant(part) for part in cam_from_world)
         self._lower, self._upper = self._constant(field.lower), self._constant(field.upper)
 
     def _constant(self, values: ArrayLike) -> nn.Buffer:
@@ -73,7 +72,7 @@ class CellGrid(nn.Module):
 
     def project(self, position: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
         """Pixels of positions in the world frame; far off, but finite, for those that are not before the camera."""
-        seen = (position @ self._turn.T + self._shift) @ self._matrix.T
+        seen = Pose[Tensor](self._rotation, self._translation).apply(position) @ self._matrix.T
         return seen[..., :2] / seen[..., 2:].clamp(min=_LEAST_DEPTH_M)
 
     def locate(self, pixels: Float[Tensor, "*batch 2"], along: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 3"]:
@@ -87,9 +86,9 @@ class CellGrid(nn.Module):
         ray = torch.cat([pixels, torch.ones_like(along)], dim=-1) @ self._inverse.T
         wanted = self._middle + self._half * along
         if not self._on_plane:
-            position: Tensor = (ray * wanted - self._shift) @ self._turn
+            position: Tensor = (ray * wanted - self._translation) @ self._rotation
             return position
-        direction, camera = ray @ self._turn, -self._shift @ self._turn
+        direction, camera = ray @ self._rotation, -self._translation @ self._rotation
         steps = (wanted - camera[1]) / direction[..., 1:2].clamp(max=-_LEAST_DESCENT)
         span = self._upper - self._lower
         return (camera + steps * direction).clamp(self._lower - span, self._upper + span)
