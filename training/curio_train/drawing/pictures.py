@@ -221,4 +221,5 @@ def _path_traced(scene: Scene, around: SceneContext, behind: np.ndarray | None, 
 
 
 def _posed(item: Placed, around: SceneContext) -> PosedMesh:
-    return PosedMesh(around.mesh(item.kind), *item.pose, item.color_srgb, item.confidence)
+    rotation, translation_m = item.pose
+    return PosedMesh(around.mesh(item.kind), rotation, translation_m, item.color_srgb, item.confidence)
