@@ -7,8 +7,8 @@ import pytest
 import torch
 from curio_train.config import NetworkConfig, Recipe, RunConfig
 from curio_train.errors import UsageError
-from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
+from curio_train.learning.trainer import Trainer
 from curio_train.metrics.assignment import scene_error
 from curio_train.networks.grid import STRIDE, CellGrid, of_cells
 from curio_train.networks.set_detector import HEAT_MAP, cell_error, fill_slots

@@ -123,7 +123,7 @@ def test_a_full_disk_costs_no_earlier_checkpoint(tmp_path: Path, cache: Path) ->
     run = RunFolder.open(tmp_path / "run")
     before = last_tensors(run.path)
     state = run.trained(Circles())
-    state.course.step += 1
+    state.progress.step += 1
     with largest_file(50_000), pytest.raises(CheckpointError, match=r"cannot write checkpoint .*00000006 is intact"):
         run.save(state)
     assert [path.name for path in run.path.joinpath("checkpoints").iterdir()] == ["00000006"]

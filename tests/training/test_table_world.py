@@ -16,9 +16,9 @@ from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.photographed import judge
 from curio_train.export.graph import export
 from curio_train.geometry import Pose, camera_looking_at
-from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import ranks
 from curio_train.learning.runs.configuration import load_config
+from curio_train.learning.trainer import Trainer
 from curio_train.meshes.meshes import load_mesh
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW
@@ -176,7 +176,7 @@ def test_a_few_steps_bring_photographs_or_dreams_nearer(world: Table, folder: Pa
             with torch.no_grad():
                 return float(world.code_loss(trainer.state.stages[0](world.render(fixed)), fixed))
 
-        error = image_error if "image" in METHODS[method] else dream_error
+        error = image_error if METHODS[method].image else dream_error
         before = error()
         for _ in range(12):
             trainer.step(1.0)

@@ -179,7 +179,7 @@ def _origin(path: Path, subject: Subject) -> dict[str, Any]:
         "objects": [kind.name for kind in subject.world.objects],
         "method": config.method,
         "reading": config.network.reading or "whole",
-        "labels": config.labels if "label" in config.terms else 0.0,
+        "labels": config.labels if config.terms.label else 0.0,
         "labels_real": False,  # images with true codes are renderings in every world
         "labels_synthetic": uses_synthetic_labels(config),
         "preset": config.preset,
