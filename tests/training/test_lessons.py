@@ -158,8 +158,8 @@ def paths(frames: Tensor, tmp_path: Path) -> list[Path]:
     return files
 
 
-def test_photographs_make_up_their_share_once_they_are_read(
-    world: TwoStageWorld, truth: SceneCode, frames: Tensor
+def test_photographs_are_mixed_in_after_the_first_round(
+    world: TwoStageWorld, truth: SceneCode, paths: list[Path]
 ) -> None:
     network = Remembering(roughly(truth)).train()
     training = SelfTraining(network, Photographed(world.object, paths), 0.25, torch.device("cpu"))
@@ -185,9 +185,7 @@ def test_photographs_make_up_their_share_once_they_are_read(
     assert look.code_loss(look.network(NetworkConfig())(crops), mixed).isfinite()
 
 
-def test_a_network_that_began_as_a_trained_one_reads_sooner(
-    world: TwoStageWorld, truth: SceneCode, frames: Tensor
-) -> None:
+def test_a_pretrained_network_has_earlier_rounds(world: TwoStageWorld, truth: SceneCode, paths: list[Path]) -> None:
     network = Remembering(roughly(truth)).train()
     photographed = Photographed(world.object, paths)
     training = SelfTraining(network, photographed, 0.25, torch.device("cpu"), pretrained=True)
@@ -198,6 +196,6 @@ def test_a_network_that_began_as_a_trained_one_reads_sooner(
     assert training.is_due(ROUNDS_OF_PRETRAINED[1])
 
 
-def test_a_share_of_all_is_refused() -> None:
+def test_photographs_alone_are_refused() -> None:
     with pytest.raises(UsageError, match="--self-training"):
         Recipe(self_training=1.0)

@@ -223,7 +223,7 @@ def test_supervision_sees_only_its_share_of_the_images(tmp_path: Path, cache: Pa
     ("change", "message"),
     [
         ({"labels": 0.5}, "expected --method super"),
-        ({"method": "super", "labels": 1.5}, "is no share"),
+        ({"method": "super", "labels": 1.5}, "is no fraction"),
         ({"minutes": 0.0}, "--minutes is 0.0, expected more than 0"),
         ({"method": "super", "stop_below": 1.0}, "--stop-below watches the image loss"),
         ({"images": -1}, "--images is -1, expected more than 0"),
