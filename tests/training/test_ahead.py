@@ -11,13 +11,13 @@ from curio_train.camera import Intrinsics
 from curio_train.config import ConvStack, NetworkConfig, Recipe, RunConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.errors import DataError
-from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
 from curio_train.learning.prefetch import Prefetcher
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.session import learn
 from curio_train.learning.state import TrainState
+from curio_train.learning.trainer import Trainer
 from curio_train.meshes.shapes import box
 from curio_train.worlds.base import Batch, ImageSource, ObjectKind
 from curio_train.worlds.generated.circles import Circles
@@ -55,7 +55,7 @@ def test_items_are_asked_for_in_order_by_one_other_thread_one_ahead() -> None:
         assert [number for number, _ in made] == [2, 5, 8, 11]
         assert ahead.take(40) == 1600, "another number than foreseen"
     assert len({thread for _, thread in made} | {threading.get_ident()}) == 2
-    assert not any(name.startswith("ahead") for name in names())
+    assert not any(name.startswith("prefetch") for name in names())
 
 
 def test_an_error_arrives_when_its_item_is_taken_and_the_thread_ends() -> None:
@@ -75,7 +75,7 @@ def test_an_error_arrives_when_its_item_is_taken_and_the_thread_ends() -> None:
     with pytest.raises(DataError) as raised:
         take_all()
     assert raised.value is broken
-    assert not any(name.startswith("ahead") for name in names())
+    assert not any(name.startswith("prefetch") for name in names())
 
 
 def test_the_callers_number_of_threads_stays() -> None:
@@ -105,10 +105,10 @@ def test_dreams_made_ahead_teach_what_others_teach_bit_for_bit(tmp_path: Path) -
     source = world.source("train", 0, with_code=False, cache=tmp_path)
     one, other = (Trainer(CONFIG, world, [source], here) for _ in range(2))
     losses = [one.step(1.0) for _ in range(3)]
-    with other.prefetching():
+    with other.synthetic.prefetching():
         assert [other.step(1.0) for _ in range(3)] == losses
-        assert any(name.startswith("ahead") for name in names())
-    assert not any(name.startswith("ahead") for name in names())
+        assert any(name.startswith("prefetch") for name in names())
+    assert not any(name.startswith("prefetch") for name in names())
     assert [other.step(1.0)] == [one.step(1.0)]
 
 
@@ -122,14 +122,14 @@ def test_images_that_cannot_be_read_end_training_with_their_error(tmp_path: Path
     one = Trainer(CONFIG, Circles(), [Broken()], Ranks(0, 1, torch.device("cpu")))
 
     def train() -> None:
-        with one.prefetching():
+        with one.synthetic.prefetching():
             one.step(1.0)
             one.step(1.0)
 
     with pytest.raises(DataError, match="frame 3"):
         train()
-    assert one.state.course.step == 1
-    assert not any(name.startswith("ahead") for name in names())
+    assert one.state.progress.step == 1
+    assert not any(name.startswith("prefetch") for name in names())
 
 
 def test_the_renderer_draws_the_same_in_another_thread() -> None:

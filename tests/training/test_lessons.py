@@ -158,46 +158,44 @@ def paths(frames: Tensor, tmp_path: Path) -> list[Path]:
     return files
 
 
-def test_photographs_make_up_their_share_once_they_are_read(
-    world: TwoStageWorld, truth: SceneCode, frames: Tensor
+def test_photographs_are_mixed_in_after_the_first_round(
+    world: TwoStageWorld, truth: SceneCode, paths: list[Path]
 ) -> None:
     network = Remembering(roughly(truth)).train()
     training = SelfTraining(network, Photographed(world.object, paths), 0.25, torch.device("cpu"))
     look = world.stages[1]
     code = look.sample(8, (1,))
     images = look.render(code)
-    before, same = training.among(code, images, (2,))
+    before, same = training.mix_in(code, images, (2,))
     assert torch.equal(same, images)
     assert set(before) == set(code)
 
     assert not training.is_due(ROUNDS[0] - 0.01)
     assert training.is_due(ROUNDS[0])
-    training.study(ROUNDS[0])
+    training.run_round(ROUNDS[0])
     assert network.calls == 1
     assert network.training
     assert not training.is_due(ROUNDS[1] - 0.01)
     assert training.is_due(ROUNDS[1])
 
-    mixed, crops = training.among(code, images, (2,))
+    mixed, crops = training.mix_in(code, images, (2,))
     assert torch.equal(crops[:6], images[2:])
     assert not torch.equal(crops[6:], images[:2])
     assert torch.equal(mixed[TRANSLATION][:6], code[TRANSLATION][2:])
     assert look.code_loss(look.network(NetworkConfig())(crops), mixed).isfinite()
 
 
-def test_a_network_that_began_as_a_trained_one_reads_sooner(
-    world: TwoStageWorld, truth: SceneCode, frames: Tensor
-) -> None:
+def test_a_pretrained_network_has_earlier_rounds(world: TwoStageWorld, truth: SceneCode, paths: list[Path]) -> None:
     network = Remembering(roughly(truth)).train()
     photographed = Photographed(world.object, paths)
-    training = SelfTraining(network, photographed, 0.25, torch.device("cpu"), trained=True)
+    training = SelfTraining(network, photographed, 0.25, torch.device("cpu"), pretrained=True)
     assert ROUNDS_OF_PRETRAINED[0] < ROUNDS[0]
     assert training.is_due(ROUNDS_OF_PRETRAINED[0])
-    training.study(ROUNDS_OF_PRETRAINED[0])
+    training.run_round(ROUNDS_OF_PRETRAINED[0])
     assert not training.is_due(ROUNDS_OF_PRETRAINED[1] - 0.01)
     assert training.is_due(ROUNDS_OF_PRETRAINED[1])
 
 
-def test_a_share_of_all_is_refused() -> None:
+def test_photographs_alone_are_refused() -> None:
     with pytest.raises(UsageError, match="--self-training"):
         Recipe(self_training=1.0)

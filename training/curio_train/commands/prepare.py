@@ -45,7 +45,7 @@ def _usual_network(config: RunConfig, options: CaptureOptions) -> NetworkConfig:
     """Parts on a plane are read by cells, unless the call, the paper, or wake–sleep wants it otherwise."""
     if options.plane is None or config.network.reading is not None:
         return config.network
-    whole = config.preset == "paper" or config.terms > {"sleep"}
+    whole = config.preset == "paper" or config.terms.perturbs_predictions
     return replace(config.network, reading="whole" if whole else "cells")
 
 

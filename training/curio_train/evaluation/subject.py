@@ -74,7 +74,7 @@ def _from_run(path: Path) -> Subject:
     run = RunFolder.open(path)
     world = build(run.config.world)
     state = run.trained(world)
-    course = state.course
+    course = state.progress
     return Subject(
         run.config,
         world,

@@ -78,7 +78,7 @@ def read_evaluation(run: Path, images: int) -> dict[str, Any] | None:
 
 def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[str, str]]:
     terms = METHODS[made.config.method]
-    supervision = [text for term, text in _SUPERVISION.items() if term in terms] or ["none: images alone"]
+    supervision = [text for term, text in _SUPERVISION.items() if getattr(terms, term)] or ["none: images alone"]
     yield "world", spec.world
     yield "method", f"{made.config.method}, preset {made.config.preset}, seed {made.config.seed}"
     yield "supervision", "; ".join(supervision)

@@ -115,8 +115,8 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     first = run_sessions(run)[0]
     spec.commit, spec.images_seen, spec.training_seconds = (
         first.commit,
-        state.course.all_images,
-        state.course.all_seconds,
+        state.progress.all_images,
+        state.progress.all_seconds,
     )
     put_spec(model, spec)
 
@@ -126,7 +126,7 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     spec.parity_max_abs_error = refuse_disparity(answers, found)
     put_spec(model, spec)
     version = target.next_version()
-    made = Provenance(run, folder.config, first, state.course, _weights(half, rounding_error))
+    made = Provenance(run, folder.config, first, state.progress, _weights(half, rounding_error))
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),

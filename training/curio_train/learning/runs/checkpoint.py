@@ -83,14 +83,14 @@ class RunFolder:
         Raises:
             CheckpointError: It could not be written (disk full, …). The earlier ones are untouched.
         """
-        target = self.path / "checkpoints" / f"{state.course.step:08d}"
+        target = self.path / "checkpoints" / f"{state.progress.step:08d}"
         draft = target.with_name("draft.tmp")
         try:
             shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed while writing
             draft.mkdir(parents=True)
             tensors = {name: value.detach().cpu().contiguous() for name, value in state.tensors().items()}
             _write_synced(draft / "tensors.safetensors", save(tensors))
-            _write_synced(draft / "course.json", json.dumps(asdict(state.course)).encode())
+            _write_synced(draft / "course.json", json.dumps(asdict(state.progress)).encode())
             _sync_folder(draft)
             if not target.exists():  # the same step is the same checkpoint
                 draft.rename(target)

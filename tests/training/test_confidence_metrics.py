@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from curio_train.metrics.certainty import auroc, calibration, calibration_error
+from curio_train.metrics.calibration import auroc, calibration, calibration_error
 
 
 def test_a_confidence_that_is_right_as_often_as_it_says_has_no_error() -> None:
