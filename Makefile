@@ -77,5 +77,5 @@ results: $(READY)
 
 # The documentation as a site with API pages, in build/site. Dead links are found by tests/contract/test_docs.py.
 docs: $(READY)
-	@$(BIN)/mkdocs build --quiet
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	echo "docs: build/site/index.html"
