@@ -227,10 +227,10 @@ def test_confidence_weighs_what_all_glances_see(brick_world: TwoStageWorld) -> N
     weights = torch.tensor([[-3.0, -0.5]]).expand(3, 2)
     frames = torch.tensor([0.2, 0.5, 0.9])[:, None, None, None].expand(3, 3, 480, 640)
     network = brick_world.assemble([Told({TOP_PROPOSALS: candidates, TOP_LOG_WEIGHTS: weights}), Bright()])
-    _, signs = network.uncalibrated(frames)
+    _, features = network.uncalibrated(frames)
     brightness = frames[:, 0, 0, 0]
-    assert torch.allclose(signs.pose_correct[:, 0], brightness.logit(), atol=1e-4)
-    assert torch.allclose(signs.presence, torch.stack([brightness, torch.full((3,), -0.5)], dim=1), atol=1e-4)
+    assert torch.allclose(features.pose_correct[:, 0], brightness.logit(), atol=1e-4)
+    assert torch.allclose(features.presence, torch.stack([brightness, torch.full((3,), -0.5)], dim=1), atol=1e-4)
     assert torch.allclose(network(frames)[CONFIDENCE].flatten(), brightness, atol=1e-4)
     network.rightness.copy_(torch.tensor([2.0, 0.5]))
     network.presence.copy_(torch.tensor([2.0, 1.0, 0.25]))
