@@ -12,7 +12,7 @@ from curio_train.config import ConvStack, NetworkConfig, Recipe, RunConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.errors import DataError
 from curio_train.learning.parallel import Ranks
-from curio_train.learning.prefetch import Prefetcher
+from curio_train.learning.prefetch import prefetching
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.session import learn
@@ -48,7 +48,7 @@ def test_items_are_asked_for_in_order_by_one_other_thread_one_ahead() -> None:
             began.set()
         return number * number
 
-    with Prefetcher(make, 3) as ahead:
+    with prefetching(make, 3) as ahead:
         assert [ahead.take(number) for number in (2, 5, 8)] == [4, 25, 64]
         assert began.wait(10), "nothing is made ahead"
         ahead.wait_idle()
@@ -67,7 +67,7 @@ def test_an_error_arrives_when_its_item_is_taken_and_the_thread_ends() -> None:
         return number
 
     def take_all() -> None:
-        with Prefetcher(make, 1) as ahead:
+        with prefetching(make, 1) as ahead:
             assert ahead.take(0) == 0
             ahead.wait_idle()
             ahead.take(1)
@@ -81,7 +81,7 @@ def test_an_error_arrives_when_its_item_is_taken_and_the_thread_ends() -> None:
 def test_the_callers_number_of_threads_stays() -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    with Prefetcher(lambda _: torch.get_num_threads(), 1) as ahead:
+    with prefetching(lambda _: torch.get_num_threads(), 1) as ahead:
         assert ahead.take(0) == 1
         assert torch.get_num_threads() == 2
     torch.set_num_threads(before)
@@ -151,7 +151,7 @@ def test_the_renderer_draws_the_same_in_another_thread() -> None:
     threads = drjit.thread_count()
     drjit.set_thread_count(1)
     try:
-        with torch.no_grad(), Prefetcher(draw, 1) as ahead:
+        with torch.no_grad(), prefetching(draw, 1) as ahead:
             drawn = [ahead.take(number) for number in range(4)]
             ahead.wait_idle()
             for number, elsewhere in enumerate(drawn):

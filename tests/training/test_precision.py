@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from curio_train.learning.hardware import autocast, quick_bfloat16
 from curio_train.learning.muon import orthogonal
-from curio_train.learning.precision import autocast, quick_bfloat16
 
 
 @pytest.mark.parametrize("device_type", ["cpu", "cuda"])

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from curio_train.learning.threads import choose_threads
+from curio_train.learning.hardware import choose_threads
 
 
 @pytest.fixture(autouse=True)
