@@ -99,8 +99,8 @@ def _without(vector: Tensor, unit: Tensor) -> Tensor:
 def matrix_from_rotation_6d(rotation_6d: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a 6D rotation by Gram–Schmidt, Zhou et al. 2019, section B.
 
-    Any finite input gives a rotation with finite gradients: if the first column is too short, the x axis replaces it; if
-    the second is too short or parallel to the first, any perpendicular does.
+    Any finite input gives a rotation with finite gradients: the x axis replaces a first column that is too short, any
+    perpendicular replaces a second one that is too short or parallel to the first.
     """
     first, second = rotation_6d[..., :3], rotation_6d[..., 3:]
     x = _unit(first, torch.eye(3, dtype=first.dtype, device=first.device)[0].expand_as(first))

@@ -118,8 +118,8 @@ def _weights_and_notes(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     file = find_model(path).with_name(WEIGHTS_FILE)
     if not file.exists():
         raise CheckpointError(
-            f"{file.parent} was exported without {WEIGHTS_FILE} and cannot be trained further; name a newer version, or "
-            "the run folder that it was exported from"
+            f"{file.parent} was exported without {WEIGHTS_FILE} and cannot be trained further; name a newer version, "
+            "or the run folder that it was exported from"
         )
     try:
         with safe_open(file, framework="pt") as content:

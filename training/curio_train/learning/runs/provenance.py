@@ -64,9 +64,7 @@ def run_sessions(run: Path) -> list[RunSession]:
     except (OSError, ValueError, TypeError) as exc:
         raise CheckpointError(f"{run / _FILE} cannot be read ({exc}); is {run} a whole run folder?") from exc
     if not found:
-        raise CheckpointError(
-            f"{run / _FILE} has no whole line, expected one per session; is {run} a whole run folder?"
-        )
+        raise CheckpointError(f"{run / _FILE} has no whole line, expected one a session; is {run} a whole run folder?")
     return found
 
 
