@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from curio_train.camera import Intrinsics, project
+from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
 from curio_train.geometry import (
     Pose,
@@ -16,6 +16,7 @@ from curio_train.geometry import (
     rotation_between,
 )
 from curio_train.networks.base import StageNetwork
+from curio_train.networks.crop_camera import project
 from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import (
     HEAT_MAP,

@@ -11,11 +11,11 @@ import numpy as np
 from curio_proto.inference import inference_pb2 as messages
 from curio_proto.inference.inference_pb2_grpc import GRPCInferenceServiceServicer
 
+from curio_serve.api.admission import WorkQueue
 from curio_serve.api.pose_detector import CallGuard, Context
-from curio_serve.errors import ArgumentError, CurioError, ModelNotFound
+from curio_serve.errors import ArgumentError, ModelNotFound
 from curio_serve.models.model import INPUT, Model, Outputs
 from curio_serve.models.repository import Repository
-from curio_serve.server.direct_calls import Caller, Method
 from curio_serve.telemetry import Metrics
 
 _MAX_BATCH = 64
@@ -25,8 +25,8 @@ _FP32 = np.dtype("<f4")
 class InferenceService(GRPCInferenceServiceServicer):
     """Answers ``inference.GRPCInferenceService``."""
 
-    def __init__(self, repository: Repository, metrics: Metrics) -> None:
-        self._repository = repository
+    def __init__(self, repository: Repository, work: WorkQueue, metrics: Metrics) -> None:
+        self._repository, self._work = repository, work
         self._guard = CallGuard(metrics)
         self._is_ready = True
 
@@ -51,16 +51,12 @@ class InferenceService(GRPCInferenceServiceServicer):
     def ModelMetadata(self, request: messages.ModelMetadataRequest, context: Context) -> messages.ModelMetadataResponse:
         return self._guard.run("ModelMetadata", "", context, partial(self._metadata, request))
 
-    @property
-    def direct(self) -> Method:
-        """``ModelInfer``, for :mod:`curio_serve.server.direct_calls`."""
-        refused = partial(self._guard.refused, "ModelInfer", "")
-        return Method("/inference.GRPCInferenceService/ModelInfer", messages.ModelInferRequest, self._answer, refused)
+    def ModelInfer(self, request: messages.ModelInferRequest, context: Context) -> messages.ModelInferResponse:
+        return self._guard.run("ModelInfer", request.id[:128], context, partial(self._infer_in_slot, request, context))
 
-    def _answer(
-        self, request: messages.ModelInferRequest, caller: Caller, _waited_s: float
-    ) -> messages.ModelInferResponse | CurioError:
-        return self._guard.attempt("ModelInfer", request.id[:128], caller, partial(self._infer, request))
+    def _infer_in_slot(self, request: messages.ModelInferRequest, context: Context) -> messages.ModelInferResponse:
+        with self._work.slot(context):
+            return self._infer(request)
 
     def _model_ready(self, request: messages.ModelReadyRequest) -> messages.ModelReadyResponse:
         try:

@@ -15,13 +15,12 @@ from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer
 
 from curio_serve.api import messages as wire
+from curio_serve.api.admission import WorkQueue
 from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, InternalError, Overloaded, status_of
 from curio_serve.imaging import image
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.repository import Repository
-from curio_serve.server.admission import WorkQueue
-from curio_serve.server.direct_calls import Caller, Method
 from curio_serve.telemetry import LOGGER, Metrics, log
 
 Context = grpc.ServicerContext
@@ -55,23 +54,25 @@ class CallGuard:
             context.abort_with_status(wire.status_from_error(answer))
         return answer
 
-    def attempt(self, method: str, request_id: str, caller: Caller, body: Callable[[], Answer]) -> Answer | CurioError:
+    def attempt(
+        self, method: str, request_id: str, context: Context, body: Callable[[], Answer]
+    ) -> Answer | CurioError:
         """Call the body; what it raises is counted, logged and returned."""
         try:
             answer = body()
         except CurioError as exc:
-            self.refused(method, request_id, exc, caller)
+            self._refused(method, request_id, exc, context)
             return exc
         except Exception:  # noqa: BLE001 - a fault of ours, which its caller shall hear of
             LOGGER.exception("a request could not be answered")
             error = InternalError("the server failed on this request; its log says where")
-            self.refused(method, request_id, error, caller)
+            self._refused(method, request_id, error, context)
             return error
         self._requests(method, "OK").inc()
         log(logging.DEBUG, "answered", method=method, request_id=request_id)
         return answer
 
-    def refused(self, method: str, request_id: str, error: CurioError, caller: Caller) -> None:
+    def _refused(self, method: str, request_id: str, error: CurioError, context: Context) -> None:
         """Count and log a call that ends without an answer."""
         code = status_of(error)
         self._requests(method, code).inc()
@@ -82,29 +83,22 @@ class CallGuard:
             level = logging.DEBUG  # they come by the thousand, when time is shortest; the metrics count them
         if LOGGER.isEnabledFor(level):
             reason = str(error)[: wire.MAX_TEXT]
-            log(level, "refused", reason=reason, method=method, request_id=request_id, code=code, peer=caller.peer())
+            log(level, "refused", reason=reason, method=method, request_id=request_id, code=code, peer=context.peer())
 
 
 class PoseService(PoseDetectorServicer):
-    """Answers ``PoseDetector``'s calls: ``Detect`` by :attr:`direct`, the others each on a thread of its own."""
+    """Answers ``PoseDetector``'s calls, each on a thread of its own."""
 
     def __init__(self, repository: Repository, work: WorkQueue, limits: Limits, metrics: Metrics) -> None:
         self._repository, self._work, self._limits, self._metrics = repository, work, limits, metrics
         self._guard = CallGuard(metrics)
+        self._phases = [metrics.phases.labels(name) for name in ("queue", "decode", "inference")]
         self._num_streams, self._lock = 0, threading.Lock()
         metrics.streams.set_function(lambda: self._num_streams)
 
-    @property
-    def direct(self) -> Method:
-        """``Detect``, for :mod:`curio_serve.server.direct_calls`."""
-        refused = partial(self._guard.refused, "Detect", "")
-        return Method("/curio.v1.PoseDetector/Detect", messages.DetectRequest, self._answer, refused)
-
-    def _answer(
-        self, request: messages.DetectRequest, caller: Caller, waited_s: float
-    ) -> messages.DetectResponse | CurioError:
-        body = partial(self._detect_at_once, request, waited_s)
-        return self._guard.attempt("Detect", request.request_id[:_MAX_ID_LENGTH], caller, body)
+    def Detect(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
+        body = partial(self._detect_in_slot, request, context)
+        return self._guard.run("Detect", request.request_id[:_MAX_ID_LENGTH], context, body)
 
     def DetectStream(
         self, request_iterator: Iterator[messages.DetectRequest], context: Context
@@ -123,7 +117,7 @@ class PoseService(PoseDetectorServicer):
     def _frame_of_stream(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
         """One frame's answer, or why it has none; only what ends the call ends the stream."""
         request_id = request.request_id[:_MAX_ID_LENGTH]
-        body = partial(self._detect_in_turn, request, context)
+        body = partial(self._detect_in_slot, request, context, always=True)
         answer = self._guard.attempt("DetectStream.frame", request_id, context, body)
         if isinstance(answer, CallEnded):
             context.abort_with_status(wire.status_from_error(answer))
@@ -155,13 +149,12 @@ class PoseService(PoseDetectorServicer):
         model = self._repository.get(request.model.name, request.model.version)
         return messages.GetModelResponse(spec=model.spec, version=model.version)
 
-    def _detect_in_turn(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
+    def _detect_in_slot(
+        self, request: messages.DetectRequest, context: Context, *, always: bool = False
+    ) -> messages.DetectResponse:
         detectors = self._detectors(request)
-        with self._work.slot(context, always=True) as waited_s:
+        with self._work.slot(context, always=always) as waited_s:
             return self._detect(request, detectors, waited_s)
-
-    def _detect_at_once(self, request: messages.DetectRequest, waited_s: float) -> messages.DetectResponse:
-        return self._detect(request, self._detectors(request), waited_s)
 
     def _detect(
         self, request: messages.DetectRequest, detectors: list[Detector], waited_s: float
@@ -196,7 +189,8 @@ class PoseService(PoseDetectorServicer):
         answer.width, answer.height = frame.width, frame.height
         spent = answer.milliseconds
         spent.queue, spent.decode, spent.inference = waited_s * 1e3, (decoded - begun) * 1e3, (inferred - decoded) * 1e3
-        self._metrics.phases.observe(waited_s, decoded - begun, inferred - decoded)
+        for phase, seconds in zip(self._phases, (waited_s, decoded - begun, inferred - decoded), strict=True):
+            phase.observe(seconds)
         return answer
 
     def _detectors(self, request: messages.DetectRequest) -> list[Detector]:

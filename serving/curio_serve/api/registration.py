@@ -5,7 +5,7 @@ have streams, that connection is dead, and a server with any of them waits out i
 bytes come to the handler's thread unread, and are parsed there.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial, update_wrapper
 from typing import Any
 
@@ -19,19 +19,17 @@ from curio_serve.api.messages import status_from_error, unreadable
 Behavior = Callable[..., Any]
 
 
-def register(server: grpc.Server, service: ServiceDescriptor, servicer: object, without: Collection[str] = ()) -> None:
+def register(server: grpc.Server, service: ServiceDescriptor, servicer: object) -> None:
     """Answer a service's calls (one message or streams both ways) with the servicer's methods of the same names.
 
     Args:
         server: Not started yet.
         service: Its description.
         servicer: Has a method for each of the service's.
-        without: Methods that are answered otherwise.
     """
     handlers = {
         f"/{service.full_name}/{method.name}": _handler(method, getattr(servicer, method.name))
         for method in service.methods
-        if method.name not in without
     }
     server.add_generic_rpc_handlers((_Handlers(handlers),))
 

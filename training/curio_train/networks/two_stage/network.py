@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from curio_train.camera import crop_camera_at, sampling_grid
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.networks.base import StageNetwork
+from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
 from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import TOP_LOG_WEIGHTS, TOP_PROPOSALS
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
