@@ -4,7 +4,6 @@ A model's ONNX file cannot be trained further: batch norm is folded into the con
 shares constants. So each version also stores the network as it was trained, in ``weights.safetensors``.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -21,51 +20,31 @@ from curio_train.learning.state import TrainState, under
 _IMAGES, _SECONDS, _SYNTHETIC_LABELS = "images_seen", "training_seconds", "synthetic_labels"
 
 
-@dataclass(frozen=True)
-class Initial:
-    """A trained network."""
-
-    tensors: dict[str, Tensor]
-    """Its weights and buffers, by name."""
-    images_seen: int
-    """Images shown to it since its weights were random."""
-    training_seconds: float
-    """Time spent training it since its weights were random."""
-
-    @staticmethod
-    def open(path: Path) -> "Initial":
-        """The network behind a path.
-
-        Args:
-            path: A run folder, a model folder (its latest version) or a version's folder.
-
-        Raises:
-            UsageError: It is none of them.
-            CheckpointError: The run is damaged or has no checkpoint, or the model has no readable weights.
-        """
-        if _is_run(path):
-            tensors, progress = RunFolder.open(path).last()
-            return Initial(under("pose.network.", tensors), progress.all_images, progress.all_seconds)
-        tensors, notes = _weights_and_notes(path)
-        return Initial(tensors, int(notes[_IMAGES]), float(notes[_SECONDS]))
-
-
 def begin_with(state: TrainState, path: Path) -> None:
-    """Load the network behind a path (see :meth:`Initial.open`) into ``state``; optimisers and budget start anew.
+    """Load a trained network into ``state``; optimisers and budget start anew.
+
+    Args:
+        state: Of the new run.
+        path: A run folder, a model folder (its latest version) or a version's folder.
 
     Raises:
         UsageError: There is no network there, or it is of another architecture.
-        CheckpointError: It cannot be read.
+        CheckpointError: The run is damaged or has no checkpoint, or the model has no readable weights.
     """
-    initial = Initial.open(path)
+    if _is_run(path):
+        tensors, before = RunFolder.open(path).last()
+        tensors, images, seconds = under("pose.network.", tensors), before.all_images, before.all_seconds
+    else:
+        tensors, notes = _weights_and_notes(path)
+        images, seconds = int(notes[_IMAGES]), float(notes[_SECONDS])
     try:
-        state.pose.network.load_state_dict(initial.tensors)
+        state.pose.network.load_state_dict(tensors)
     except RuntimeError as exc:
         raise UsageError(
             f"--init {path}: its network does not fit this world ({str(exc).splitlines()[-1].strip()}); "
             "expected a run or a model of the same world and the same network flags"
         ) from exc
-    state.progress.images_before, state.progress.seconds_before = initial.images_seen, initial.training_seconds
+    state.progress.images_before, state.progress.seconds_before = images, seconds
 
 
 def weights_file(state: TrainState, config: RunConfig, *, half: bool) -> bytes:

@@ -18,6 +18,7 @@ import cv2
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.table import Column
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
@@ -27,6 +28,7 @@ from curio_train.learning.state import TrainingProgress
 _HISTORY = "history.jsonl"
 _STEPS_A_LINE = 20  # of history and curves
 _SECONDS_A_LINE = 10  # of the log where stderr is no terminal
+_BAR_WIDTH = 16
 
 
 class Reporter:
@@ -45,9 +47,12 @@ class Reporter:
         self._bar: Progress | None = None
         self._task = TaskID(0)
         if console.is_terminal:
-            self._bar = Progress(
-                BarColumn(), TextColumn("{task.percentage:3.0f} %  {task.description}"), console=console
+            # The bar keeps its place in narrow terminals: the text beside it is cut off at its end, the losses.
+            bar = BarColumn(_BAR_WIDTH, table_column=Column(width=_BAR_WIDTH))
+            text = TextColumn(
+                "{task.percentage:3.0f} %  {task.description}", table_column=Column(ratio=1, no_wrap=True)
             )
+            self._bar = Progress(bar, text, console=console, expand=True)
             self._task = self._bar.add_task("starting", total=1.0)
             self._bar.start()
 
@@ -98,11 +103,11 @@ class Reporter:
         self._counts.clear()
         self._since = (now.step, now.images, now.seconds)
         losses = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
-        return f"{now.images:,} images  {losses}  {rate:.0f} images/s"
+        return f"{now.images:,} images  {rate:.0f} images/s  {losses}"
 
     def _show(self, text: str, spent: float) -> None:
         seconds = self._progress.seconds
-        text += f"  {_clock(seconds * max(0.0, 1 / spent - 1))} left"
+        text = f"{_clock(seconds * max(0.0, 1 / spent - 1))} left  {text}"
         if self._bar is not None:
             self._bar.update(self._task, completed=min(spent, 1.0), description=text)
         elif seconds - self._logged_at >= _SECONDS_A_LINE:
