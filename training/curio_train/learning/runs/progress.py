@@ -48,11 +48,9 @@ class Reporter:
         self._task = TaskID(0)
         if console.is_terminal:
             # The bar keeps its place in narrow terminals: the text beside it is cut off at its end, the losses.
-            bar = BarColumn(_BAR_WIDTH, table_column=Column(width=_BAR_WIDTH))
-            text = TextColumn(
-                "{task.percentage:3.0f} %  {task.description}", table_column=Column(ratio=1, no_wrap=True)
-            )
-            self._bar = Progress(bar, text, console=console, expand=True)
+            bar_column, text_column = Column(width=_BAR_WIDTH), Column(ratio=1, no_wrap=True)
+            text = TextColumn("{task.percentage:3.0f} %  {task.description}", table_column=text_column)
+            self._bar = Progress(BarColumn(table_column=bar_column), text, console=console, expand=True)
             self._task = self._bar.add_task("starting", total=1.0)
             self._bar.start()
 
