@@ -15,7 +15,8 @@ from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from curio_train.capture.options import CalibrateCommand
-from curio_train.config import Preset, RunConfig, WorldOptions, preset_recipe
+from curio_train.commands.field_help import join_help_lines
+from curio_train.config import NetworkConfig, Preset, Recipe, RunConfig, WorldOptions, preset_recipe
 from curio_train.errors import CurioError, UsageError
 from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
 from curio_train.learning.runs.interruption import Interrupted, Interruption, interruptible
@@ -113,6 +114,7 @@ def _parse(arguments: list[str]) -> TrainCommand:
         {name: TrainCommand(config) for name, config in defaults.items()},
         {name: (kind.__doc__ or "").partition("\n\n")[0] for name, kind in WORLDS.items()},
     )
+    join_help_lines([RunConfig, Recipe, NetworkConfig])
     command: TrainCommand = tyro.cli(
         commands,
         args=arguments,
