@@ -211,8 +211,7 @@ def _evaluate(command: EvaluateCommand) -> int:
     from curio_train.evaluation.evaluate import evaluate
     from curio_train.evaluation.tables import print_evaluation
 
-    names = ("split", "num_images", "data", "bop_results", "refine", "cache")
-    given = {name: getattr(command, name) for name in names}
+    given = {name: getattr(command, name) for name in ("split", "num_images", "data", "bop_results", "refine", "cache")}
     with Console(stderr=True).status("") as status:
         result = evaluate(command.path, **given, progress=status.update, warn=_warn)
     print_evaluation(result, Console())
