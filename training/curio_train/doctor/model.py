@@ -9,8 +9,7 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_train.camera import Intrinsics
 from curio_train.doctor.finding import Finding
 from curio_train.errors import CurioError
-from curio_train.export.folder import find_model
-from curio_train.export.onnx import OnnxModel
+from curio_train.exported_model import ExportedModel, find_model
 from curio_train.meshes.meshes import METRES, Mesh
 
 _SAME_SIZE = 0.01
@@ -20,7 +19,7 @@ _OTHER_VIEW = 2.0
 def examine_model(path: Path, mesh: Mesh | None, camera: Intrinsics | None) -> Iterator[Finding]:
     """Whether the model can be run, and was trained for this mesh and such a camera."""
     try:
-        spec = OnnxModel.open(find_model(path)).spec
+        spec = ExportedModel.open(find_model(path)).spec
     except CurioError as exc:
         yield Finding("model", "bad", str(exc), fault="model unreadable")
         return

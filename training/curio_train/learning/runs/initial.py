@@ -12,7 +12,7 @@ from torch import Tensor
 
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, CurioError, ExportError, UsageError
-from curio_train.export.folder import WEIGHTS_FILE, find_model
+from curio_train.exported_model import WEIGHTS_FILE, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, load_config
 from curio_train.learning.state import TrainState, under
