@@ -1,4 +1,4 @@
-"""What is made ahead is what would have been made, in order, by one thread that ends."""
+"""Prefetched items equal those made without a thread, come in order, and the thread ends."""
 
 import threading
 from dataclasses import replace
@@ -12,7 +12,7 @@ from curio_train.config import ConvStack, NetworkConfig, Recipe, RunConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.errors import DataError
 from curio_train.learning.parallel import Ranks
-from curio_train.learning.prefetch import Prefetcher
+from curio_train.learning.prefetch import prefetching
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.session import learn
@@ -39,7 +39,7 @@ def names() -> set[str]:
     return {thread.name for thread in threading.enumerate()}
 
 
-def test_items_are_asked_for_in_order_by_one_other_thread_one_ahead() -> None:
+def test_items_are_made_in_order_by_one_other_thread_one_ahead() -> None:
     made, began = [], threading.Event()
 
     def make(number: int) -> int:
@@ -48,12 +48,12 @@ def test_items_are_asked_for_in_order_by_one_other_thread_one_ahead() -> None:
             began.set()
         return number * number
 
-    with Prefetcher(make, 3) as ahead:
-        assert [ahead.take(number) for number in (2, 5, 8)] == [4, 25, 64]
-        assert began.wait(10), "nothing is made ahead"
-        ahead.wait_idle()
+    with prefetching(make, 3) as prefetcher:
+        assert [prefetcher.take(number) for number in (2, 5, 8)] == [4, 25, 64]
+        assert began.wait(10), "nothing is prefetched"
+        prefetcher.wait_idle()
         assert [number for number, _ in made] == [2, 5, 8, 11]
-        assert ahead.take(40) == 1600, "another number than foreseen"
+        assert prefetcher.take(40) == 1600, "another number than foreseen"
     assert len({thread for _, thread in made} | {threading.get_ident()}) == 2
     assert not any(name.startswith("prefetch") for name in names())
 
@@ -67,10 +67,10 @@ def test_an_error_arrives_when_its_item_is_taken_and_the_thread_ends() -> None:
         return number
 
     def take_all() -> None:
-        with Prefetcher(make, 1) as ahead:
-            assert ahead.take(0) == 0
-            ahead.wait_idle()
-            ahead.take(1)
+        with prefetching(make, 1) as prefetcher:
+            assert prefetcher.take(0) == 0
+            prefetcher.wait_idle()
+            prefetcher.take(1)
 
     with pytest.raises(DataError) as raised:
         take_all()
@@ -81,8 +81,8 @@ def test_an_error_arrives_when_its_item_is_taken_and_the_thread_ends() -> None:
 def test_the_callers_number_of_threads_stays() -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    with Prefetcher(lambda _: torch.get_num_threads(), 1) as ahead:
-        assert ahead.take(0) == 1
+    with prefetching(lambda _: torch.get_num_threads(), 1) as prefetcher:
+        assert prefetcher.take(0) == 1
         assert torch.get_num_threads() == 2
     torch.set_num_threads(before)
 
@@ -94,7 +94,7 @@ def tensors(path: Path) -> dict[str, Tensor]:
     return state.tensors()
 
 
-def test_dreams_made_ahead_teach_what_others_teach_bit_for_bit(tmp_path: Path) -> None:
+def test_prefetched_batches_train_the_same_weights_bit_for_bit(tmp_path: Path) -> None:
     """Whole, in pieces, and without a thread: the same weights."""
     learn(CONFIG, tmp_path / "whole", Interruption(), resume=False, cache=tmp_path)
     learn(replace(CONFIG, images=16), tmp_path / "pieces", Interruption(), resume=False, cache=tmp_path)
@@ -151,9 +151,9 @@ def test_the_renderer_draws_the_same_in_another_thread() -> None:
     threads = drjit.thread_count()
     drjit.set_thread_count(1)
     try:
-        with torch.no_grad(), Prefetcher(draw, 1) as ahead:
-            drawn = [ahead.take(number) for number in range(4)]
-            ahead.wait_idle()
+        with torch.no_grad(), prefetching(draw, 1) as prefetcher:
+            drawn = [prefetcher.take(number) for number in range(4)]
+            prefetcher.wait_idle()
             for number, elsewhere in enumerate(drawn):
                 assert all(map(torch.equal, elsewhere, draw(number)))
     finally:

@@ -1,4 +1,4 @@
-"""Images read cell by cell: between pixels and positions, how slots are filled, what is wrong with a reading."""
+"""The dense detector: between pixels and positions, how slots are filled, the loss of all cells."""
 
 from pathlib import Path
 
@@ -36,27 +36,27 @@ def kinds_of(world: MeshWorld) -> list[tuple[int, ...]]:
     return [kind.slots for kind in world.objects]
 
 
-def perfect_cells(world: MeshWorld, code: SceneCode) -> tuple[Tensor, dict[str, Tensor]]:
-    """Amounts, and values of which those around an object are its own and all others are far off."""
+def perfect_predictions(world: MeshWorld, code: SceneCode) -> tuple[Tensor, dict[str, Tensor]]:
+    """A heat map, and values that are an object's own at the cells around it and far off elsewhere."""
     grid, kinds = grid_of(world), kinds_of(world)
     batch, cells = len(code[TRANSLATION]), len(grid.pixels)
     fields = [field for field in world.layout.fields if field.per_object and field.name != CONFIDENCE]
-    amounts = torch.zeros(batch, len(kinds), cells)
+    heat = torch.zeros(batch, len(kinds), cells)
     values = {field.name: torch.full((batch, len(kinds), cells, field.size), 0.3) for field in fields}
     far = grid.locate(grid.pixels, torch.zeros(cells, 1))
     values[TRANSLATION] = far.expand(batch, len(kinds), cells, 3).clone()
-    here = grid.splat_weights(grid.project(code[TRANSLATION]))
+    splat = grid.splat_weights(grid.project(code[TRANSLATION]))
     present = code[CONFIDENCE][..., 0] if CONFIDENCE in code else torch.ones(code[TRANSLATION].shape[:2])
     for image in range(batch):
         for kind, slots in enumerate(kinds):
             for slot in slots:
                 if not present[image, slot]:
                     continue
-                at = here.cell[image, slot]
-                amounts[image, kind, at] += here.weight[image, slot]
+                at = splat.cell[image, slot]
+                heat[image, kind, at] += splat.weight[image, slot]
                 for name, value in values.items():
                     value[image, kind, at] = code[name][image, slot]
-    return amounts, values
+    return heat, values
 
 
 @pytest.mark.parametrize("name", ["spheres", "light"])
@@ -77,12 +77,12 @@ def test_rays_above_the_horizon_do_not_lead_out_of_the_world(worlds: dict[str, M
     assert pixels.grad.isfinite().all()
 
 
-def test_what_is_not_before_the_camera_has_finite_pixels(worlds: dict[str, MeshWorld]) -> None:
+def test_points_behind_the_camera_have_finite_pixels(worlds: dict[str, MeshWorld]) -> None:
     pixels = grid_of(worlds["spheres"]).project(torch.tensor([[0.0, 0, 0], [0.1, 0.1, -1.0]]))
     assert pixels.isfinite().all()
 
 
-def test_a_point_is_shared_out_among_the_cells_around_it(worlds: dict[str, MeshWorld]) -> None:
+def test_a_point_is_splatted_onto_the_cells_around_it(worlds: dict[str, MeshWorld]) -> None:
     grid = grid_of(worlds["spheres"])
     pixels = torch.tensor([[16.0, 24.0], [18.0, 24.0], [20.0, 28.0], [-40.0, 400.0]])
     cell, weight = grid.splat_weights(pixels)
@@ -96,11 +96,11 @@ def test_a_point_is_shared_out_among_the_cells_around_it(worlds: dict[str, MeshW
 
 
 @pytest.mark.parametrize("name", ["spheres", "varied", "light"])
-def test_slots_are_filled_with_what_the_cells_say(worlds: dict[str, MeshWorld], name: str) -> None:
+def test_slots_are_filled_with_the_predictions_of_their_cells(worlds: dict[str, MeshWorld], name: str) -> None:
     world = worlds[name]
     code = world.sample(40, (2,))
     grid, kinds = grid_of(world), kinds_of(world)
-    amounts, values = perfect_cells(world, code)
+    heat, values = perfect_predictions(world, code)
     # Objects of a kind that share cells overwrite each other in this construction: only the others are judged.
     pixels = grid.project(code[TRANSLATION])
     kind_of_slot = torch.cat([torch.full((len(slots),), number) for number, slots in enumerate(kinds)])
@@ -110,17 +110,17 @@ def test_slots_are_filled_with_what_the_cells_say(worlds: dict[str, MeshWorld], 
     near = torch.cdist(pixels, pixels) + 1e3 * torch.eye(pixels.shape[1])
     lone = near.flatten(1).amin(dim=1) > 3 * STRIDE
     assert lone.sum() >= 3
-    found = fill_slots(grid, [len(slots) for slots in kinds], amounts, values)
+    found = fill_slots(grid, [len(slots) for slots in kinds], heat, values)
     read = {field: found.get(field, code[field]) for field in code}
     assert scene_error(world.layout, index(read, lone), index(code, lone), kinds).max() < 1e-2
 
 
 def test_the_surest_object_comes_first_and_empty_slots_last(worlds: dict[str, MeshWorld]) -> None:
     grid = grid_of(worlds["varied"])
-    amounts, along = torch.zeros(1, 1, len(grid.pixels)), torch.zeros(len(grid.pixels), 1)
-    amounts[0, 0, 35], amounts[0, 0, 130] = 0.4, 0.9
+    heat, along = torch.zeros(1, 1, len(grid.pixels)), torch.zeros(len(grid.pixels), 1)
+    heat[0, 0, 35], heat[0, 0, 130] = 0.4, 0.9
     values = {TRANSLATION: grid.locate(grid.pixels, along)[None, None]}
-    found = fill_slots(grid, [3], amounts, values)
+    found = fill_slots(grid, [3], heat, values)
     assert found[CONFIDENCE][0, :, 0].tolist() == pytest.approx([0.9, 0.4, 0.0], abs=1e-5)
     assert torch.allclose(found[TRANSLATION][0, :2], values[TRANSLATION][0, 0, [130, 35]], atol=1e-4)
     assert found[TRANSLATION].isfinite().all()
@@ -128,28 +128,28 @@ def test_the_surest_object_comes_first_and_empty_slots_last(worlds: dict[str, Me
 
 def test_two_things_in_neighbouring_cells_are_told_apart_by_where_those_put_them(worlds: dict[str, MeshWorld]) -> None:
     grid = grid_of(worlds["varied"])
-    amounts, along = torch.zeros(1, 1, len(grid.pixels)), torch.zeros(len(grid.pixels), 1)
-    amounts[0, 0, 100], amounts[0, 0, 101] = 1.0, 1.0
+    heat, along = torch.zeros(1, 1, len(grid.pixels)), torch.zeros(len(grid.pixels), 1)
+    heat[0, 0, 100], heat[0, 0, 101] = 1.0, 1.0
     shift = torch.zeros_like(grid.pixels)
     shift[101, 0] = 3.0
     apart = {TRANSLATION: grid.locate(grid.pixels + shift, along)[None, None]}
-    assert fill_slots(grid, [2], amounts, apart)[CONFIDENCE][0, :, 0].tolist() == pytest.approx([1, 1], abs=1e-5)
+    assert fill_slots(grid, [2], heat, apart)[CONFIDENCE][0, :, 0].tolist() == pytest.approx([1, 1], abs=1e-5)
     shift[101, 0] = -6.0
     together = {TRANSLATION: grid.locate(grid.pixels + shift, along)[None, None]}
-    found = fill_slots(grid, [2], amounts, together)
+    found = fill_slots(grid, [2], heat, together)
     assert found[CONFIDENCE][0, :, 0].tolist() == pytest.approx([1, 0], abs=1e-5)
     middle = grid.project(found[TRANSLATION])[0, 0] - grid.pixels[100]
     assert middle.tolist() == pytest.approx([1, 0], abs=1e-2)
 
 
-def reading(world: MeshWorld, code: SceneCode) -> dict[str, Tensor]:
-    amounts, values = perfect_cells(world, code)
+def prediction(world: MeshWorld, code: SceneCode) -> dict[str, Tensor]:
+    heat, values = perfect_predictions(world, code)
     of_scene = {field.name: code[field.name] for field in world.layout.fields if not field.per_object}
-    logits = torch.logit(amounts.clamp(1e-4, 1 - 1e-4))
+    logits = torch.logit(heat.clamp(1e-4, 1 - 1e-4))
     return {HEAT_MAP: logits, **{per_cell(name): value for name, value in values.items()}, **of_scene}
 
 
-def test_error_of_cells_is_least_at_the_truth(worlds: dict[str, MeshWorld]) -> None:
+def test_dense_loss_is_least_at_the_truth(worlds: dict[str, MeshWorld]) -> None:
     world = worlds["light"]
     code = world.sample(6, (3,))
     grid, kinds = grid_of(world), kinds_of(world)
@@ -157,7 +157,7 @@ def test_error_of_cells_is_least_at_the_truth(worlds: dict[str, MeshWorld]) -> N
     def error(read: SceneCode) -> Tensor:
         return dense_loss(world.layout, kinds, grid, read, code)
 
-    true = reading(world, code)
+    true = prediction(world, code)
     least = error(true)
     for name in (per_cell(TRANSLATION), per_cell(COLOR), LIGHT, HEAT_MAP):
         assert (error({**true, name: true[name] + 0.4}) > least + 0.05).all(), name
@@ -168,7 +168,7 @@ def test_absent_objects_teach_no_cell_anything(worlds: dict[str, MeshWorld]) -> 
     code = world.sample(6, (4,))
     moved = dict(code) | {COLOR: torch.where(code[CONFIDENCE] > 0, code[COLOR], 1 - code[COLOR])}
     assert not torch.equal(moved[COLOR], code[COLOR])
-    read, grid, kinds = reading(world, code), grid_of(world), kinds_of(world)
+    read, grid, kinds = prediction(world, code), grid_of(world), kinds_of(world)
     errors = [dense_loss(world.layout, kinds, grid, read, true) for true in (code, moved)]
     assert torch.equal(*errors)
 
@@ -192,22 +192,22 @@ def test_a_few_steps_of_every_method(worlds: dict[str, MeshWorld], name: str, me
     assert world.layout.fields[0].name in trainer.state.pose.network(images[:2])
 
 
-def test_image_loss_teaches_how_much_is_where_in_worlds_of_fixed_numbers(worlds: dict[str, MeshWorld]) -> None:
+def test_image_loss_trains_the_heat_map_in_worlds_of_fixed_numbers(worlds: dict[str, MeshWorld]) -> None:
     world = worlds["spheres"]
     network = world.network(CELLS)
     images = world.render(world.sample(4, (6,)))
     code = network(images)
     world.render(code).sum().backward()
-    of_amounts = network.cells[-1].bias.grad.view(1, -1)[:, 0]
-    assert of_amounts.abs().min() > 0
+    heat_gradient = network.cells[-1].bias.grad.view(1, -1)[:, 0]
+    assert heat_gradient.abs().min() > 0
     assert CONFIDENCE not in network.eval()(images)
 
 
-def test_methods_and_worlds_that_cells_are_not_for(worlds: dict[str, MeshWorld], tmp_path: Path) -> None:
+def test_methods_and_worlds_without_the_dense_decoder_are_refused(worlds: dict[str, MeshWorld], tmp_path: Path) -> None:
     source = worlds["spheres"].source("test", 0, with_code=False, cache=tmp_path)
     config = RunConfig(WORLDS["spheres"](), method="wake_sleep", network=CELLS)
-    with pytest.raises(UsageError, match=r"dreams around what it reads.*--reading whole"):
+    with pytest.raises(UsageError, match=r"perturbs the network's raw outputs.*--reading whole"):
         Trainer(config, worlds["spheres"], [source], CPU)
     circles = build(WORLDS["circles"]())
-    with pytest.raises(UsageError, match="--reading cells: images of circles cannot be read so"):
+    with pytest.raises(UsageError, match="--reading cells: circles has no such decoder"):
         Trainer(RunConfig(WORLDS["circles"](), method="noncur", network=CELLS), circles, [source], CPU)
