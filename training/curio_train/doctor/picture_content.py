@@ -20,27 +20,24 @@ _BLACK, _WHITE = 3, 252
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A photograph's vital signs.
-
-    Attributes:
-        path: Its file.
-        width: As stored, pixels.
-        height: As stored, pixels.
-        orientation: EXIF's; 1 is as stored.
-        focal_35mm: EXIF's focal length on 35 mm film, or 0.
-        thumbnail: [64, 64, 3] float sRGB, 0 to 255.
-        blur: 0 sharp to 1 blurred (Crété-Roffet et al. 2007), at no more than 640 pixels a side.
-        lost: Share of the pixels that are black or white, and say nothing.
-    """
+    """A photograph's vital signs."""
 
     path: Path
+    """Its file."""
     width: int
+    """As stored, pixels."""
     height: int
+    """As stored, pixels."""
     orientation: int
+    """EXIF's; 1 is as stored."""
     focal_35mm: float
+    """EXIF's focal length on 35 mm film, or 0."""
     thumbnail: np.ndarray
+    """[64, 64, 3] float sRGB, 0 to 255."""
     blur: float
+    """0 sharp to 1 blurred (Crété-Roffet et al. 2007), at no more than 640 pixels a side."""
     lost: float
+    """Share of the pixels that are black or white, and say nothing."""
 
 
 def look_at(path: Path) -> Photograph:
