@@ -23,7 +23,7 @@ from paper.run_queue import QueuedRun, carry_out
 World = Literal["circles", "spheres", "chairs", "varied", "multi", "light"]
 
 # Images that every method of a world sees with preset laptop. Full supervision learns a world's 2,000 images by heart
-# within 32,000 and is no better after 96,000 (docs/experiments.md).
+# within 32,000 and is no better after 96,000 (docs/experiments/).
 BUDGETS = {"circles": 48_000, "spheres": 32_000, "chairs": 32_000, "varied": 32_000, "multi": 32_000, "light": 32_000}
 SEVERAL_SEEDS = {"circles", "spheres"}
 _SEEDED = {"super_1.0", "noncur", "our"}

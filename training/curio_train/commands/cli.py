@@ -15,7 +15,8 @@ from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from curio_train.capture.options import CalibrateCommand
-from curio_train.config import Preset, RunConfig, WorldOptions, preset_recipe
+from curio_train.commands.field_help import join_help_lines
+from curio_train.config import NetworkConfig, Preset, Recipe, RunConfig, WorldOptions, preset_recipe
 from curio_train.errors import CurioError, UsageError
 from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
 from curio_train.learning.runs.interruption import Interrupted, Interruption, interruptible
@@ -113,6 +114,7 @@ def _parse(arguments: list[str]) -> TrainCommand:
         {name: TrainCommand(config) for name, config in defaults.items()},
         {name: (kind.__doc__ or "").partition("\n\n")[0] for name, kind in WORLDS.items()},
     )
+    join_help_lines([RunConfig, Recipe, NetworkConfig])
     command: TrainCommand = tyro.cli(
         commands,
         args=arguments,
@@ -209,8 +211,7 @@ def _evaluate(command: EvaluateCommand) -> int:
     from curio_train.evaluation.evaluate import evaluate
     from curio_train.evaluation.tables import print_evaluation
 
-    names = ("split", "num_images", "data", "bop_results", "refine", "cache")
-    given = {name: getattr(command, name) for name in names}
+    given = {name: getattr(command, name) for name in ("split", "num_images", "data", "bop_results", "refine", "cache")}
     with Console(stderr=True).status("") as status:
         result = evaluate(command.path, **given, progress=status.update, warn=_warn)
     print_evaluation(result, Console())
