@@ -15,7 +15,7 @@ from curio_train.commands import cli
 from curio_train.config import NetworkConfig
 from curio_train.data import backgrounds
 from curio_train.data.background_image import BackgroundImages, MixedBackgrounds
-from curio_train.doctor.before_training import refuse_unfit
+from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, MeshError, UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.subject import load_subject

@@ -293,7 +293,9 @@ def test_a_place_that_cannot_be_written_is_told(run: Path, tmp_path: Path, capsy
 
 
 def test_a_full_disk_leaves_nothing_behind(run: Path, tmp_path: Path) -> None:
-    limited = f'ulimit -f 2000; exec "{sys.executable}" -c "from curio_train.commands.cli import export; export()" "$@"'
+    limited = (
+        f'ulimit -f 2000; exec "{sys.executable}" -c "from curio_train.commands.export import export; export()" "$@"'
+    )
     command = ["bash", "-c", limited, "curio-export", str(run), "--out", str(tmp_path / "models")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1

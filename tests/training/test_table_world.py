@@ -10,7 +10,7 @@ import torch
 import trimesh
 from curio_train.commands import cli
 from curio_train.config import METHODS, NetworkConfig, Recipe, RunConfig
-from curio_train.doctor.before_training import refuse_unfit
+from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.photographed import judge
