@@ -87,7 +87,7 @@ class Outlines(Launch):
         return difference
 
     def _beside(self, points: OutlineSamples, lane: Any) -> tuple[ImageLocation, Any]:
-        """Samples beside the outlines as every slot sees them: (instance, slot, point, side), the last running fastest."""
+        """Samples beside the outlines, seen by every slot: (instance, slot, point, side), the last fastest."""
         mi, dr, n, per_instance = self.mi, self.dr, self.set.num_slots, self.set.outline_samples
         entry = lane >> 1
         block = entry // per_instance

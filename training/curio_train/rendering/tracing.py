@@ -29,7 +29,7 @@ class LayerTracer:
         return dr.squared_norm(arm) - dr.square(dr.dot(arm, ray.d)) / dr.squared_norm(ray.d) <= SPHERE * SPHERE
 
     def intersect(self, instances: Instances, instance: Any, ray: Any, active: Any, nearest: float) -> Any:
-        """The detached preliminary intersection with the instance's own object: which face, where on it, at which depth.
+        """Detached preliminary intersection with the instance's object: which face, where on it, at which depth.
 
         Only the part of the ray within the object's bounding sphere is traced. The other objects of the static scene
         are then out of reach, and float32 is spent on the object instead of on the way there. Nothing before the ray
