@@ -44,7 +44,7 @@ def ball() -> Mesh:
 
 @pytest.fixture(scope="module")
 def post_on_a_plate() -> Mesh:
-    """The plate faces the camera, the post sticks out of it towards the camera."""
+    """The background image faces the camera, the post sticks out of it towards the camera."""
     plate = trimesh.creation.box(extents=(0.24, 0.24, 0.01))
     post = trimesh.creation.box(extents=(0.03, 0.03, 0.1))
     post.apply_translation([0, 0, -0.055])

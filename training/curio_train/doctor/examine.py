@@ -96,7 +96,7 @@ _BROKEN = "photographs unreadable"  # all that matters about other scenes: they 
 
 
 def refuse_unfit(options: CaptureOptions) -> list[str]:
-    """Compare the meshes, the camera, the photographs and the plate; read every other background.
+    """Compare the meshes, the camera, the photographs and the background image; read every other background.
 
     Returns:
         What is doubtful about them, a line each.

@@ -93,20 +93,20 @@ class RenderOptions:
             raise UsageError("--over-photograph and --turn-deg exclude each other: the photograph shows one side alone")
 
 
-def picture(scene: Scene, around: SceneContext, wish: RenderOptions) -> np.ndarray:
+def picture(scene: Scene, around: SceneContext, options: RenderOptions) -> np.ndarray:
     """Draw a scene: [height, width, 3] uint8 sRGB.
 
     Raises:
         DataError: An object without a mesh, or a photograph that is missing or of another size.
         RendererError: No usable libLLVM, or a mesh that cannot be rendered.
     """
-    scene, around = _resized(scene, wish.height), _with_light(scene, around)
-    behind = _photograph(scene) if wish.over_photograph else None
+    scene, around = _resized(scene, options.height), _with_light(scene, around)
+    behind = _photograph(scene) if options.over_photograph else None
     if behind is not None:
         around = replace(around, ground=None)
-    scene, around = _carried(scene, around, wish.turn_deg)
-    draw = _path_traced if wish.path_traced else _rendered
-    image = draw(scene, around, behind, wish.samples)
+    scene, around = _carried(scene, around, options.turn_deg)
+    draw = _path_traced if options.path_traced else _rendered
+    image = draw(scene, around, behind, options.samples)
     return np.asarray((image.clip(0, 1) * 255 + 0.5).astype(np.uint8))
 
 

@@ -77,9 +77,9 @@ def _found(folder: Path) -> Iterator[Candidate]:
                 yield Candidate(path, spec.objects[0].name, _method(json.loads(spec.recipe)), files_sha256(file))
 
 
-def _method(making: Mapping[str, Any]) -> str:
+def _method(provenance: Mapping[str, Any]) -> str:
     """Models that are older than self-training say nothing of it."""
-    return str(making["method"]) + (SELF_TRAINED if making["recipe"].get("self_training") else "")
+    return str(provenance["method"]) + (SELF_TRAINED if provenance["recipe"].get("self_training") else "")
 
 
 def files_sha256(*files: Path) -> str:

@@ -146,7 +146,7 @@ def score(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, floa
     return scores
 
 
-def certainty(world: World, predicted: SceneCode, true: SceneCode, on_empty: SceneCode) -> dict[str, float]:
+def calibration(world: World, predicted: SceneCode, true: SceneCode, on_empty: SceneCode) -> dict[str, float]:
     """What the confidence of one object is worth.
 
     Once as the probability that ADD(-S) is below a tenth of the diameter, once as a sign that the object is there.
@@ -164,7 +164,7 @@ def _scored(world: World, predict: Predict, held_out: HeldOut) -> tuple[SceneCod
     predicted = read(predict, held_out.images)
     scores = score(world, predicted, held_out.code)
     if held_out.empty is not None:
-        scores |= certainty(world, predicted, held_out.code, read(predict, held_out.empty))
+        scores |= calibration(world, predicted, held_out.code, read(predict, held_out.empty))
     return predicted, scores
 
 

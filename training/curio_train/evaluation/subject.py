@@ -70,13 +70,13 @@ def _from_run(path: Path) -> Subject:
     run = RunFolder.open(path)
     world = build(run.config.world)
     state = run.trained(world)
-    course = state.progress
+    progress = state.progress
     return Subject(
         run.config,
         world,
         _reader(state.pose.network),
-        course.all_images,
-        course.all_seconds,
+        progress.all_images,
+        progress.all_seconds,
         run_sessions(path)[0].commit,
     )
 
