@@ -27,7 +27,7 @@ from torch import Tensor
 
 from curio_train.data.background_difference import compare
 from curio_train.metrics.images import blurred
-from curio_train.refinement.inpainting import filled_in
+from curio_train.refinement.inpainting import inpainted
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
 
@@ -92,7 +92,7 @@ def explained(photographs: Tensor, drawing: Drawing) -> Float[Tensor, " num"]:
     """
     mask, reach = drawing.silhouette, max(1, round(_AROUND * photographs.shape[-1]))
     around = F.max_pool2d(mask[:, None].float(), 2 * reach + 1, 1, reach) > 0
-    behind, seen = filled_in(photographs, around), blurred(photographs)
+    behind, seen = inpainted(photographs, around), blurred(photographs)
     gains = _gains(seen, blurred(drawing.over(photographs)), mask)
     drawn = gains * blurred(drawing.over_black) + blurred(drawing.through * behind)
     left, without = (_missed(image, seen, around[:, 0]) for image in (drawn, blurred(behind)))

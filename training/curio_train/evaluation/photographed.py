@@ -24,7 +24,10 @@ from curio_train.evaluation.agreement import differing, draw, explained, inside,
 from curio_train.evaluation.subject import Predict
 from curio_train.metrics.images import blurred, dssim
 from curio_train.scene_code import CONFIDENCE, SceneCode
-from curio_train.worlds.base import View, World
+from curio_train.worlds.base import PhotographSet, World
+from curio_train.worlds.single_object.capture import CapturePhotographs
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.tabletop.world import TabletopWorld
 
 _TRUSTED, _DOUBTFUL = 0.9, 0.6
 _NAMES = ("own_view", "second_view")
@@ -64,22 +67,27 @@ def judge(world: World, predict: Predict) -> Judgement | None:
     """Compare re-renderings with photographs; None in worlds without photographs to judge by.
 
     Args:
-        world: With its views, or its photographs.
+        world: With its photographs.
         predict: Reads the own camera's photographs.
 
     Raises:
         DataError: A photograph or the plate cannot be read, or is not of the camera's size.
     """
-    if views := world.views():
-        return _on_plane(world, predict, views)
-    photographs = world.photographs(_NUM_IN_SPACE)
-    return None if photographs is None else _in_space(world, predict, photographs, world.plate())
+    if isinstance(world, TabletopWorld):
+        return _on_plane(world, predict)
+    if isinstance(world, TwoStageWorld) and isinstance(world.photographs, CapturePhotographs):
+        photographs = world.photographs
+        return _in_space(world, predict, photographs.judged(_NUM_IN_SPACE), photographs.background_image())
+    return None
 
 
-def _on_plane(world: World, predict: Predict, views: Sequence[View]) -> Judgement:
+def _on_plane(world: TabletopWorld, predict: Predict) -> Judgement:
+    views = [view for view in (world.photographs.own, world.photographs.second) if view is not None]
     code = _read(predict, views[0].photographs)
     drawn = [_drawn(world, number, code) for number in range(len(views))]
-    agreed, _ = _agreement(world, _certain(code), views[0].photographs.float() / 255, views[0].plate.float() / 255)
+    agreed, _ = _agreement(
+        world, _certain(code), views[0].photographs.float() / 255, views[0].background_image.float() / 255
+    )
     metrics = _means(agreed)
     for name, view, images in zip(_NAMES, views, drawn, strict=False):
         error, of_plate = _errors(view, images)
@@ -149,14 +157,14 @@ def _read(predict: Predict, photographs: Tensor) -> SceneCode:
     return {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
 
 
-def _drawn(world: World, view: int, code: SceneCode) -> Tensor:
+def _drawn(world: TabletopWorld, view: int, code: SceneCode) -> Tensor:
     """The scenes as the own (0) or the second camera sees them."""
     return (world.novel_view(code) if view else world.render(code)).clamp(0, 1)
 
 
-def _errors(view: View, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def _errors(view: PhotographSet, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Of re-renderings, and of the plate in place of them."""
-    photographs, plate = view.photographs.float() / 255, view.plate.float() / 255
+    photographs, plate = view.photographs.float() / 255, view.background_image.float() / 255
     of_both = []
     for shown in (images, plate.expand_as(photographs)):
         soft = dssim(blurred(shown), blurred(photographs))
