@@ -122,7 +122,7 @@ def of_nothing(version: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "error", "text"),
     [
-        (without_weights, CheckpointError, r"circles/1 was exported without weights to go on from"),
+        (without_weights, CheckpointError, r"circles/1 was exported without weights.safetensors"),
         (cut, CheckpointError, r"weights\.safetensors cannot be read .*export the model anew"),
         (of_nothing, UsageError, "neither a run folder .* nor a model"),
     ],

@@ -19,31 +19,28 @@ _VALUES_AT_ONCE = 2**17  # half a megabyte: what lies between two operations sta
 
 @dataclass(frozen=True)
 class AugmentationStrength:
-    """How much pictures are disturbed: each by amounts drawn evenly from these ranges.
-
-    Attributes:
-        occluded: Share of the images with something in front.
-        shade: Largest standard deviation of the logarithm of uneven light.
-        gamma: Largest logarithm, up or down, of the exponent on values.
-        saturation: Least and largest factor on colours' difference from grey.
-        exposure: Least and largest factor on values.
-        tint: Largest share by which a channel is lighter or darker than that.
-        contrast: Least and largest factor on values' difference from their mean.
-        offset: Largest that is then added or taken away.
-        blur: Largest weight of the image behind a Gaussian of one pixel, beside the sharp one.
-        noise: Largest standard deviation.
-    """
+    """How much pictures are disturbed: each by amounts drawn evenly from these ranges."""
 
     occluded: float
+    """Share of the images with something in front."""
     shade: float
+    """Largest standard deviation of the logarithm of uneven light."""
     gamma: float
+    """Largest logarithm, up or down, of the exponent on values."""
     saturation: tuple[float, float]
+    """Least and largest factor on colours' difference from grey."""
     exposure: tuple[float, float]
+    """Least and largest factor on values."""
     tint: float
+    """Largest share by which a channel is lighter or darker than that."""
     contrast: tuple[float, float]
+    """Least and largest factor on values' difference from their mean."""
     offset: float
+    """Largest that is then added or taken away."""
     blur: float
+    """Largest weight of the image behind a Gaussian of one pixel, beside the sharp one."""
     noise: float
+    """Largest standard deviation."""
 
 
 UNKNOWN_SCENE = AugmentationStrength(

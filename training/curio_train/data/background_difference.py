@@ -17,17 +17,14 @@ _LEAST_LIGHT = 1e-3
 
 
 class BackgroundDifference(NamedTuple):
-    """Photographs beside their plate.
-
-    Attributes:
-        difference: Largest of the three channels', sRGB, exposure allowed for.
-        differs: Where it is clear.
-        shaded: Where the photograph is the plate made darker.
-    """
+    """Photographs beside their plate."""
 
     difference: Float[Tensor, "num height width"]
+    """Largest of the three channels', sRGB, exposure allowed for."""
     differs: Bool[Tensor, "num height width"]
+    """Where it is clear."""
     shaded: Bool[Tensor, "num height width"]
+    """Where the photograph is the plate made darker."""
 
 
 def compare(

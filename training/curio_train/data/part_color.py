@@ -30,17 +30,14 @@ _LARGEST_SPREAD = 0.12  # of the photographs' tints, as shares of the largest ch
 
 @dataclass(frozen=True)
 class FoundColor:
-    """A part's colour.
-
-    Attributes:
-        hex: As in HTML, sRGB, such as #8a6f4c.
-        num_used: Photographs that show it.
-        num_compared: Photographs looked at.
-    """
+    """A part's colour."""
 
     hex: str
+    """As in HTML, sRGB, such as #8a6f4c."""
     num_used: int
+    """Photographs that show it."""
     num_compared: int
+    """Photographs looked at."""
 
 
 def is_unpainted(mesh: Mesh) -> bool:

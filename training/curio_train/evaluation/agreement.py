@@ -40,15 +40,12 @@ _DARKEST = 0.02  # of a rendering's pixels that a gain is read from
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """Scenes drawn so that they can be laid over anything.
-
-    Attributes:
-        over_black: [num, 3, height, width], sRGB in [0, 1].
-        through: Likewise, the share of what is behind that is seen.
-    """
+    """Scenes drawn so that they can be laid over anything."""
 
     over_black: Tensor
+    """[num, 3, height, width], sRGB in [0, 1]."""
     through: Tensor
+    """Likewise, the share of what is behind that is seen."""
 
     @property
     def silhouette(self) -> Bool[Tensor, "num height width"]:

@@ -21,19 +21,16 @@ SELF_TRAINED = ", self-trained"
 
 @dataclass(frozen=True)
 class Candidate:
-    """A run or a model of one LineMOD class.
-
-    Attributes:
-        path: Its folder.
-        name: The class.
-        method: That trained it; ``, self-trained`` follows where unlabelled real frames took part.
-        weights_sha256: Of the last checkpoint's tensors, or of the model file.
-    """
+    """A run or a model of one LineMOD class."""
 
     path: Path
+    """Its folder."""
     name: str
+    """The class."""
     method: str
+    """That trained it; ``, self-trained`` follows where unlabelled real frames took part."""
     weights_sha256: str
+    """Of the last checkpoint's tensors, or of the model file."""
 
 
 def candidates(folder: Path, flag: str = "--runs", *, of_any_method: bool = True) -> list[Candidate]:

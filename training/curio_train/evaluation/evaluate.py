@@ -33,17 +33,14 @@ _SEED = 0  # of the images: the same for every run, so that figures can be compa
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Images of a split with their true codes.
-
-    Attributes:
-        images: uint8 [num_images, 3, height, width].
-        code: Of all images.
-        empty: uint8 [num, 3, height, width], backgrounds without the object, in worlds whose codes have a confidence.
-    """
+    """Images of a split with their true codes."""
 
     images: Tensor
+    """Uint8 [num_images, 3, height, width]."""
     code: SceneCode
+    """Of all images."""
     empty: Tensor | None = None
+    """Uint8 [num, 3, height, width], backgrounds without the object, in worlds whose codes have a confidence."""
 
 
 def evaluate(

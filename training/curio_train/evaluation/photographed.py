@@ -39,22 +39,19 @@ _DRAWN_AT_ONCE = 8  # frames of a camera are larger than images of a plane
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """How far re-renderings are from photographs.
-
-    Attributes:
-        metrics: Means ``own_view_inside`` and ``own_view_overlap`` (without a plate ``own_view_explained``). In free
-            space ``own_view_agreeing``, the share of photographs. On a plane of each view ``…_dssim`` and
-            ``…_dssim_blurred``, the same of the empty plate as ``…_plate_…``, and ``better_than_plate``, the share of
-            scenes in which the last view is nearer than its plate.
-        verdict: Whether to trust the model, and what to do if not.
-        columns: Photograph and re-rendering of each view by heading, [num, 3, height, width] in [0, 1], worst first.
-        captions: The figures of each row.
-    """
+    """How far re-renderings are from photographs."""
 
     metrics: Mapping[str, float]
+    """Means ``own_view_inside`` and ``own_view_overlap`` (without a plate ``own_view_explained``). In free space
+    ``own_view_agreeing``, the share of photographs. On a plane of each view ``…_dssim`` and ``…_dssim_blurred``, the
+    same of the empty plate as ``…_plate_…``, and ``better_than_plate``, the share of scenes in which the last view is
+    nearer than its plate."""
     verdict: str
+    """Whether to trust the model, and what to do if not."""
     columns: Mapping[str, Tensor]
+    """Photograph and re-rendering of each view by heading, [num, 3, height, width] in [0, 1], worst first."""
     captions: Sequence[str]
+    """The figures of each row."""
 
     @property
     def summary(self) -> dict[str, Any]:

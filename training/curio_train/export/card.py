@@ -25,21 +25,18 @@ _SUPERVISION = {
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a version comes from.
-
-    Attributes:
-        run: The run folder.
-        config: What was learned and how.
-        sitting: The first sitting of training.
-        course: How far it came.
-        weights: How they are stored, and what that costs.
-    """
+    """Where a version comes from."""
 
     run: Path
+    """The run folder."""
     config: RunConfig
+    """What was learned and how."""
     sitting: RunSession
+    """The first sitting of training."""
     course: TrainingProgress
+    """How far it came."""
     weights: str
+    """How they are stored, and what that costs."""
 
 
 def card(

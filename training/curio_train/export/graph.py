@@ -45,19 +45,16 @@ _LEAST_SETTLED = 0.25  # of the check images
 
 @dataclass(frozen=True)
 class Exported:
-    """What became of an export.
-
-    Attributes:
-        path: The version's folder.
-        parity_error: Largest absolute difference between the network, its weights rounded as stored, and onnxruntime.
-        rounding_error: Largest absolute difference between that network and the one that was trained; 0 in float32.
-        num_bytes: Of model.onnx.
-    """
+    """What became of an export."""
 
     path: Path
+    """The version's folder."""
     parity_error: float
+    """Largest absolute difference between the network, its weights rounded as stored, and onnxruntime."""
     rounding_error: float
+    """Largest absolute difference between that network and the one that was trained; 0 in float32."""
     num_bytes: int
+    """Of model.onnx."""
 
 
 class Graph(nn.Module):

@@ -33,15 +33,12 @@ _PROBE_TURNS_DEG = (19.0, 47.0, 73.0, 101.0, 137.0, 163.0)  # multiples of no 36
 
 @dataclass(frozen=True)
 class Symmetries:
-    """What leaves the shape as it is, beside doing nothing.
-
-    Attributes:
-        discrete: Each [4, 4], object frame, metres.
-        continuous: Each (unit axis [3], point on it in metres [3]); any turn about it counts.
-    """
+    """What leaves the shape as it is, beside doing nothing."""
 
     discrete: tuple[np.ndarray, ...]
+    """Each [4, 4], object frame, metres."""
     continuous: tuple[tuple[np.ndarray, np.ndarray], ...]
+    """Each (unit axis [3], point on it in metres [3]); any turn about it counts."""
 
     def as_bop(self) -> dict[str, list[object]]:
         """Fields ``symmetries_discrete`` and ``symmetries_continuous`` of BOP, in mm; none that would be empty."""
