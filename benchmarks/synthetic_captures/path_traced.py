@@ -53,7 +53,7 @@ class PathTracedScene:
         """Build the scene once; later only positions change, so that kernels are compiled once.
 
         Args:
-            things: What may stand on the table.
+            objects: What may stand on the table.
             table_srgb: [height, width, 3] uint8, the table's look.
             table_side_m: Of the square table.
             camera_matrix: K [3, 3] with the principal point in the middle, as Mitsuba's lens wants it.

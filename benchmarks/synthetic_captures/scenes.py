@@ -73,9 +73,7 @@ def bunny_like() -> Mesh:
 
 
 def bracket() -> Mesh:
-    """A machined part: a background image with an upright, a rib on one side and a pin. No two sides are alike. About
-    10 cm.
-    """
+    """A machined part of about 10 cm: a base with an upright, a rib on one side and a pin. No two sides are alike."""
     blocks = [
         ((0.08, 0.012, 0.05), (0.0, 0.0, 0.0)),
         ((0.014, 0.05, 0.05), (-0.033, 0.031, 0.0)),

@@ -314,7 +314,7 @@ class _Everything(Circles):
 def test_physical_outputs_hold_the_scene_code() -> None:
     world, generator = _Everything(), torch.Generator().manual_seed(0)
     code = {f.name: torch.rand(world.layout.shape(f, 5), generator=generator) for f in world.layout.fields}
-    outputs = world.exported(code)
+    outputs = world.outputs.from_code(code)
     assert {name: tuple(value.shape) for name, value in outputs.items()} == {
         TRANSLATION: (5, 2, 3), ROTATION_6D: (5, 2, 6), CONFIDENCE: (5, 2), "rotation": (5, 2, 3, 3)
     }  # fmt: skip
@@ -322,10 +322,10 @@ def test_physical_outputs_hold_the_scene_code() -> None:
     assert rotation @ rotation.transpose(-1, -2) == pytest.approx(torch.eye(3).expand(5, 2, 3, 3), abs=1e-5)
     columns = rotation[..., :2].transpose(-1, -2).flatten(-2)
     assert outputs[ROTATION_6D] == pytest.approx(columns, abs=1e-6)
-    back = world.from_exported(outputs)
+    back = world.outputs.to_code(outputs)
     world.layout.check(back)
     assert torch.equal(back[CONFIDENCE], code[CONFIDENCE])
-    assert world.exported(back)["rotation"] == pytest.approx(rotation, abs=1e-5)
+    assert world.outputs.from_code(back)["rotation"] == pytest.approx(rotation, abs=1e-5)
 
 
 def test_differences_that_are_not_numbers_are_infinite() -> None:

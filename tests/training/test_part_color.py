@@ -17,8 +17,7 @@ from curio_train.errors import UsageError
 from curio_train.scene_code import COLOR, CONFIDENCE
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object.base_colors import base_colors_near
-from curio_train.worlds.single_object.world import any_base_color
+from curio_train.worlds.single_object.base_colors import any_base_color, base_colors_near
 
 WIDTH, HEIGHT = 160, 120
 SRGB = {"red": (0.78, 0.2, 0.16), "pale": (0.8, 0.78, 0.7), "black": (0.08, 0.08, 0.1), "teal": (0.1, 0.5, 0.5)}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from curio_train.capture.plane import CameraPoseFile, ever_changed, seen_points
+from curio_train.capture.plane import CameraPoseFile, changed_pixels, points_on_plane
 from curio_train.errors import CameraError, DataError
 from curio_train.geometry import Pose
 
@@ -25,7 +25,7 @@ def camera(tilt_deg: float) -> np.ndarray:
 
 def test_pixels_look_at_the_plane_and_nothing_above_the_horizon() -> None:
     level = camera(5)
-    points = seen_points(MATRIX, level, WIDTH, HEIGHT)
+    points = points_on_plane(MATRIX, level, WIDTH, HEIGHT)
     assert np.isnan(points[0]).all()
     seen = points[np.isfinite(points).all(axis=2)]
     assert len(seen) > 1000
@@ -41,10 +41,10 @@ def test_where_things_ever_were_is_told_from_noise_and_exposure() -> None:
     plate = random.integers(100, 140, (3, 64, 64)).astype(np.uint8)
     photographs = [(plate * random.uniform(0.95, 1.05)).clip(0, 255).astype(np.uint8) for _ in range(20)]
     with pytest.raises(DataError, match="nothing but the background image"):
-        ever_changed(photographs, [plate] * 20)
+        changed_pixels(photographs, [plate] * 20)
     for number, photograph in enumerate(photographs):
         photograph[:, 20:30, 2 * number : 2 * number + 8] = 20
-    mask = ever_changed(photographs, [plate] * 20)
+    mask = changed_pixels(photographs, [plate] * 20)
     assert mask[22:28, 4:40].all()
     assert not mask[:15].any()
     assert not mask[35:].any()

@@ -216,5 +216,5 @@ def test_the_benchmark_asks_for_worlds_that_there_are(monkeypatch: pytest.Monkey
         command = _parse([run.world, "--images", str(run.images), *run.flags])
         world = command.config.world
         assert isinstance(world, CaptureOptions)
-        assert (world.lying, len(world.amounts)) == (scene == "bunny", len(world.mesh))
+        assert (world.lying, len(world.count_ranges)) == (scene == "bunny", len(world.mesh))
         assert command.config.method + "_cells" * (command.config.network.reading == "cells") == method

@@ -19,13 +19,9 @@ from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.single_object.two_stage import (
-    ASSUMED_M,
-    CROP_PX,
-    LARGEST_LOG_SCALE,
-    LARGEST_OFFSET,
-    TwoStageWorld,
-)
+from curio_train.worlds.single_object.crop_pose_loss import ASSUMED_DEPTH
+from curio_train.worlds.single_object.crop_pose_stage import CROP_PX, MAX_LOG_SCALE, MAX_OFFSET
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
@@ -85,12 +81,12 @@ def test_crops_look_like_what_their_codes_render(world: TwoStageWorld, truth: Sc
 def test_codes_are_those_of_a_first_look_that_errs(world: TwoStageWorld, truth: SceneCode, frames: Tensor) -> None:
     code, _ = PseudoLabels(world, frames, truth).draw(64, (4,))
     slope = (code[TRANSLATION][..., :2] / code[TRANSLATION][..., 2:]).abs()
-    assert 0.7 * LARGEST_OFFSET < slope.max() < 1.15 * LARGEST_OFFSET  # the crop's camera is turned, too
+    assert 0.7 * MAX_OFFSET < slope.max() < 1.15 * MAX_OFFSET  # the crop's camera is turned, too
     logs = code[TRANSLATION][..., 2].log()
-    assert logs.min() < -0.7 * LARGEST_LOG_SCALE
-    assert logs.max() > 0.7 * LARGEST_LOG_SCALE
-    assert logs.abs().max() < 1.1 * LARGEST_LOG_SCALE
-    expected = {TRANSLATION, ROTATION_6D, LIGHT, CONFIDENCE, ASSUMED_M, OBJECT_COORDINATES}
+    assert logs.min() < -0.7 * MAX_LOG_SCALE
+    assert logs.max() > 0.7 * MAX_LOG_SCALE
+    assert logs.abs().max() < 1.1 * MAX_LOG_SCALE
+    expected = {TRANSLATION, ROTATION_6D, LIGHT, CONFIDENCE, ASSUMED_DEPTH, OBJECT_COORDINATES}
     assert set(code) == expected
     assert (code[CONFIDENCE] == 1).all()
     strength = truth[LIGHT].norm(dim=1)
@@ -140,15 +136,18 @@ class Remembering(nn.Module):
         return {name: value[: len(images)] for name, value in self.code.items()}
 
 
-class Photographed(TwoStageWorld):
-    """A world with photographs."""
+class Photographs:
+    """Photographs without camera poses."""
 
-    def __init__(self, thing: Object, paths: list[Path]) -> None:
-        super().__init__("photographed", thing)
+    def __init__(self, paths: list[Path]) -> None:
         self.paths = paths
 
     def unlabelled(self) -> UnlabelledPhotographs:
         return UnlabelledPhotographs(self.paths)
+
+
+def photographed(object_: Object, paths: list[Path]) -> TwoStageWorld:
+    return TwoStageWorld("photographed", object_, Photographs(paths))
 
 
 @pytest.fixture
@@ -163,7 +162,7 @@ def test_photographs_are_mixed_in_after_the_first_round(
     world: TwoStageWorld, truth: SceneCode, paths: list[Path]
 ) -> None:
     network = Remembering(roughly(truth)).train()
-    training = SelfTraining(network, Photographed(world.object, paths), 0.25, torch.device("cpu"))
+    training = SelfTraining(network, photographed(world.object, paths), 0.25, torch.device("cpu"))
     look = world.stages[1]
     code = look.sample(8, (1,))
     images = look.render(code)
@@ -188,8 +187,7 @@ def test_photographs_are_mixed_in_after_the_first_round(
 
 def test_a_pretrained_network_has_earlier_rounds(world: TwoStageWorld, truth: SceneCode, paths: list[Path]) -> None:
     network = Remembering(roughly(truth)).train()
-    photographed = Photographed(world.object, paths)
-    training = SelfTraining(network, photographed, 0.25, torch.device("cpu"), pretrained=True)
+    training = SelfTraining(network, photographed(world.object, paths), 0.25, torch.device("cpu"), pretrained=True)
     assert ROUNDS_OF_PRETRAINED[0] < ROUNDS[0]
     assert training.is_due(ROUNDS_OF_PRETRAINED[0])
     training.run_round(ROUNDS_OF_PRETRAINED[0])

@@ -28,13 +28,13 @@ class BackgroundDifference(NamedTuple):
 
 
 def compare(
-    photographs: Float[Tensor, "num 3 height width"], plate: Float[Tensor, "3 height width"]
+    photographs: Float[Tensor, "num 3 height width"], background_image: Float[Tensor, "3 height width"]
 ) -> BackgroundDifference:
     """Compare photographs with the empty scene, both sRGB in [0, 1]."""
-    light, empty = linear_from_srgb(photographs), linear_from_srgb(plate)
+    light, empty = linear_from_srgb(photographs), linear_from_srgb(background_image)
     ratio = (light + _LEAST_LIGHT) / (empty + _LEAST_LIGHT)
     ratio = ratio / ratio.flatten(2).median(dim=2).values[..., None, None]
-    difference = (srgb_from_linear(empty * ratio) - plate).abs().amax(dim=1)
+    difference = (srgb_from_linear(empty * ratio) - background_image).abs().amax(dim=1)
     level = _median(difference)
     limit = (level + _DEVIATIONS * 1.4826 * _median((difference - level).abs())).clamp(min=_LEAST_DIFFERENCE)
     logs = ratio.clamp(min=_LEAST_LIGHT).log()

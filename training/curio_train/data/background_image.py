@@ -33,14 +33,14 @@ _DARKEST_CAST = 0.6
 class BackgroundImages(Backgrounds):
     """One photograph of the empty scene, shifted and lit a little differently each time."""
 
-    def __init__(self, plate: np.ndarray, shares: tuple[float, float] | None = None) -> None:
+    def __init__(self, background_image: np.ndarray, shares: tuple[float, float] | None = None) -> None:
         """Views of a background image.
 
         Args:
-            background image: [height, width, 3] uint8 sRGB, without distortion.
+            background_image: [height, width, 3] uint8 sRGB, without distortion.
             shares: Of its width that a view spans, least and largest; None: all of it.
         """
-        self._levels, self._shares = [plate], shares
+        self._levels, self._shares = [background_image], shares
         while min(self._levels[-1].shape[:2]) >= _SHORTEST_SIDE:  # to shrink much takes long, and views are many
             self._levels.append(cv2.resize(self._levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 

@@ -45,14 +45,14 @@ def is_unpainted(mesh: Mesh) -> bool:
     return mesh.texture is None and mesh.vertex_colors_srgb is None
 
 
-def find_color(photos: Path, plate: Path, camera: Intrinsics) -> FoundColor | None:
+def find_color(photos: Path, background_image: Path, camera: Intrinsics) -> FoundColor | None:
     """The colour of what moves over a background image, or None where the photographs do not tell it.
 
     What is found is the colour of its better lit half: paint of about this colour looks so in light of strength one.
 
     Args:
         photos: Folder; up to 64 photographs spread over it are read.
-        background image: The empty scene.
+        background_image: The empty scene.
         camera: That took both.
 
     Raises:
@@ -61,7 +61,7 @@ def find_color(photos: Path, plate: Path, camera: Intrinsics) -> FoundColor | No
     paths = Photographs(photos).paths
     chosen = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, _MOST_COMPARED).astype(int))]
     height = max(1, round(_WIDTH_PX * camera.height / camera.width))
-    empty = cv2.resize(read_frame(plate, camera), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    empty = cv2.resize(read_frame(background_image, camera), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
     frames = read_frames(chosen, camera, _WIDTH_PX, height).transpose(0, 2, 3, 1)
     seen = [color for frame in frames if (color := _color_of_piece(frame, empty)) is not None]
     if len(seen) < max(_FEWEST, _LEAST_FRACTION * len(chosen)):
@@ -80,9 +80,9 @@ def _consensus(colors: Sequence[np.ndarray]) -> np.ndarray | None:
     return tint / tint.max() * np.quantile(srgb.max(axis=1), _WELL_LIT)
 
 
-def _color_of_piece(frame: np.ndarray, plate: np.ndarray) -> np.ndarray | None:
+def _color_of_piece(frame: np.ndarray, background_image: np.ndarray) -> np.ndarray | None:
     """Linear colour [3] of what two uint8 sRGB pictures [height, width, 3] differ in; None if nothing, or all."""
-    photograph, empty = (torch.from_numpy(picture / 255.0).permute(2, 0, 1) for picture in (frame, plate))
+    photograph, empty = (torch.from_numpy(picture / 255.0).permute(2, 0, 1) for picture in (frame, background_image))
     difference, differs, shaded = (found[0].numpy() for found in compare(photograph[None], empty))
     if not differs.any():
         return None

@@ -48,14 +48,15 @@ class SceneContext:
     @classmethod
     def of_world(cls, world: MeshWorld) -> "SceneContext":
         """Those of a generated world."""
-        cam_from_world = world.stage.cam_from_world
+        setup = world.setup
+        cam_from_world = setup.cam_from_world
         return cls(
             {kind.name: kind.mesh for kind in world.kinds},
-            world.stage.ambient,
-            cam_from_world.rotation @ np.array(world.stage.sun),
-            cam_from_world.apply(np.array(world.stage.center_m)),
-            tuple((cam_from_world.rotation @ np.array(world.stage.up)).tolist()),
-            world.ground(cam_from_world),
+            setup.ambient,
+            cam_from_world.rotation @ np.array(setup.sun),
+            cam_from_world.apply(np.array(setup.center_m)),
+            tuple((cam_from_world.rotation @ np.array(setup.up)).tolist()),
+            setup.ground(cam_from_world),
         )
 
     def mesh(self, kind: str) -> Mesh:

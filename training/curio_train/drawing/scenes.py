@@ -143,7 +143,7 @@ def _from_code(record: Mapping[str, Any], number: int) -> Scene:
     world = mesh_world(str(record["world"]))
     code = {name: torch.tensor([values], dtype=torch.float32) for name, values in record["code"].items()}
     world.layout.check(code)
-    seen = {name: values[0].double().numpy() for name, values in world.exported(code).items()}
+    seen = {name: values[0].double().numpy() for name, values in world.outputs.from_code(code).items()}
     slots = len(seen[TRANSLATION])
     rotation = seen.get("rotation", np.broadcast_to(np.eye(3), (slots, 3, 3)))
     color, confidence = seen.get(COLOR, np.ones((slots, 3))), seen.get(CONFIDENCE, np.ones(slots))

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from curio_train.data.background_difference import compare
 from curio_train.metrics.images import blurred
-from curio_train.refinement.inpainting import filled_in
+from curio_train.refinement.inpainting import inpainted
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
 
@@ -91,7 +91,7 @@ def inlier_ratio(photographs: Tensor, drawing: Drawing) -> Float[Tensor, " num"]
     """
     mask, reach = drawing.silhouette, max(1, round(_AROUND * photographs.shape[-1]))
     around = F.max_pool2d(mask[:, None].float(), 2 * reach + 1, 1, reach) > 0
-    behind, seen = filled_in(photographs, around), blurred(photographs)
+    behind, seen = inpainted(photographs, around), blurred(photographs)
     gains = _gains(seen, blurred(drawing.over(photographs)), mask)
     drawn = gains * blurred(drawing.over_black) + blurred(drawing.through * behind)
     left, without = (_residual(image, seen, around[:, 0]) for image in (drawn, blurred(behind)))
@@ -119,14 +119,14 @@ def overlap(silhouette: Tensor, differing: Tensor) -> Float[Tensor, " num"]:
     return torch.where(either > 0, common / either.clamp(min=1), 1.0)
 
 
-def differing(photographs: Tensor, plate: Tensor) -> Bool[Tensor, "num height width"]:
+def differing(photographs: Tensor, background_image: Tensor) -> Bool[Tensor, "num height width"]:
     """Where photographs clearly differ from the empty scene, shadows on it and speckles left out.
 
     Args:
         photographs: [num, 3, height, width], sRGB in [0, 1].
-        background image: [3, height, width], likewise.
+        background_image: [3, height, width], likewise.
     """
-    found = compare(photographs, plate)
+    found = compare(photographs, background_image)
     masks = (found.differs & ~found.shaded).numpy().astype(np.uint8)
     opened = [cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) for mask in masks]
     return torch.from_numpy(np.stack(opened)).bool()

@@ -21,9 +21,10 @@ from curio_train.learning.runs.initial import uses_synthetic_labels
 from curio_train.learning.runs.provenance import machine
 from curio_train.metrics.calibration import auroc, calibration_error
 from curio_train.metrics.poses import ADD_THRESHOLD
-from curio_train.refinement.render_and_compare import refined
+from curio_train.refinement.render_and_compare import with_refinement
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
 from curio_train.worlds.base import Split, World
+from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _BATCH_SIZE = 50
 _NUM_EMPTY = 100
@@ -81,9 +82,9 @@ def evaluate(
     if bop_results is not None and data is None:
         raise UsageError("--bop-results needs the real frames that it is about: --data DIR")
     subject = load_subject(path, data)
-    if data is not None and subject.world.mesh is None:
+    if data is not None and not isinstance(subject.world, SingleObjectWorld):
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
-    better = replace(subject, predict=refined(subject.predict, subject.world)) if refine else None
+    better = replace(subject, predict=with_refinement(subject.predict, subject.world)) if refine else None
     progress(f"{num_images} images of the {split} split")
     held_out = draw(subject.world, split, num_images, cache)
     result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images)}
@@ -125,7 +126,7 @@ def draw(world: World, split: Split, num_images: int, cache: Path) -> HeldOut:
     images = torch.cat([(batch.images.clamp(0, 1) * 255).round().byte() for batch in batches])
     codes = [batch.code for batch in batches if batch.code is not None]
     code = {name: torch.cat([one[name] for one in codes])[:num_images] for name in codes[0]}
-    if world.mesh is None or CONFIDENCE not in world.layout:
+    if not isinstance(world, SingleObjectWorld) or CONFIDENCE not in world.layout:
         return HeldOut(images[:num_images], code)
     behind = source.backgrounds(len(batches), _NUM_EMPTY)  # of steps that have not been drawn
     return HeldOut(images[:num_images], code, None if behind is None else (behind.clamp(0, 1) * 255).round().byte())
@@ -140,9 +141,9 @@ def read(predict: Predict, images: Tensor) -> SceneCode:
 def score(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, float]:
     """All metrics that mean something in this world."""
     scores = scene_scores(world, predicted, true)
-    if world.mesh is not None:
+    if isinstance(world, SingleObjectWorld):
         info = world.objects[0].info
-        scores |= pose_scores(poses(predicted), poses(true), world.mesh.vertices_m, info)
+        scores |= pose_scores(poses(predicted), poses(true), world.object.mesh.vertices_m, info)
     return scores
 
 
@@ -151,8 +152,8 @@ def calibration(world: World, predicted: SceneCode, true: SceneCode, on_empty: S
 
     Once as the probability that ADD(-S) is below a tenth of the diameter, once as a sign that the object is there.
     """
-    assert world.mesh is not None  # worlds of one object have one
-    errors = add_errors(poses(predicted), poses(true), world.mesh.vertices_m, world.objects[0].info)
+    assert isinstance(world, SingleObjectWorld)
+    errors = add_errors(poses(predicted), poses(true), world.object.mesh.vertices_m, world.objects[0].info)
     confidences, without = (code[CONFIDENCE].flatten().tolist() for code in (predicted, on_empty))
     return {
         "confidence_ece": calibration_error(confidences, [error < ADD_THRESHOLD for error in errors]),

@@ -24,7 +24,10 @@ from curio_train.evaluation.agreement import differing, draw, inlier_ratio, insi
 from curio_train.evaluation.subject import Predict
 from curio_train.metrics.images import blurred, dssim
 from curio_train.scene_code import CONFIDENCE, SceneCode
-from curio_train.worlds.base import View, World
+from curio_train.worlds.base import PhotographSet, World
+from curio_train.worlds.single_object.capture import CapturePhotographs
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.tabletop.world import TabletopWorld
 
 _TRUSTED, _DOUBTFUL = 0.9, 0.6
 _NAMES = ("own_view", "second_view")
@@ -61,22 +64,27 @@ def judge(world: World, predict: Predict) -> Judgement | None:
     """Compare re-renderings with photographs; None in worlds without photographs to judge by.
 
     Args:
-        world: With its views, or its photographs.
+        world: With its photographs.
         predict: Reads the own camera's photographs.
 
     Raises:
         DataError: A photograph or the background image cannot be read, or is not of the camera's size.
     """
-    if views := world.views():
-        return _on_plane(world, predict, views)
-    photographs = world.photographs(_NUM_IN_SPACE)
-    return None if photographs is None else _in_space(world, predict, photographs, world.plate())
+    if isinstance(world, TabletopWorld):
+        return _on_plane(world, predict)
+    if isinstance(world, TwoStageWorld) and isinstance(world.photographs, CapturePhotographs):
+        photographs = world.photographs
+        return _in_space(world, predict, photographs.judged(_NUM_IN_SPACE), photographs.background_image())
+    return None
 
 
-def _on_plane(world: World, predict: Predict, views: Sequence[View]) -> Judgement:
+def _on_plane(world: TabletopWorld, predict: Predict) -> Judgement:
+    views = [view for view in (world.photographs.own, world.photographs.second) if view is not None]
     code = _read(predict, views[0].photographs)
     drawn = [_drawn(world, number, code) for number in range(len(views))]
-    agreed, _ = _agreement(world, _certain(code), views[0].photographs.float() / 255, views[0].plate.float() / 255)
+    agreed, _ = _agreement(
+        world, _certain(code), views[0].photographs.float() / 255, views[0].background_image.float() / 255
+    )
     metrics = _means(agreed)
     for name, view, images in zip(_NAMES, views, drawn, strict=False):
         error, of_background_image = _errors(view, images)
@@ -90,42 +98,44 @@ def _on_plane(world: World, predict: Predict, views: Sequence[View]) -> Judgemen
         columns["photograph" + heading] = view.photographs[order].float() / 255
         columns["prediction" + heading] = images[order]
     verdict = _verdict(metrics["better_than_plate"], len(worst), len(views) > 1)
-    verdict += f" Drawn parts and what differs from the background image overlap by {metrics['own_view_overlap']:.2f} (1: all)."
+    verdict += (
+        f" Drawn parts and the difference from the background image overlap by {metrics['own_view_overlap']:.2f}."
+    )
     return Judgement(metrics, verdict, columns, _captions(agreed | {"blurred DSSIM": worst}, order))
 
 
-def _in_space(world: World, predict: Predict, photographs: Tensor, plate: Tensor | None) -> Judgement:
+def _in_space(world: World, predict: Predict, photographs: Tensor, background_image: Tensor | None) -> Judgement:
     code = dict(_read(predict, (photographs * 255).round().byte()))
     if CONFIDENCE in code:  # drawn however unsure: whether it is right is the question
         code[CONFIDENCE] = torch.ones_like(code[CONFIDENCE])
-    agreed, images = _agreement(world, code, photographs, plate)
-    measure = "explained" if plate is None else "overlap"
+    agreed, images = _agreement(world, code, photographs, background_image)
+    measure = "explained" if background_image is None else "overlap"
     order = agreed[measure].argsort()
     metrics = _means(agreed)
     metrics["own_view_agreeing"] = float((agreed[measure] >= _AGREES[measure]).double().mean())
-    num_empty = 0 if plate is None else int((~differing(photographs, plate).any(dim=2).any(dim=1)).sum())
-    verdict = _verdict_in_space(metrics["own_view_agreeing"], len(photographs), plate is not None, num_empty)
+    num_empty = (
+        0 if background_image is None else int((~differing(photographs, background_image).any(dim=2).any(dim=1)).sum())
+    )
+    verdict = _verdict_in_space(metrics["own_view_agreeing"], len(photographs), background_image is not None, num_empty)
     columns = {"photograph": photographs[order], "what was found": images[order]}
     return Judgement(metrics, verdict, columns, _captions(agreed, order))
 
 
 def _agreement(
-    world: World, code: SceneCode, photographs: Tensor, plate: Tensor | None
+    world: World, code: SceneCode, photographs: Tensor, background_image: Tensor | None
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Numbers of each photograph by name, and what was found drawn over the background image, or else over the
-    photographs.
-    """
-    found: dict[str, list[Tensor]] = {"inside": [], "explained" if plate is None else "overlap": []}
+    """Numbers of each photograph by name, and what was found, drawn over the background image or the photographs."""
+    found: dict[str, list[Tensor]] = {"inside": [], "explained" if background_image is None else "overlap": []}
     images = []
     for start in range(0, len(photographs), _DRAWN_AT_ONCE):
         some = slice(start, start + _DRAWN_AT_ONCE)
         seen, drawing = photographs[some], draw(world, {name: values[some] for name, values in code.items()})
-        behind = seen if plate is None else plate.expand_as(seen)
+        behind = seen if background_image is None else background_image.expand_as(seen)
         found["inside"].append(inside(seen, drawing, behind))
-        if plate is None:
+        if background_image is None:
             found["explained"].append(inlier_ratio(seen, drawing))
         else:
-            found["overlap"].append(overlap(drawing.silhouette, differing(seen, plate)))
+            found["overlap"].append(overlap(drawing.silhouette, differing(seen, background_image)))
         images.append(drawing.over(behind))
     return {name: torch.cat(values) for name, values in found.items()}, torch.cat(images)
 
@@ -148,16 +158,16 @@ def _read(predict: Predict, photographs: Tensor) -> SceneCode:
     return {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
 
 
-def _drawn(world: World, view: int, code: SceneCode) -> Tensor:
+def _drawn(world: TabletopWorld, view: int, code: SceneCode) -> Tensor:
     """The scenes as the own (0) or the second camera sees them."""
     return (world.novel_view(code) if view else world.render(code)).clamp(0, 1)
 
 
-def _errors(view: View, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def _errors(view: PhotographSet, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Of re-renderings, and of the background image in place of them."""
-    photographs, plate = view.photographs.float() / 255, view.plate.float() / 255
+    photographs, background_image = view.photographs.float() / 255, view.background_image.float() / 255
     of_both = []
-    for shown in (images, plate.expand_as(photographs)):
+    for shown in (images, background_image.expand_as(photographs)):
         soft = dssim(blurred(shown), blurred(photographs))
         of_both.append({"dssim": dssim(shown, photographs), "dssim_blurred": soft})
     return of_both[0], of_both[1]

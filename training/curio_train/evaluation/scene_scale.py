@@ -20,7 +20,7 @@ from curio_train.evaluation.subject import load_subject
 from curio_train.refinement.multi_view import estimate_scale
 from curio_train.refinement.pseudo_labels import predict_and_refine
 from curio_train.refinement.render_and_compare import RenderAndCompare
-from curio_train.worlds.single_object.linemod import TwoStageLinemod
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 MOST_PHOTOGRAPHS = 100
 """More tell little more: what one object errs by is the same in all."""
@@ -73,8 +73,8 @@ def mean_scale(scales: Mapping[str, float]) -> tuple[float, str]:
 def _scale_by(path: Path, data: Path | None, structure: Structure) -> float | None:
     subject = load_subject(path, data)
     world = subject.world
-    if not isinstance(world, TwoStageLinemod):
-        raise UsageError(f"{path}: a network of one stage (--no-two-stage network), expected one of two")
+    if not isinstance(world, TwoStageWorld):
+        raise UsageError(f"{path}: the paper's network (--one-stage), expected a two-stage detector")
     camera = world.object.camera
     if np.abs(camera.matrix - structure.camera.matrix).max() > _SAME_CAMERA * camera.matrix[0, 0]:
         raise UsageError(
@@ -84,8 +84,6 @@ def _scale_by(path: Path, data: Path | None, structure: Structure) -> float | No
     chosen = spread(structure.photographs, MOST_PHOTOGRAPHS)
     matrices = structure.cam_from_world[[structure.photographs.index(photograph) for photograph in chosen]]
     frames = torch.from_numpy(read_frames(chosen, camera, world.camera.width, world.camera.height))
-    refine = RenderAndCompare(world)
-    _, refined, taken = predict_and_refine(
-        refine, frames, lambda images: subject.predict((images * 255).round().byte())
-    )
-    return estimate_scale(CameraPoses(matrices), refined, taken, refine.diameter_m)
+    refiner = RenderAndCompare(world)
+    found = predict_and_refine(refiner, frames, lambda images: subject.predict((images * 255).round().byte()))
+    return estimate_scale(CameraPoses(matrices), found.refined, found.accepted, refiner.diameter_m)

@@ -96,7 +96,7 @@ def _from_model(file: Path, data: Path | None) -> Subject:
     world = build(config.world)
 
     def predict(images: Tensor) -> dict[str, Tensor]:
-        return world.from_exported(model(images.permute(0, 2, 3, 1).contiguous()))
+        return world.outputs.to_code(model(images.permute(0, 2, 3, 1).contiguous()))
 
     spec = model.spec
     return Subject(config, world, predict, spec.images_seen, spec.training_seconds, spec.commit)

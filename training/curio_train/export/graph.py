@@ -75,7 +75,7 @@ class Graph(nn.Module):
 
     def read(self, pixels: Tensor) -> dict[str, Tensor]:
         """Of pixels [batch, 3, height, width] in [0, 1]."""
-        return self._world.exported(self.network(pixels))
+        return self._world.outputs.from_code(self.network(pixels))
 
 
 def export(run: Path, out: Path, name: str | None = None, *, half: bool = False) -> Exported:
@@ -271,7 +271,7 @@ def model_spec(world: World, name: str) -> ModelSpec:
         name=name,
         world=world.name,
         num_slots=world.layout.num_slots,
-        fields=[_field_spec(field) for field in world.exported_fields],
+        fields=[_field_spec(field) for field in world.outputs.fields],
         objects=[_object_model(kind) for kind in world.objects],
         camera=CanonicalCamera(
             width=camera.width, height=camera.height, camera_matrix=matrix, is_default=camera.is_default

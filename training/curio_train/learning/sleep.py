@@ -18,7 +18,7 @@ from curio_train.learning.prefetch import Prefetcher, prefetching
 from curio_train.learning.self_training import SelfTraining
 from curio_train.metrics.assignment import canonical
 from curio_train.scene_code import SceneCode
-from curio_train.worlds.base import ImageSource, World
+from curio_train.worlds.base import AugmentedWorld, ImageSource, StagedWorld, World, stages_of
 
 _SYNTHETIC = 1  # keeps these draws apart from those of the training images
 
@@ -28,7 +28,7 @@ SyntheticBatch = tuple[dict[str, Tensor], Tensor]
 
 def scheduled_stage(world: World, step: int) -> int:
     """Which of the world's stages a step trains."""
-    return world.turns[step % len(world.turns)]
+    return world.stage_schedule[step % len(world.stage_schedule)] if isinstance(world, StagedWorld) else 0
 
 
 class SyntheticBatches:
@@ -92,20 +92,24 @@ class SyntheticBatches:
         recipe, seed = self._config.recipe, (self._config.seed, number)
         code = sleep_codes(self._world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
         with torch.no_grad():
-            return code, self._world.augment(self._world.render(code, backgrounds), seed)
+            return code, _augmented(self._world, self._world.render(code, backgrounds), seed)
 
     @torch.no_grad()
     def _draw(self, number: int) -> SyntheticBatch:
         stage, size = scheduled_stage(self._world, number // self._num_micro), self._config.recipe.micro_batch_size
-        world, device = self._world.stages[stage], self._ranks.device
+        world, device = stages_of(self._world)[stage], self._ranks.device
         seed = self._config.seed, number
         backgrounds = self._sources[stage].backgrounds(number, size)
         code = {name: value.to(device) for name, value in world.sample(size, (*seed, _SYNTHETIC)).items()}
         images = world.render(code, None if backgrounds is None else backgrounds.to(device))
-        images = world.augment(images, seed)
-        if stage == len(self._world.stages) - 1:
+        images = _augmented(world, images, seed)
+        if stage == len(stages_of(self._world)) - 1:
             return self._self_training.mix_in(code, images, (*seed, _SYNTHETIC))
         return code, images
+
+
+def _augmented(world: World, images: Tensor, seed: tuple[int, ...]) -> Tensor:
+    return world.augment(images, seed) if isinstance(world, AugmentedWorld) else images
 
 
 def sleep_codes(world: World, raw: SceneCode, noise: float, drawn: float, seed: tuple[int, ...]) -> dict[str, Tensor]:

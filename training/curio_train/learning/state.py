@@ -12,7 +12,7 @@ from curio_train.errors import UsageError
 from curio_train.learning.muon import Muon
 from curio_train.networks.base import StageNetwork
 from curio_train.networks.paper.critic import Critic
-from curio_train.worlds.base import World
+from curio_train.worlds.base import StagedWorld, World, stages_of
 
 N = TypeVar("N", bound=nn.Module)
 _BETAS = (0.9, 0.999)  # paper, appendix, table of hyperparameters
@@ -122,18 +122,19 @@ class TrainState:
             UsageError: The world has no such decoder, or the method cannot train it.
         """
         decoder = config.network.reading
-        if decoder is not None and decoder not in world.readings:
+        if decoder is not None and decoder not in world.decoders:
             raise UsageError(f"--reading {decoder}: {world.name} has no such decoder; leave the flag out")
         torch.manual_seed(config.seed)
         self.progress = TrainingProgress()
-        self.stages = [stage.network(config.network) for stage in world.stages]
+        self.stages = [stage.network(config.network) for stage in stages_of(world)]
         if config.terms.perturbs_predictions and not self.stages[0].has_raw_values:
             raise UsageError(
                 f"--method {config.method} perturbs the network's raw outputs, and the dense decoder has none: "
                 "use --method sleep, or --reading whole"
             )
         recipe = config.recipe
-        self.pose = Learner(world.assemble(self.stages).to(device), recipe.learning_rate, recipe.matrix_learning_rate)
+        network = world.assemble(self.stages) if isinstance(world, StagedWorld) else self.stages[0]
+        self.pose = Learner(network.to(device), recipe.learning_rate, recipe.matrix_learning_rate)
         self.critic = None
         if config.terms.curiosity:
             critic = Critic(config.network.critic, config.network.critic_normalisation).to(device)

@@ -21,8 +21,9 @@ from curio_train.learning.recoloring import recolored
 from curio_train.learning.self_training import SelfTraining
 from curio_train.learning.sleep import SyntheticBatches, scheduled_stage
 from curio_train.learning.state import TrainState
+from curio_train.metrics.images import blurred
 from curio_train.networks.base import StageNetwork
-from curio_train.worlds.base import Batch, ImageSource, World
+from curio_train.worlds.base import Batch, ImageSource, World, stages_of
 
 _SMOOTHING = 0.98  # of the image loss that convergence is judged by: a memory of about 50 steps
 _NUM_PAIRS = 8
@@ -64,16 +65,16 @@ class Trainer:
         Raises:
             UsageError: The method cannot train this world, or its network.
         """
-        if len(world.stages) > 1 and config.terms.reads_images:
+        if len(stages_of(world)) > 1 and config.terms.reads_images:
             raise UsageError(
                 f"--method {config.method} needs whole-scene images, and this model trains on crops: "
-                "use --method sleep (or, with linemod, --no-two-stage network)"
+                "use --method sleep (or, with linemod, --one-stage)"
             )
         self.config, self.world, self.ranks = config, world, ranks
         self.state = TrainState(config, world, ranks.device)
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
         self._micro_batches = ranks.micro_batches(self._num_micro)
-        self._stages = [Stage(*parts) for parts in zip(world.stages, self.state.stages, sources, strict=True)]
+        self._stages = [Stage(*parts) for parts in zip(stages_of(world), self.state.stages, sources, strict=True)]
         network, fraction = self.state.pose.network, config.recipe.self_training
         self_training = SelfTraining(network, world, fraction, ranks.device, pretrained=config.init is not None)
         self.synthetic = SyntheticBatches(config, world, sources, ranks, self_training)
@@ -106,8 +107,8 @@ class Trainer:
                 batch = self._training_batch(stage, number)
                 raw, code = self._predict(network, batch.images)
             if terms.image or terms.curiosity:
-                rendered = world.compared(world.render(code, batch.backgrounds))
-                images = world.compared(batch.images)
+                rendered = blurred(world.render(code, batch.backgrounds), world.comparison_blur_px)
+                images = blurred(batch.images, world.comparison_blur_px)
             if terms.image:
                 losses["image"] = image_loss(rendered, images)
             if critic is not None:

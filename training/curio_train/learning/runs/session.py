@@ -16,6 +16,7 @@ from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress
 from curio_train.learning.trainer import Trainer
 from curio_train.worlds import build
+from curio_train.worlds.base import StagedWorld, stages_of
 
 
 def learn(
@@ -49,7 +50,7 @@ def learn(
         # The world comes first, so that an error in its data leaves no run folder behind.
         world = build(config.world)
         sources = [
-            stage.source("train", config.seed, with_code=config.terms.label, cache=cache) for stage in world.stages
+            stage.source("train", config.seed, with_code=config.terms.label, cache=cache) for stage in stages_of(world)
         ]
         if config.labels < 1:
             sources = [source.subset(config.labels) for source in sources]
@@ -65,6 +66,11 @@ def learn(
             run.restore(trainer.state)
         elif config.init is not None:
             begin_with(trainer.state, config.init)
+
+        def finish() -> None:
+            if isinstance(world, StagedWorld):
+                world.calibrate_confidence(trainer.state.pose.network, cache)
+
         with reporting(path, trainer.state.progress) if here.leads else nullcontext() as reporter:
             outcome = train(
                 trainer,
@@ -72,6 +78,6 @@ def learn(
                 interruption,
                 reporter,
                 checkpoint_minutes,
-                finish=lambda: world.finish(trainer.state.pose.network, cache),
+                finish=finish,
             )
         return outcome, trainer.state.progress

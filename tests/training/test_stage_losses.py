@@ -8,7 +8,8 @@ from curio_train.networks.grid import per_cell
 from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import HEAT_MAP, PROPOSALS
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
-from curio_train.worlds.single_object.two_stage import LocalisationStage, TwoStageWorld
+from curio_train.worlds.single_object.localisation_stage import LocalisationStage
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
 from torch import Tensor, nn
 

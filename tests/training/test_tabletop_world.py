@@ -21,11 +21,12 @@ from curio_train.learning.parallel import ranks
 from curio_train.learning.runs.configuration import load_config
 from curio_train.learning.trainer import Trainer
 from curio_train.meshes.meshes import load_mesh
+from curio_train.metrics.images import blurred
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.tabletop.world import Table
+from curio_train.worlds.tabletop.world import TabletopWorld
 from paper.captures_table import markdown, row
 
 ROOT = Path(__file__).parents[2]
@@ -98,13 +99,13 @@ def options(folder: Path, **changes: object) -> CaptureOptions:
 
 
 @pytest.fixture(scope="module")
-def world(folder: Path) -> Table:
+def world(folder: Path) -> TabletopWorld:
     found = build(options(folder))
-    assert isinstance(found, Table)
+    assert isinstance(found, TabletopWorld)
     return found
 
 
-def truth(folder: Path, world: Table) -> dict[str, torch.Tensor]:
+def truth(folder: Path, world: TabletopWorld) -> dict[str, torch.Tensor]:
     """What was photographed, as the world's code; the middle of a wedge is the code's place."""
     places = torch.from_numpy(np.load(folder / "places.npy")).float()
     code = {name: torch.zeros(NUM, 2, 3) for name in (TRANSLATION, COLOR)}
@@ -116,15 +117,16 @@ def truth(folder: Path, world: Table) -> dict[str, torch.Tensor]:
     return {field.name: code[field.name] for field in world.layout.fields}
 
 
-def test_a_true_code_looks_like_its_photographs_from_both_cameras(folder: Path, world: Table) -> None:
+def test_a_true_code_looks_like_its_photographs_from_both_cameras(folder: Path, world: TabletopWorld) -> None:
     code = truth(folder, world)
-    own, second = world.views()
+    own, second = world.photographs.own, world.photographs.second
+    assert second is not None
     for view, drawn in ((own, world.render(code)), (second, world.novel_view(code))):
         photographs = view.photographs / 255
-        assert (drawn - photographs).abs().mean() < 0.25 * (view.plate / 255 - photographs).abs().mean()
+        assert (drawn - photographs).abs().mean() < 0.25 * (view.background_image / 255 - photographs).abs().mean()
 
 
-def test_true_codes_score_better_than_wrong_ones(folder: Path, world: Table) -> None:
+def test_true_codes_score_better_than_wrong_ones(folder: Path, world: TabletopWorld) -> None:
     """And what looks right from the own camera alone is found out by the second."""
     code = truth(folder, world)
     moved = code | {TRANSLATION: code[TRANSLATION] + torch.tensor([0.1, 0.0, 0.0])}
@@ -144,7 +146,7 @@ def test_true_codes_score_better_than_wrong_ones(folder: Path, world: Table) -> 
     assert [*right.columns][2:] == ["photograph, second camera", "prediction, second camera"]
 
 
-def test_draws_lie_where_photographs_show_parts(folder: Path, world: Table) -> None:
+def test_draws_lie_where_photographs_show_parts(folder: Path, world: TabletopWorld) -> None:
     code = world.sample(100, (3,))
     world.layout.check(code)
     assert torch.equal(code[TRANSLATION], world.sample(100, (3,))[TRANSLATION])
@@ -153,13 +155,15 @@ def test_draws_lie_where_photographs_show_parts(folder: Path, world: Table) -> N
     assert float(x.abs().max()) < 0.3
     assert float(z.abs().max()) < 0.3
     drawn = world.render(code)
-    plate = world.views()[0].plate / 255
+    plate = world.photographs.own.background_image / 255
     changed = ((drawn - plate).abs().amax(dim=1) > 0.1).float().mean(dim=(1, 2))
     assert float(changed.min()) > 0.005, "each draw is seen"
 
 
 @pytest.mark.parametrize("row", ["our", "noncur", "sleep", "wake_sleep", "sleep_cells"])
-def test_a_few_steps_bring_photographs_or_dreams_nearer(world: Table, folder: Path, tmp_path: Path, row: str) -> None:
+def test_a_few_steps_bring_photographs_or_dreams_nearer(
+    world: TabletopWorld, folder: Path, tmp_path: Path, row: str
+) -> None:
     method, network = row.removesuffix("_cells"), NetworkConfig(reading="cells" if row.endswith("_cells") else "whole")
     recipe = Recipe(batch_size=NUM, micro_batch_size=NUM, learning_rate=1e-3, gradient_clip=1.0, critic_weight=0.1)
     config = RunConfig(options(folder), method=method, recipe=recipe, network=network)
@@ -171,7 +175,7 @@ def test_a_few_steps_bring_photographs_or_dreams_nearer(world: Table, folder: Pa
         def image_error() -> float:
             with torch.no_grad():
                 read = trainer.state.stages[0](source.images / 255)
-                return float((world.compared(world.render(read)) - world.compared(source.images / 255)).square().mean())
+                return float((seen(world, world.render(read)) - seen(world, source.images / 255)).square().mean())
 
         def dream_error() -> float:
             with torch.no_grad():
@@ -184,14 +188,19 @@ def test_a_few_steps_bring_photographs_or_dreams_nearer(world: Table, folder: Pa
         assert error() < before
 
 
-def test_image_loss_and_critic_see_both_through_a_filter(world: Table) -> None:
+def seen(world: TabletopWorld, images: torch.Tensor) -> torch.Tensor:
+    """As image loss and critic see them."""
+    return blurred(images, world.comparison_blur_px)
+
+
+def test_image_loss_and_critic_see_both_through_a_filter(world: TabletopWorld) -> None:
     sharp = torch.zeros(1, 3, 128, 128)
     sharp[..., 64, 64] = 1
-    soft = world.compared(sharp)
+    soft = seen(world, sharp)
     assert float(soft.sum()) == pytest.approx(3, rel=1e-4)
     assert float(soft[0, 0, 64, 64]) < 0.1
     assert float(soft[0, 0, 64, 69]) == 0, "nine pixels wide"
-    assert torch.allclose(world.compared(torch.ones(1, 3, 128, 128)), torch.ones(1, 3, 128, 128), atol=1e-5)
+    assert torch.allclose(seen(world, torch.ones(1, 3, 128, 128)), torch.ones(1, 3, 128, 128), atol=1e-5)
 
 
 def test_counts_that_vary_have_confidences(folder: Path) -> None:
@@ -213,7 +222,7 @@ def test_round_parts_have_no_yaw_and_what_lies_has_a_free_rotation(folder: Path,
     code = lying.sample(30, (1,))
     assert ROTATION_6D in lying.layout
     turned = torch.einsum(
-        "bsij,vj->bsvi", lying.own_rotation(code).double(), torch.from_numpy(lying.parts[0].mesh.vertices_m)
+        "bsij,vj->bsvi", lying.orientation.rotation(code).double(), torch.from_numpy(lying.parts[0].mesh.vertices_m)
     )
     lowest = (turned[..., 1] + code[TRANSLATION][..., None, 1]).amin(dim=-1)
     assert float(lowest.abs().max()) < 1e-6, "it touches the plane"
@@ -223,19 +232,21 @@ def test_round_parts_have_no_yaw_and_what_lies_has_a_free_rotation(folder: Path,
 def test_a_model_answers_in_the_camera_frame_and_the_files(folder: Path, lying: bool) -> None:
     """Where a corner of the file is seen is where the code puts it, and the code can be had back."""
     found = build(options(folder, lying=lying))
-    assert isinstance(found, Table)
+    assert isinstance(found, TabletopWorld)
     code = found.sample(8, (2,))
-    outputs = found.exported(code)
+    outputs = found.outputs.from_code(code)
     assert outputs["rotation"].det().sub(1).abs().max() < 1e-5
     file_corner = torch.tensor([0.0, 0.0, 0.05], dtype=torch.float64)  # of the upper edge
     seen = outputs[TRANSLATION].double() + outputs["rotation"].double() @ file_corner
     part = found.parts[0]
     own_corner = part.file_from_own.inverse().to(file_corner).apply(file_corner)
-    in_world = found.own_rotation(code).double() @ own_corner + code[TRANSLATION]
-    expected = found.stage.cam_from_world.to(in_world).apply(in_world)
+    in_world = found.orientation.rotation(code).double() @ own_corner + code[TRANSLATION]
+    expected = found.setup.cam_from_world.to(in_world).apply(in_world)
     assert torch.allclose(seen, expected, atol=1e-5)
-    again = found.from_exported(outputs)
-    assert torch.allclose(found.own_rotation(again).double(), found.own_rotation(code).double(), atol=1e-4)
+    again = found.outputs.to_code(outputs)
+    assert torch.allclose(
+        found.orientation.rotation(again).double(), found.orientation.rotation(code).double(), atol=1e-4
+    )
     assert torch.allclose(again[TRANSLATION], code[TRANSLATION], atol=1e-6)
 
 
@@ -270,7 +281,7 @@ def test_a_camera_that_moves_has_a_plate_for_each_photograph(folder: Path, tmp_p
         ({"counts": ("2", "3")}, "2 --counts for 1 meshes"),
         ({"counts": ("3-2",)}, "--counts 3-2"),
         ({"counts": ("many",)}, "--counts many"),
-        ({"counts": ("0",)}, "never anything"),
+        ({"counts": ("0",)}, "all scenes are empty"),
         ({"second_background": None}, "belong together"),
         ({"blur_px": 4}, "odd"),
     ],
@@ -294,7 +305,7 @@ def test_pictures_that_do_not_belong_together(folder: Path, tmp_path: Path) -> N
     assert not any("background" in doubt for doubt in refuse_unfit(options(folder)))
 
 
-def test_photographs_have_no_labels(world: Table, tmp_path: Path) -> None:
+def test_photographs_have_no_labels(world: TabletopWorld, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no labels"):
         world.source("train", 0, with_code=True, cache=tmp_path)
 
@@ -310,8 +321,8 @@ def test_from_files_to_a_model_by_a_project_file(folder: Path, tmp_path: Path, m
     monkeypatch.setattr("curio_train.worlds.image_sets.NUM_IMAGES", {"train": 4, "validation": 4, "test": 4})
     project = folder / "table.toml"
     project.write_text(
-        'mesh = ["wedge.stl"]\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "a"\nbackground = "background image-a.png"\n'
-        'plane = "views.json"\ncounts = [2]\nsecond = "b"\nsecond-background = "background image-b.png"\nmethod = "our"\n'
+        'mesh = ["wedge.stl"]\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "a"\nbackground = "plate-a.png"\n'
+        'plane = "views.json"\ncounts = [2]\nsecond = "b"\nsecond-background = "plate-b.png"\nmethod = "our"\n'
         "batch-size = 4\nmicro-batch-size = 4\n"
     )
     run = tmp_path / "run"

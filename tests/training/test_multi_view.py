@@ -12,13 +12,14 @@ from curio_train.data.photographs import CameraPoses
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
 from curio_train.meshes.shapes import chair
 from curio_train.metrics.poses import symmetry_poses
-from curio_train.refinement.multi_view import agreed, estimate_scale
+from curio_train.refinement.multi_view import Estimates, consensus_poses, estimate_scale
 from curio_train.refinement.pseudo_labels import MIN_CONSENSUS, PseudoLabels
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.single_object.linemod import TwoStageLinemod
-from curio_train.worlds.single_object.two_stage import SYMMETRY_STEP, TwoStageWorld
+from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
+from curio_train.worlds.single_object.linemod import LinemodPhotographs
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -79,14 +80,8 @@ def agree(
     world: TwoStageWorld, frames: Tensor, matrices: np.ndarray, read: SceneCode
 ) -> tuple[dict[str, Tensor], Tensor]:
     symmetries = symmetry_poses(world.object.kind.info, SYMMETRY_STEP)
-    return agreed(
-        RenderAndCompare(world),
-        frames,
-        CameraPoses(matrices),
-        read,
-        (read, torch.ones(NUM, dtype=torch.bool)),
-        symmetries,
-    )
+    estimates = Estimates(read, read, torch.ones(NUM, dtype=torch.bool))
+    return consensus_poses(RenderAndCompare(world), frames, CameraPoses(matrices), estimates, symmetries)
 
 
 def errors(found: SceneCode, true: SceneCode) -> tuple[Tensor, Tensor]:
@@ -115,12 +110,10 @@ def test_metres_correct_what_an_object_is_read_too_far_by(
     read[TRANSLATION] = read[TRANSLATION] * 1.04
     of_any_scale, metres = cameras(truth), cameras(truth)
     metres[:, :3, 3] *= SCALE
-    taken = torch.ones(NUM, dtype=torch.bool)
+    estimates = Estimates(read, read, torch.ones(NUM, dtype=torch.bool))
     off = []
     for where in (CameraPoses(of_any_scale), CameraPoses(metres, in_metres=True)):
-        code, chosen = agreed(
-            RenderAndCompare(world), frames, where, read, (read, taken), [Pose(np.eye(3), np.zeros(3))]
-        )
+        code, chosen = consensus_poses(RenderAndCompare(world), frames, where, estimates, [Pose.identity()])
         assert chosen.sum() >= NUM - 4
         off.append((code[TRANSLATION][chosen, 0, 2] / truth[TRANSLATION][chosen, 0, 2]).log().median())
     assert off[0] == pytest.approx(np.log(1.04), abs=0.01)
@@ -189,5 +182,5 @@ def test_photographs_without_texture_teach_one_by_one_and_say_why(
     for number in range(4):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((480, 640, 3), 40 * number, np.uint8))
     with caplog.at_level(logging.WARNING):
-        assert TwoStageLinemod(thing(), tmp_path).cameras(sorted(tmp_path.iterdir())) is None
-    assert "teach one by one" in caplog.text
+        assert LinemodPhotographs(tmp_path, thing().camera).unlabelled().cameras is None
+    assert "one by one" in caplog.text

@@ -29,14 +29,10 @@ from curio_train.networks.two_stage.network import SCALES
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, index
 from curio_train.worlds.single_object.confidence import calibrate
-from curio_train.worlds.single_object.two_stage import (
-    ASSUMED_M,
-    CROP_PX,
-    CropPoseStage,
-    LocalisationStage,
-    TwoStageWorld,
-    frame_camera,
-)
+from curio_train.worlds.single_object.crop_pose_loss import ASSUMED_DEPTH
+from curio_train.worlds.single_object.crop_pose_stage import CROP_PX, CropPoseStage
+from curio_train.worlds.single_object.localisation_stage import LocalisationStage
+from curio_train.worlds.single_object.two_stage import TwoStageWorld, frame_camera
 from curio_train.worlds.single_object.world import EXPOSURE, Object
 from torch import Tensor, nn
 
@@ -99,7 +95,7 @@ def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(b
     assert turned.max() < 0.05
     assert torch.allclose(found[LIGHT], code[LIGHT], atol=1e-5)
     assert torch.allclose(found[CONFIDENCE], relative[CONFIDENCE])
-    given = {ASSUMED_M: distance, EXPOSURE: code[EXPOSURE]}
+    given = {ASSUMED_DEPTH: distance, EXPOSURE: code[EXPOSURE]}
     rendered = second.render(relative | given | {CONFIDENCE: torch.ones(6, 1, 1)})
     assert glance.shown[0].shape == (6, 3, CROP_PX, CROP_PX)
     missed = (glance.shown[0] - rendered).abs().mean()
@@ -112,7 +108,7 @@ def test_objects_of_the_second_look_lie_where_its_code_says(brick_world: TwoStag
     assert 0 < (code[CONFIDENCE] == 0).sum() < 15
     code[CONFIDENCE][:] = 1
     second.layout.check(
-        {name: value for name, value in code.items() if name not in (ASSUMED_M, EXPOSURE, OBJECT_COORDINATES)}
+        {name: value for name, value in code.items() if name not in (ASSUMED_DEPTH, EXPOSURE, OBJECT_COORDINATES)}
     )
     drawn = second.render(code).amax(dim=1) > 0.02
     place = code[TRANSLATION][:, 0]
@@ -128,7 +124,7 @@ def test_surface_points_project_to_the_patches_that_see_them(brick_world: TwoSta
     code = second.sample(8, (3,))
     surface_map = ObjectCoordinateMap(second.object.mesh, 32)
     rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
-    place = second._metres(code[TRANSLATION][:, 0], code[ASSUMED_M])
+    place = second._in_metres(code[TRANSLATION][:, 0], code[ASSUMED_DEPTH])
     matrices = second._matrices(code, 32)
     points, seen = surface_map(rotation, place, matrices)
     assert seen.sum() > 500
@@ -166,21 +162,21 @@ def test_localisation_gives_the_likeliest_position(brick_world: TwoStageWorld) -
 def test_first_look_sees_several_under_one_light(brick_world: TwoStageWorld) -> None:
     first: LocalisationStage = brick_world.stages[0]
     code = first.sample(4, (1,))
-    assert code[TRANSLATION].shape == (4, first.num_shown, 3)
+    assert code[TRANSLATION].shape == (4, first.num_instances, 3)
     assert code[LIGHT].shape == (4, 3)
     background = torch.zeros(4, 3, first.camera.height, first.camera.width)
     seen = first.render(code, background).sum(1) > 0
     matrix = torch.from_numpy(first.camera.matrix).float()
     pixels = project(code[TRANSLATION].flatten(0, 1), matrix)
     for number, (u, v) in enumerate(pixels.round().int().tolist()):
-        patch = seen[number // first.num_shown, max(v - 4, 0) : v + 5, max(u - 4, 0) : u + 5]
+        patch = seen[number // first.num_instances, max(v - 4, 0) : v + 5, max(u - 4, 0) : u + 5]
         assert patch.any(), (number, u, v)
 
 
 def test_batches_of_crops_give_what_rendering_needs_and_no_label(brick_world: TwoStageWorld, tmp_path) -> None:
     batch = brick_world.stages[1].source("train", 0, with_code=False, cache=tmp_path).batch(3, 4)
     assert batch.code is None
-    assert set(batch.given) == {ASSUMED_M}
+    assert set(batch.given) == {ASSUMED_DEPTH}
     labelled = brick_world.stages[1].source("train", 0, with_code=True, cache=tmp_path).batch(3, 4)
     again = brick_world.stages[1].render(index(labelled.code, slice(None)), labelled.backgrounds)
     assert torch.allclose(again, batch.images, atol=1e-5)  # Dr.Jit's threads add in any order
