@@ -12,7 +12,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from curio_train.commands import cli
+from curio_train.commands import export as export_command
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, ExportError, UsageError
 from curio_train.export.card import EVALUATION_FILE, Provenance, card, portable
@@ -285,7 +285,7 @@ def test_runs_that_cannot_be_read_are_refused(tmp_path: Path, write_run: WriteRu
 def test_a_place_that_cannot_be_written_is_told(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(SystemExit) as exit_:
-        cli.export([str(run), "--out", str(tmp_path / "file")])
+        export_command.export([str(run), "--out", str(tmp_path / "file")])
     assert exit_.value.code == 1
     said = capsys.readouterr().err
     assert said.startswith("error: cannot write ")
@@ -293,7 +293,9 @@ def test_a_place_that_cannot_be_written_is_told(run: Path, tmp_path: Path, capsy
 
 
 def test_a_full_disk_leaves_nothing_behind(run: Path, tmp_path: Path) -> None:
-    limited = f'ulimit -f 2000; exec "{sys.executable}" -c "from curio_train.commands.cli import export; export()" "$@"'
+    limited = (
+        f'ulimit -f 2000; exec "{sys.executable}" -c "from curio_train.commands.export import export; export()" "$@"'
+    )
     command = ["bash", "-c", limited, "curio-export", str(run), "--out", str(tmp_path / "models")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1

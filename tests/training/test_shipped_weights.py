@@ -9,7 +9,7 @@ from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.export.graph import Graph
-from curio_train.export.onnx import OnnxModel
+from curio_train.exported_model import ExportedModel
 from curio_train.meshes.shapes import chair
 from curio_train.scene_code import TRANSLATION
 from curio_train.worlds.base import ObjectKind
@@ -21,7 +21,7 @@ VERSIONS = sorted((Path(__file__).parents[2] / "models").glob("*/[0-9]*"))
 MESH = chair(0.1)  # only rendering would need the object's own
 
 
-def described_world(model: OnnxModel) -> TwoStageWorld:
+def described_world(model: ExportedModel) -> TwoStageWorld:
     """The world that a model's specification describes, with another mesh."""
     spec = model.spec
     camera, found = spec.camera, spec.objects[0]
@@ -34,7 +34,7 @@ def described_world(model: OnnxModel) -> TwoStageWorld:
 
 @pytest.mark.parametrize("version", VERSIONS, ids=lambda version: version.parent.name)
 def test_weights_fit_and_give_the_golden_answer(version: Path) -> None:
-    world = described_world(OnnxModel.open(version / "model.onnx"))
+    world = described_world(ExportedModel.open(version / "model.onnx"))
     network = world.assemble([stage.network(NetworkConfig()) for stage in world.stages])
     weights, built = load_file(version / "weights.safetensors"), network.state_dict()
     assert {name: value.shape for name, value in weights.items()} == {name: v.shape for name, v in built.items()}

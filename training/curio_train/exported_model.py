@@ -77,7 +77,7 @@ def find_model(path: Path) -> Path:
     if (path / MODEL_FILE).is_file():
         return path / MODEL_FILE
     try:
-        found = versions(path)
+        found = versions(path) if path.is_dir() else []
     except ModelError as exc:
         raise UsageError(str(exc)) from exc
     if not found:

@@ -1,4 +1,4 @@
-"""Project files: the flags of a call, written down once as TOML.
+"""Reads project files: the flags of a call as TOML.
 
 ::
 
@@ -11,10 +11,12 @@
     minutes = 25
 """
 
-import tomllib
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
+
+from curio_serve import errors as serving
+from curio_serve.settings import read_toml, to_arguments
 
 from curio_train.errors import UsageError
 
@@ -38,29 +40,27 @@ def with_project(arguments: list[str], paths: Collection[str]) -> list[str]:
         raise UsageError(f"{FLAG} stands last, expected a TOML file after it")
     file = Path(arguments[place + 1])
     typed = arguments[:place] + arguments[place + 2 :]
-    flags = [word for name, value in _read(file).items() for word in _flag(name, value, file, paths)]
+    flags = [word for name, value in _read(file).items() for word in _arguments(name, value, file, paths)]
     return [*typed[:1], *flags, *typed[1:]]
 
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as exc:
-        raise UsageError(f"{FLAG} {file}: cannot be read ({exc.strerror}); expected a TOML file") from exc
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as exc:
-        raise UsageError(f"{FLAG} {file}: not TOML ({exc})") from exc
+        content = read_toml(file, FLAG)
+    except serving.UsageError as exc:
+        raise UsageError(str(exc)) from exc
     if not content:
         raise UsageError(f'{FLAG} {file}: the file is empty, expected flags such as mesh = "part.stl"')
     return content
 
 
-def _flag(name: str, value: object, file: Path, paths: Collection[str]) -> list[str]:
-    flag, plain = f"--{name.replace('_', '-')}", name.replace("-", "_")
-    if isinstance(value, bool):
-        return [flag] if value else []
-    values: list[Any] = value if isinstance(value, list) else [value]
-    if values and all(isinstance(one, str | int | float) for one in values):
-        return [flag, *(str(file.parent / Path(one).expanduser()) if plain in paths else str(one) for one in values)]
-    raise UsageError(
-        f"{FLAG} {file}, {name}: found a {type(value).__name__}, expected text, a number, a list of them, true or false"
-    )
+def _arguments(name: str, value: Any, file: Path, paths: Collection[str]) -> list[str]:
+    """Flags and their values; paths count from the file's folder."""
+    if name.replace("-", "_") in paths:
+        given = value if isinstance(value, list) else [value]
+        if all(isinstance(one, str) for one in given):
+            value = [str(file.parent / Path(one).expanduser()) for one in given]
+    try:
+        return to_arguments(name, value, f"{FLAG} {file}", negate=False)
+    except serving.UsageError as exc:
+        raise UsageError(str(exc)) from exc
