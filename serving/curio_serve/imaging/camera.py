@@ -168,11 +168,11 @@ def _check_matrix(matrix: Array) -> None:
 
 @lru_cache(32)
 def _check_distortion(camera: PinholeCamera, width: int, height: int) -> None:
-    """Refuse a distortion that moves a point of the frame's border by more than the frame's diagonal."""
+    """Refuse a distortion that moves a point of the frame's border by more than half its diagonal, as far as the centre."""
     x, y = np.meshgrid([-0.5, (width - 1) / 2, width - 0.5], [-0.5, (height - 1) / 2, height - 0.5])
     border = np.stack([x.ravel(), y.ravel(), np.ones(9)])
     moved_px = np.abs(camera.project((np.linalg.inv(camera.matrix) @ border).T) - border[:2].T).max()
-    if not moved_px <= math.hypot(width, height):
+    if not moved_px <= math.hypot(width, height) / 2:
         raise CameraError(
             f"the distortion {list(camera.distortion)} moves pixels of a frame of {width}x{height} by up to "
             f"{moved_px:.3g} px; expected the coefficients k1, k2, p1, p2, k3 of this camera, in OpenCV's order"
