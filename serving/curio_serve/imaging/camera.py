@@ -168,7 +168,7 @@ def _check_matrix(matrix: Array) -> None:
 
 @lru_cache(32)
 def _check_distortion(camera: PinholeCamera, width: int, height: int) -> None:
-    """Refuse a distortion that moves a point of the frame's border by more than half its diagonal, as far as the centre."""
+    """Refuse a distortion that moves a point of the frame's border by more than half the diagonal: past the centre."""
     x, y = np.meshgrid([-0.5, (width - 1) / 2, width - 0.5], [-0.5, (height - 1) / 2, height - 0.5])
     border = np.stack([x.ravel(), y.ravel(), np.ones(9)])
     moved_px = np.abs(camera.project((np.linalg.inv(camera.matrix) @ border).T) - border[:2].T).max()

@@ -17,6 +17,7 @@ from curio_serve.imaging.png import pixels_only
 
 MIN_SIDE_PX = 16
 MAX_PIXELS = 1 << 25  # 33.5 million: 8K video fits
+MAX_FILE_BYTES = 1 << 28  # more than so many pixels of 8 bytes take without compression
 RawFormat = Literal["RGB8", "BGR8", "GRAY8"]
 
 _REDUCED = {
