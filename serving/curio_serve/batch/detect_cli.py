@@ -110,11 +110,14 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.progress import Progress
     from curio_serve.batch.result_file import ResultFile
     from curio_serve.batch.sources import check_arguments, images
+    from curio_serve.models.model_check import ChildCheck
 
     _check_numbers(arguments)
     check_arguments(arguments.images)
     cv2.setNumThreads(1)  # the images are what runs in parallel
     settings = _settings(arguments)
+    if os.path.exists(arguments.model):
+        ChildCheck()(Path(arguments.model))
     estimator = _estimator(arguments, settings)
     form = _format(arguments, estimator.spec)
     _check_camera(arguments, estimator)

@@ -74,7 +74,7 @@ class PoseServer:
         """
         # Frames run in parallel already, one a core; OpenCV's own threads would only get in their way.
         cv2.setNumThreads(1)
-        self._report(self._repository.refresh())
+        self._report(self._repository.refresh(self._check))
         if not list(self._repository):
             raise ModelError(
                 f"no model could be loaded from {self.config.models}; the log says why each was refused. "

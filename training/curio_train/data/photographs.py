@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.view import undistort
 from jaxtyping import Bool, Float
 from PIL import Image
 
@@ -92,12 +94,7 @@ def read_frame(path: Path, camera: Intrinsics) -> np.ndarray:
             f"{path}: found {width}x{height} pixels, but the camera file is for {camera.width}x{camera.height}; "
             "expected photographs as that camera stores them, neither resized nor turned"
         )
-    if not any(camera.distortion):
-        return pixels
-    matrix, size = camera.matrix, (pixels.shape[1], pixels.shape[0])
-    maps = cv2.initUndistortRectifyMap(matrix, np.array(camera.distortion), None, matrix, size, cv2.CV_32FC1)
-    # As serving does it: what lies beyond the photograph's edge continues it, and is no black frame to find things in.
-    return cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return undistort(pixels, PinholeCamera(camera.matrix, camera.distortion))
 
 
 def read_frames(paths: Sequence[Path], camera: Intrinsics, width: int, height: int) -> np.ndarray:
