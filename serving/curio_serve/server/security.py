@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import grpc
 from grpc_health.v1 import health
 
-from curio_serve.api.messages import status_from_error
+from curio_serve.api.status import status_from_error
 from curio_serve.errors import TokenError, UsageError
 from curio_serve.server.config import ServeConfig
 

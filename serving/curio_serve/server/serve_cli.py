@@ -27,8 +27,6 @@ def main() -> None:
 def _serve(config: ServeConfig) -> None:
     # gRPC's own stderr lines say again, and less clearly, what our messages say.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
-    # Connections are read by the threads that answer, not by threads of gRPC's own that would wake them.
-    os.environ.setdefault("GRPC_EXPERIMENTS", "-event_engine_listener")
     # Imported here, so that --help need not wait for gRPC and OpenCV.
     from curio_serve.server.server import PoseServer
     from curio_serve.telemetry import start_logging

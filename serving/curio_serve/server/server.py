@@ -14,6 +14,7 @@ from grpc_health.v1 import health, health_pb2
 from grpc_reflection.v1alpha import reflection, reflection_pb2
 from prometheus_client import CollectorRegistry, start_http_server
 
+from curio_serve.api.admission import WorkQueue
 from curio_serve.api.kserve import InferenceService
 from curio_serve.api.pose_detector import Limits, PoseService
 from curio_serve.api.registration import register
@@ -22,10 +23,7 @@ from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.models.model import Runtime
 from curio_serve.models.model_check import ChildCheck
 from curio_serve.models.repository import Change, Repository
-from curio_serve.server.admission import WorkQueue
 from curio_serve.server.config import ServeConfig
-from curio_serve.server.direct_calls import DirectCalls
-from curio_serve.server.events import share_events
 from curio_serve.server.security import TokenInterceptor, Tokens, read_tokens, server_credentials
 from curio_serve.telemetry import Metrics, log
 
@@ -56,10 +54,9 @@ class PoseServer:
         # Watchers of health wait without a thread each.
         watchers = ThreadPoolExecutor(1)
         self._health = health.HealthServicer(experimental_non_blocking=True, experimental_thread_pool=watchers)
-        self._inference = InferenceService(self._repository, self._metrics)
+        self._inference = InferenceService(self._repository, self._work, self._metrics)
         self._check = ChildCheck()
         self._server: grpc.Server | None = None
-        self._direct: DirectCalls | None = None
         self._stopped = threading.Event()
 
     def start(self) -> list[str]:
@@ -81,27 +78,24 @@ class PoseServer:
                 f"no model could be loaded from {self.config.models}; the log says why each was refused. "
                 "Export one with curio-export"
             )
-        self._server, self._direct = self._build()
+        self._server = self._build()
         addresses = [self._open_port(self._server)]
         if self.config.metrics_port is not None:
             addresses.append(self._open_metrics(self.config.metrics_port))
         self._server.start()
-        self._direct.start()
         self._announce()
         return addresses
 
-    def _build(self) -> tuple[grpc.Server, DirectCalls]:
+    def _build(self) -> grpc.Server:
         config = self.config
         tokens = Tokens(read_tokens(config.token_file) if config.token_file else ())
-        options = channel_options(config)
         server = grpc.server(
             # Threads are made as calls need them, so their number follows the load; one that waits takes 16 kB.
             ThreadPoolExecutor(config.max_calls, thread_name_prefix="curio-call"),
             interceptors=[TokenInterceptor(tokens)],
-            options=options,
+            options=channel_options(config),
             maximum_concurrent_rpcs=config.max_calls,
         )
-        events = share_events(server, options)
         limits = Limits(
             config.max_pixels,
             config.max_regions,
@@ -111,14 +105,12 @@ class PoseServer:
             config.full_decode,
         )
         pose = PoseService(self._repository, self._work, limits, self._metrics)
-        methods = [pose.direct, self._inference.direct]
-        direct = DirectCalls(server, events, self._work, methods, config.max_calls, tokens.refuse)
-        register(server, _POSE, pose, without=["Detect"])
-        register(server, _INFERENCE, self._inference, without=["ModelInfer"])
+        register(server, _POSE, pose, unread=["Detect"])
+        register(server, _INFERENCE, self._inference, unread=["ModelInfer"])
         register(server, _HEALTH, self._health)
         names = [service.full_name for service in (_POSE, _INFERENCE, _HEALTH, _REFLECTION)]
         register(server, _REFLECTION, reflection.ReflectionServicer(names))
-        return server, direct
+        return server
 
     def _open_port(self, server: grpc.Server) -> str:
         host, port = self.config.host, self.config.port
@@ -169,13 +161,12 @@ class PoseServer:
 
     def _drain(self) -> None:
         """Refuse new calls and let accepted ones finish."""
-        if self._server is None or self._direct is None:
+        if self._server is None:
             return
         log(logging.INFO, "draining", grace_s=self.config.grace_s)
         self._inference.drain()
         self._health.enter_graceful_shutdown()
         self._server.stop(self.config.grace_s).wait()
-        self._direct.stop()
 
     def _watch(self) -> None:
         """Pick up new model versions for as long as the server lives."""
