@@ -6,7 +6,8 @@
                       frames: […], images_seen, training_seconds, preset, seed, commit, machine}}}
 
 Beside each method stands the same followed by ``, refined``: its poses after render-and-compare, see
-``curio_train.refinement``. ``frames`` are single frames of a second data set, each with its errors. A row is kept as long as weights, number of renderings and real labels are those that it was made of.
+``curio_train.refinement``. ``frames`` are single frames of a second data set, each with its errors. A
+row is kept as long as weights, number of renderings and real labels are those that it was made of.
 """
 
 from collections.abc import Mapping, Sequence

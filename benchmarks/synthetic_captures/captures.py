@@ -26,13 +26,13 @@ from typing import Any
 import cv2
 import numpy as np
 import trimesh
-from curio_train.capture.camera_json import save_intrinsics
+from curio_train.camera import save_intrinsics
 from curio_train.errors import DataError, UsageError
 from scipy.spatial.transform import Rotation
 
 from synthetic_captures import scenes
 from synthetic_captures.boards import calibrated, photograph_boards
-from synthetic_captures.path_traced import StandinScene, Thing
+from synthetic_captures.path_traced import PathTracedScene, Thing
 from synthetic_captures.sensor import Sensor
 
 _TABLE_M = 2.4
@@ -122,7 +122,7 @@ class _Taker:
     def __init__(self, name: str, samples_per_pixel: int) -> None:
         meshes = [kind.mesh for kind in scenes.kinds(name) for _ in range(kind.count)]
         self._name, self._count = name, len(meshes)
-        self._scene = StandinScene(
+        self._scene = PathTracedScene(
             [Thing(mesh, scenes.colour(slot)) for slot, mesh in enumerate(meshes)],
             scenes.table_look(),
             _TABLE_M,

@@ -25,6 +25,9 @@ class Caller:
     def time_remaining(self) -> float | None:
         return self._remaining_s
 
+    def is_active(self) -> bool:
+        return not self._has_ended
+
     def add_callback(self, callback: Callable[[], None]) -> bool:
         self._callbacks.append(callback)
         self.is_waiting.set()

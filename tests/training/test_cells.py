@@ -7,11 +7,11 @@ import pytest
 import torch
 from curio_train.config import NetworkConfig, Recipe, RunConfig
 from curio_train.errors import UsageError
-from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
+from curio_train.learning.trainer import Trainer
 from curio_train.metrics.assignment import scene_error
-from curio_train.networks.grid import STRIDE, CellGrid, of_cells
-from curio_train.networks.set_detector import AMOUNTS, cell_error, fill_slots
+from curio_train.networks.grid import STRIDE, CellGrid, per_cell
+from curio_train.networks.set_detector import HEAT_MAP, dense_loss, fill_slots
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, SceneCode, index
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.generated.mesh_world import MeshWorld
@@ -45,7 +45,7 @@ def perfect_cells(world: MeshWorld, code: SceneCode) -> tuple[Tensor, dict[str, 
     values = {field.name: torch.full((batch, len(kinds), cells, field.size), 0.3) for field in fields}
     far = grid.locate(grid.pixels, torch.zeros(cells, 1))
     values[TRANSLATION] = far.expand(batch, len(kinds), cells, 3).clone()
-    here = grid.share(grid.project(code[TRANSLATION]))
+    here = grid.splat_weights(grid.project(code[TRANSLATION]))
     present = code[CONFIDENCE][..., 0] if CONFIDENCE in code else torch.ones(code[TRANSLATION].shape[:2])
     for image in range(batch):
         for kind, slots in enumerate(kinds):
@@ -85,7 +85,7 @@ def test_what_is_not_before_the_camera_has_finite_pixels(worlds: dict[str, MeshW
 def test_a_point_is_shared_out_among_the_cells_around_it(worlds: dict[str, MeshWorld]) -> None:
     grid = grid_of(worlds["spheres"])
     pixels = torch.tensor([[16.0, 24.0], [18.0, 24.0], [20.0, 28.0], [-40.0, 400.0]])
-    cell, weight = grid.share(pixels)
+    cell, weight = grid.splat_weights(pixels)
     assert torch.allclose(weight.sum(dim=-1), torch.ones(4))
     pairs = zip(cell.tolist(), weight.tolist(), strict=True)
     on_cell, beside, between, outside = (dict(zip(*pair, strict=True)) for pair in pairs)
@@ -146,7 +146,7 @@ def reading(world: MeshWorld, code: SceneCode) -> dict[str, Tensor]:
     amounts, values = perfect_cells(world, code)
     of_scene = {field.name: code[field.name] for field in world.layout.fields if not field.per_object}
     logits = torch.logit(amounts.clamp(1e-4, 1 - 1e-4))
-    return {AMOUNTS: logits, **{of_cells(name): value for name, value in values.items()}, **of_scene}
+    return {HEAT_MAP: logits, **{per_cell(name): value for name, value in values.items()}, **of_scene}
 
 
 def test_error_of_cells_is_least_at_the_truth(worlds: dict[str, MeshWorld]) -> None:
@@ -155,11 +155,11 @@ def test_error_of_cells_is_least_at_the_truth(worlds: dict[str, MeshWorld]) -> N
     grid, kinds = grid_of(world), kinds_of(world)
 
     def error(read: SceneCode) -> Tensor:
-        return cell_error(world.layout, kinds, grid, read, code)
+        return dense_loss(world.layout, kinds, grid, read, code)
 
     true = reading(world, code)
     least = error(true)
-    for name in (of_cells(TRANSLATION), of_cells(COLOR), LIGHT, AMOUNTS):
+    for name in (per_cell(TRANSLATION), per_cell(COLOR), LIGHT, HEAT_MAP):
         assert (error({**true, name: true[name] + 0.4}) > least + 0.05).all(), name
 
 
@@ -169,7 +169,7 @@ def test_absent_objects_teach_no_cell_anything(worlds: dict[str, MeshWorld]) -> 
     moved = dict(code) | {COLOR: torch.where(code[CONFIDENCE] > 0, code[COLOR], 1 - code[COLOR])}
     assert not torch.equal(moved[COLOR], code[COLOR])
     read, grid, kinds = reading(world, code), grid_of(world), kinds_of(world)
-    errors = [cell_error(world.layout, kinds, grid, read, true) for true in (code, moved)]
+    errors = [dense_loss(world.layout, kinds, grid, read, true) for true in (code, moved)]
     assert torch.equal(*errors)
 
 

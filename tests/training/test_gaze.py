@@ -6,27 +6,42 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from curio_train.camera import Intrinsics, project
+from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
 from curio_train.geometry import (
+    Pose,
     matrix_from_rotation_6d,
     rotation_6d_from_matrix,
     rotation_angle_deg,
     rotation_between,
 )
-from curio_train.networks.base import Look
-from curio_train.networks.two_stage.crop_pose import SURFACE
-from curio_train.networks.two_stage.localise import AMOUNTS, CANDIDATE_LOG_WEIGHTS, CANDIDATES, NUM_CANDIDATES, PLACES
+from curio_train.networks.base import StageNetwork
+from curio_train.networks.crop_camera import project
+from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
+from curio_train.networks.two_stage.localise import (
+    HEAT_MAP,
+    NUM_TOP,
+    PROPOSALS,
+    TOP_LOG_WEIGHTS,
+    TOP_PROPOSALS,
+)
 from curio_train.networks.two_stage.network import SCALES
-from curio_train.rendering.object_coordinates import SurfaceMap
+from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, index
 from curio_train.worlds.single_object.confidence import calibrate
-from curio_train.worlds.single_object.two_stage import ASSUMED_M, CROP_PX, FirstLook, GazeWorld, SecondLook, gaze_camera
+from curio_train.worlds.single_object.two_stage import (
+    ASSUMED_M,
+    CROP_PX,
+    CropPoseStage,
+    LocalisationStage,
+    TwoStageWorld,
+    frame_camera,
+)
 from curio_train.worlds.single_object.world import EXPOSURE, Object
 from torch import Tensor, nn
 
 
-class Told(Look):
+class Told(StageNetwork):
     """A look that answers what it was told, and keeps what it was shown.
 
     Of crops placed nearer and farther too, it says so.
@@ -47,15 +62,15 @@ class Told(Look):
 
 
 def test_the_canonical_camera_is_the_frames_own_at_most_640_pixels_long(brick: Object) -> None:
-    camera = gaze_camera(brick.camera)
+    camera = frame_camera(brick.camera)
     assert (camera.width, camera.height) == (640, 480)
     assert np.array_equal(camera.matrix, brick.camera.matrix)
-    large = gaze_camera(Intrinsics(np.array([[1600.0, 0, 960], [0, 1600, 540], [0, 0, 1]]), 1920, 1080))
+    large = frame_camera(Intrinsics(np.array([[1600.0, 0, 960], [0, 1600, 540], [0, 0, 1]]), 1920, 1080))
     assert (large.width, large.height) == (640, 360)
     assert large.matrix[0, 0] == pytest.approx(1600 / 3)
 
 
-def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(brick_world: GazeWorld) -> None:
+def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(brick_world: TwoStageWorld) -> None:
     """A frame is rendered, looked at where the object is, and the crop compared with one rendered as a crop.
 
     Told the truth about the crop, the gaze must answer the truth about the frame.
@@ -66,17 +81,17 @@ def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(b
     images = brick_world.render(code)
     place = code[TRANSLATION][:, 0]
     distance = place.norm(dim=1, keepdim=True)
-    second = brick_world.looks[1]
+    second = brick_world.stages[1]
     turn = rotation_between(place, torch.tensor([0.0, 0, 1]).expand_as(place))
     relative = {
         TRANSLATION: torch.tensor([0.0, 0, 1]).expand(6, 1, 3),
         ROTATION_6D: rotation_6d_from_matrix(turn @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0]))[:, None],
         CONFIDENCE: torch.full((6, 1, 1), 0.7),
         LIGHT: (turn @ code[LIGHT][..., None])[..., 0],
-        SURFACE: torch.zeros(6, 4, 16, 16),
+        OBJECT_COORDINATES: torch.zeros(6, 4, 16, 16),
     }
     glance = Told(relative)
-    places = {CANDIDATES: code[TRANSLATION], CANDIDATE_LOG_WEIGHTS: torch.zeros(6, 1)}
+    places = {TOP_PROPOSALS: code[TRANSLATION], TOP_LOG_WEIGHTS: torch.zeros(6, 1)}
     network = brick_world.assemble([Told(places), glance])
     found = network(images)
     assert torch.allclose(found[TRANSLATION], code[TRANSLATION], atol=1e-5)
@@ -91,12 +106,14 @@ def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(b
     assert missed < 0.5 * (rendered - rendered.roll(1, dims=-1)).abs().mean(), "further off than half a pixel"
 
 
-def test_objects_of_the_second_look_lie_where_its_code_says(brick_world: GazeWorld) -> None:
-    second = brick_world.looks[1]
+def test_objects_of_the_second_look_lie_where_its_code_says(brick_world: TwoStageWorld) -> None:
+    second = brick_world.stages[1]
     code = second.sample(40, (1,))
     assert 0 < (code[CONFIDENCE] == 0).sum() < 15
     code[CONFIDENCE][:] = 1
-    second.layout.check({name: value for name, value in code.items() if name not in (ASSUMED_M, EXPOSURE, SURFACE)})
+    second.layout.check(
+        {name: value for name, value in code.items() if name not in (ASSUMED_M, EXPOSURE, OBJECT_COORDINATES)}
+    )
     drawn = second.render(code).amax(dim=1) > 0.02
     place = code[TRANSLATION][:, 0]
     pixels = project(place[:, None], torch.from_numpy(second.camera.matrix).float()[None])[:, 0]
@@ -106,10 +123,10 @@ def test_objects_of_the_second_look_lie_where_its_code_says(brick_world: GazeWor
         assert (middle - pixel).norm() < 6
 
 
-def test_surface_points_project_to_the_patches_that_see_them(brick_world: GazeWorld) -> None:
-    second = brick_world.looks[1]
+def test_surface_points_project_to_the_patches_that_see_them(brick_world: TwoStageWorld) -> None:
+    second = brick_world.stages[1]
     code = second.sample(8, (3,))
-    surface_map = SurfaceMap(second.object.mesh, 32)
+    surface_map = ObjectCoordinateMap(second.object.mesh, 32)
     rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
     place = second._metres(code[TRANSLATION][:, 0], code[ASSUMED_M])
     matrices = second._matrices(code, 32)
@@ -118,14 +135,14 @@ def test_surface_points_project_to_the_patches_that_see_them(brick_world: GazeWo
     for image in range(8):
         v, u = torch.nonzero(seen[image], as_tuple=True)  # those at the rim, too
         metres = points[image][:, v, u].T * surface_map.half_extent_m + torch.from_numpy(surface_map.center_m).float()
-        camera = metres @ rotation[image].T + place[image]
+        camera = Pose(rotation[image], place[image]).apply(metres)
         pixels = project(camera[None], torch.from_numpy(matrices[image]).float()[None])[0]
         assert (pixels - torch.stack([u, v], dim=1)).abs().mean() < 0.3
 
 
-def test_first_look_reads_the_likeliest_place(brick_world: GazeWorld) -> None:
+def test_first_look_reads_the_likeliest_place(brick_world: TwoStageWorld) -> None:
     """A network that scores brightness must answer with the bright spot's place, between the depth bounds."""
-    first = brick_world.looks[0]
+    first = brick_world.stages[0]
     network = first.network(NetworkConfig()).eval()
     spot = torch.zeros(1, 3, 120, 160)
     spot[:, :, 60:68, 100:108] = 1.0
@@ -139,15 +156,15 @@ def test_first_look_reads_the_likeliest_place(brick_world: GazeWorld) -> None:
         network.score.weight.zero_()
         network.score.weight[0, 0] = 50.0
         found = network(spot)
-    assert found[PLACES].shape == (1, 20 * 15, 3)
-    assert found[AMOUNTS].shape == (1, 20 * 15)
+    assert found[PROPOSALS].shape == (1, 20 * 15, 3)
+    assert found[HEAT_MAP].shape == (1, 20 * 15)
     pixel = project(found[TRANSLATION][0], torch.from_numpy(first.camera.matrix).float())[0]
     assert (pixel - torch.tensor([104.0, 64.0])).abs().max() < 8.1
     assert 0.5 <= found[TRANSLATION][0, 0, 2] <= 1.5
 
 
-def test_first_look_sees_several_under_one_light(brick_world: GazeWorld) -> None:
-    first: FirstLook = brick_world.looks[0]
+def test_first_look_sees_several_under_one_light(brick_world: TwoStageWorld) -> None:
+    first: LocalisationStage = brick_world.stages[0]
     code = first.sample(4, (1,))
     assert code[TRANSLATION].shape == (4, first.num_shown, 3)
     assert code[LIGHT].shape == (4, 3)
@@ -160,16 +177,16 @@ def test_first_look_sees_several_under_one_light(brick_world: GazeWorld) -> None
         assert patch.any(), (number, u, v)
 
 
-def test_batches_of_crops_give_what_rendering_needs_and_no_label(brick_world: GazeWorld, tmp_path) -> None:
-    batch = brick_world.looks[1].source("train", 0, with_code=False, cache=tmp_path).batch(3, 4)
+def test_batches_of_crops_give_what_rendering_needs_and_no_label(brick_world: TwoStageWorld, tmp_path) -> None:
+    batch = brick_world.stages[1].source("train", 0, with_code=False, cache=tmp_path).batch(3, 4)
     assert batch.code is None
     assert set(batch.given) == {ASSUMED_M}
-    labelled = brick_world.looks[1].source("train", 0, with_code=True, cache=tmp_path).batch(3, 4)
-    again = brick_world.looks[1].render(index(labelled.code, slice(None)), labelled.backgrounds)
+    labelled = brick_world.stages[1].source("train", 0, with_code=True, cache=tmp_path).batch(3, 4)
+    again = brick_world.stages[1].render(index(labelled.code, slice(None)), labelled.backgrounds)
     assert torch.allclose(again, batch.images, atol=1e-5)  # Dr.Jit's threads add in any order
 
 
-class Bright(Look):
+class Bright(StageNetwork):
     """A look at crops that sees the more of the object the brighter they are, and says that it is in the middle."""
 
     def __init__(self) -> None:
@@ -183,11 +200,11 @@ class Bright(Look):
             ROTATION_6D: torch.tensor([1.0, 0, 0, 0, 1, 0]).expand(count, 1, 6),
             CONFIDENCE: brightness.view(count, 1, 1),
             LIGHT: torch.zeros(count, 3),
-            SURFACE: brightness.view(count, 1, 1, 1).expand(count, 4, 16, 16),
+            OBJECT_COORDINATES: brightness.view(count, 1, 1, 1).expand(count, 4, 16, 16),
         }
 
 
-def test_of_several_candidates_the_likeliest_is_answered(brick_world: GazeWorld) -> None:
+def test_of_several_candidates_the_likeliest_is_answered(brick_world: TwoStageWorld) -> None:
     """Two frames, each bright at another of three candidates; then a first look that knows better than the second."""
     candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8], [0.0, 0.2, 1.2]]).expand(2, 3, 3)
     pixels = project(candidates, torch.from_numpy(brick_world.camera.matrix).float()[None]).round().int()
@@ -195,26 +212,26 @@ def test_of_several_candidates_the_likeliest_is_answered(brick_world: GazeWorld)
     for image, chosen in enumerate((2, 0)):
         u, v = pixels[image, chosen].tolist()
         frames[image, :, v - 30 : v + 31, u - 30 : u + 31] = 1.0
-    equal = {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: torch.full((2, 3), -1.1)}
+    equal = {TOP_PROPOSALS: candidates, TOP_LOG_WEIGHTS: torch.full((2, 3), -1.1)}
     found = brick_world.assemble([Told(equal), Bright()])(frames)
     assert torch.allclose(found[TRANSLATION][:, 0], candidates[0, [2, 0]], atol=1e-5)
     assert found[CONFIDENCE].min() > 0.1
     assert set(found) == {field.name for field in brick_world.layout.fields}
-    known = {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: torch.tensor([[-9.0, 0, -9]]).expand(2, 3)}
+    known = {TOP_PROPOSALS: candidates, TOP_LOG_WEIGHTS: torch.tensor([[-9.0, 0, -9]]).expand(2, 3)}
     found = brick_world.assemble([Told(known), Bright()])(frames)
     assert torch.allclose(found[TRANSLATION][:, 0], candidates[0, [1, 1]], atol=1e-5)
 
 
-def test_confidence_weighs_what_all_glances_see(brick_world: GazeWorld) -> None:
+def test_confidence_weighs_what_all_glances_see(brick_world: TwoStageWorld) -> None:
     """Probability that the object is there, by evidence and weight of the place, times that of being right then."""
     candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8]]).expand(3, 2, 3)
     weights = torch.tensor([[-3.0, -0.5]]).expand(3, 2)
     frames = torch.tensor([0.2, 0.5, 0.9])[:, None, None, None].expand(3, 3, 480, 640)
-    network = brick_world.assemble([Told({CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: weights}), Bright()])
-    _, signs = network.read(frames)
+    network = brick_world.assemble([Told({TOP_PROPOSALS: candidates, TOP_LOG_WEIGHTS: weights}), Bright()])
+    _, signs = network.uncalibrated(frames)
     brightness = frames[:, 0, 0, 0]
-    assert torch.allclose(signs.right[:, 0], brightness.logit(), atol=1e-4)
-    assert torch.allclose(signs.there, torch.stack([brightness, torch.full((3,), -0.5)], dim=1), atol=1e-4)
+    assert torch.allclose(signs.pose_correct[:, 0], brightness.logit(), atol=1e-4)
+    assert torch.allclose(signs.presence, torch.stack([brightness, torch.full((3,), -0.5)], dim=1), atol=1e-4)
     assert torch.allclose(network(frames)[CONFIDENCE].flatten(), brightness, atol=1e-4)
     network.rightness.copy_(torch.tensor([2.0, 0.5]))
     network.presence.copy_(torch.tensor([2.0, 1.0, 0.25]))
@@ -222,7 +239,7 @@ def test_confidence_weighs_what_all_glances_see(brick_world: GazeWorld) -> None:
     assert torch.allclose(network(frames)[CONFIDENCE].flatten(), expected, atol=1e-4)
 
 
-class Middle(Look):
+class Middle(StageNetwork):
     """A look at frames that takes everything to be at one place."""
 
     def __init__(self) -> None:
@@ -232,10 +249,10 @@ class Middle(Look):
     def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         count = len(features)
         place = torch.tensor([0.0, 0, 0.8]).expand(count, 1, 3)
-        return {}, {CANDIDATES: place, CANDIDATE_LOG_WEIGHTS: torch.zeros(count, 1)}
+        return {}, {TOP_PROPOSALS: place, TOP_LOG_WEIGHTS: torch.zeros(count, 1)}
 
 
-def test_calibration_knows_empty_frames(brick_world: GazeWorld, tmp_path: Path) -> None:
+def test_calibration_knows_empty_frames(brick_world: TwoStageWorld, tmp_path: Path) -> None:
     """To a network that sees what stands out from the wall, whose own confidence says nothing."""
     wall = torch.full((4, 3, 480, 640), 128 / 255)
 
@@ -243,7 +260,10 @@ def test_calibration_knows_empty_frames(brick_world: GazeWorld, tmp_path: Path) 
         def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
             seen = (features - wall[0, 0, 0, 0]).abs().mean(dim=(1, 2, 3), keepdim=True)
             surface = (100 * seen).expand(-1, 4, 16, 16)
-            return {}, super().decode(features)[1] | {SURFACE: surface, CONFIDENCE: torch.full_like(seen[:, 0], 0.5)}
+            return {}, super().decode(features)[1] | {
+                OBJECT_COORDINATES: surface,
+                CONFIDENCE: torch.full_like(seen[:, 0], 0.5),
+            }
 
     network = brick_world.assemble([Middle(), StandsOut()])
     calibrate(network, brick_world, tmp_path)
@@ -253,15 +273,15 @@ def test_calibration_knows_empty_frames(brick_world: GazeWorld, tmp_path: Path) 
     assert empty < 0.6 * full
 
 
-def test_candidates_are_apart_and_the_likeliest_comes_first(brick_world: GazeWorld) -> None:
-    first = brick_world.looks[0]
+def test_candidates_are_apart_and_the_likeliest_comes_first(brick_world: TwoStageWorld) -> None:
+    first = brick_world.stages[0]
     network = first.network(NetworkConfig())
     weights = torch.full((1, 20 * 15), 1e-6)
     chosen = torch.tensor([5 * 20 + 5, 5 * 20 + 6, 10 * 20 + 12, 2 * 20 + 17])
     weights[0, chosen] = torch.tensor([0.5, 0.3, 0.15, 0.05])
     places = network.grid.locate(network.grid.pixels, torch.zeros(300, 1))[None]
     found, of_found = network._candidates(places, weights)
-    assert found.shape == (1, NUM_CANDIDATES, 3)
+    assert found.shape == (1, NUM_TOP, 3)
     assert torch.equal(found[0, :3], places[0, chosen[[0, 2, 3]]])
     assert torch.equal(of_found[0, :3], weights[0, chosen[[0, 2, 3]]])
     # Cells far from each other that mean one place are one candidate.
@@ -270,30 +290,30 @@ def test_candidates_are_apart_and_the_likeliest_comes_first(brick_world: GazeWor
     assert torch.equal(found[0, :2], places[0, chosen[[0, 3]]])
 
 
-def test_colours_differ_least_where_they_tell_most(brick: Object, brick_world: GazeWorld) -> None:
+def test_colours_differ_least_where_they_tell_most(brick: Object, brick_world: TwoStageWorld) -> None:
     """The first look, and all looks at a known scene, see milder light than the second look at an unknown one."""
-    first, second = brick_world.looks
-    known = GazeWorld("capture", replace(brick, known_scene=True))
+    first, second = brick_world.stages
+    known = TwoStageWorld("capture", replace(brick, known_scene=True))
     spread = {
         name: float(look.sample(400, (1,))[EXPOSURE].log().std())
-        for name, look in {"whole": brick_world, "first": first, "second": second, "known": known.looks[1]}.items()
+        for name, look in {"whole": brick_world, "first": first, "second": second, "known": known.stages[1]}.items()
     }
     assert spread["second"] > 1.3 * spread["first"]
     assert spread["whole"] == pytest.approx(spread["first"], rel=0.1)
     assert spread["known"] == pytest.approx(spread["first"], rel=0.1)
     images = torch.rand(64, 3, 1, 1).expand(-1, -1, 64, 64).contiguous()
 
-    def moved(look: FirstLook | SecondLook) -> float:
-        return float((look.disturb(images, (1,)) - images).mean((2, 3)).abs().mean())
+    def moved(look: LocalisationStage | CropPoseStage) -> float:
+        return float((look.augment(images, (1,)) - images).mean((2, 3)).abs().mean())
 
     assert moved(second) > 1.3 * moved(first)
-    assert moved(first) > 1.2 * moved(known.looks[0])
-    assert moved(known.looks[0]) == pytest.approx(moved(known.looks[1]))
+    assert moved(first) > 1.2 * moved(known.stages[0])
+    assert moved(known.stages[0]) == pytest.approx(moved(known.stages[1]))
 
 
 def test_light_of_a_known_scene_tells_faces_apart(brick: Object) -> None:
     for known, weakest in ((False, 0.2), (True, 0.5)):
-        for look in GazeWorld("capture", replace(brick, known_scene=known)).looks:
+        for look in TwoStageWorld("capture", replace(brick, known_scene=known)).stages:
             strength = look.sample(400, (1,))[LIGHT].norm(dim=-1)
             assert weakest <= strength.min() < 1.1 * weakest
             assert strength.max() <= 2

@@ -58,7 +58,7 @@ def test_a_model_gives_the_network_that_it_was_exported_from(run: Path, model: P
         for name, value in expected.items():
             assert found[name].dtype == value.dtype
             assert torch.allclose(found[name], value, rtol=tolerance, atol=1e-6 * bool(tolerance)), name
-        assert (state.course.all_images, state.course.images, state.course.all_seconds) == (64, 0, 1.5)
+        assert (state.progress.all_images, state.progress.images, state.progress.all_seconds) == (64, 0, 1.5)
     assert not torch.equal(network(begun(model))["encoder.layers.0.weight"], expected["encoder.layers.0.weight"])
     assert (model / "2" / "weights.safetensors").stat().st_size < 0.51 * (
         model / "1" / "weights.safetensors"
@@ -83,7 +83,7 @@ def test_images_count_on_over_models_and_in_their_cards(model: Path, tmp_path: P
     assert "| images seen | 76, 12 of them since it was circles |" in card
     assert "| a | 2 |" in card
     assert "`curio-train circles --init models/circles/1`" in card
-    assert begun(version).course.images_before == 76
+    assert begun(version).progress.images_before == 76
 
 
 def test_a_run_killed_before_its_first_checkpoint_begins_with_the_same_network(run: Path, tmp_path: Path) -> None:

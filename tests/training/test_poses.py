@@ -95,7 +95,7 @@ def test_continuous_symmetry() -> None:
     np.testing.assert_allclose(same[0].translation_m, 0, atol=1e-12)
     on_axis = np.array([[0.05, 0, -0.2]])
     for pose in same:
-        np.testing.assert_allclose(poses.transform(pose, on_axis), on_axis, atol=1e-12)
+        np.testing.assert_allclose(pose.apply(on_axis), on_axis, atol=1e-12)
     turn = same[100]
     estimate = Pose(turn.rotation, turn.translation_m + ORIGIN.translation_m)
     assert poses.mssd_m(estimate, ORIGIN, CLOUD, same) == pytest.approx(0, abs=1e-12)

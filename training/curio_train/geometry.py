@@ -1,14 +1,16 @@
 """Rotations and rigid transforms in torch, batch first.
 
 Frames and handedness: everything is right-handed; the camera frame is OpenCV's (x right, y down, z forward), the world
-frame of the ground-plane scenes has y up. A transform is named target_from_source and is the pair
-``rotation [*batch, 3, 3], translation_m [*batch, 3]``; a point goes ``rotation @ point + translation_m``.
+frame of the ground-plane scenes has y up. A transform is a :class:`Pose`, named target_from_source; a point x of the
+source frame becomes ``rotation @ x + translation_m``.
 
 6D rotations are Zhou et al. 2019 ("On the Continuity of Rotation Representations in Neural Networks"), the first two
 **columns** of the matrix, column after column. (PyTorch3D stores rows.)
 """
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -20,17 +22,55 @@ from torch import Tensor
 # bounds them.
 _SHORTEST = 1e-6
 
+Array = TypeVar("Array", np.ndarray, Tensor)
 
-class Pose(NamedTuple):
-    """One target_from_source transform in numpy, as files and metrics hold it.
 
-    Attributes:
-        rotation: [3, 3].
-        translation_m: [3].
-    """
+@dataclass(frozen=True, eq=False)
+class Pose(Generic[Array]):
+    """A rigid transform target_from_source, or a batch of them: numpy arrays, as files and metrics have, or tensors."""
 
-    rotation: np.ndarray
-    translation_m: np.ndarray
+    rotation: Array
+    """[*batch, 3, 3]."""
+    translation_m: Array
+    """[*batch, 3]: the source frame's origin in the target frame."""
+
+    def __iter__(self) -> Iterator[Array]:
+        """Rotation and translation, to unpack."""
+        return iter((self.rotation, self.translation_m))
+
+    @staticmethod
+    def identity() -> "Pose[np.ndarray]":
+        """The pose that moves nothing, in numpy."""
+        return Pose(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: Array) -> "Pose[Array]":
+        """The pose of homogeneous matrices [*batch, 4, 4]."""
+        return Pose(matrix[..., :3, :3], matrix[..., :3, 3])
+
+    def apply(self, points: Array) -> Array:
+        """Points of the source frame in the target frame.
+
+        Args:
+            points: [*batch, n, 3]; leading dimensions broadcast. For a single pose any shape [..., 3].
+        """
+        single = self.rotation.ndim == 2
+        translation_m = self.translation_m if single else self.translation_m[..., None, :]
+        return points @ self.rotation.swapaxes(-1, -2) + translation_m
+
+    def inverse(self) -> "Pose[Array]":
+        """source_from_target."""
+        transposed = self.rotation.swapaxes(-1, -2)
+        return Pose(transposed, -(transposed @ self.translation_m[..., None])[..., 0])
+
+    def __matmul__(self, other: "Pose[Array]") -> "Pose[Array]":
+        """a_from_c of ``a_from_b @ b_from_c``."""
+        moved = (self.rotation @ other.translation_m[..., None])[..., 0]
+        return Pose(self.rotation @ other.rotation, moved + self.translation_m)
+
+    def to(self, like: Tensor) -> "Pose[Tensor]":
+        """The same pose as tensors with the type and device of ``like``."""
+        return Pose(torch.as_tensor(self.rotation).to(like), torch.as_tensor(self.translation_m).to(like))
 
 
 def _unit(vector: Tensor, fallback: Tensor) -> Tensor:
@@ -134,42 +174,14 @@ def rotation_angle_deg(a: Float[Tensor, "*#batch 3 3"], b: Float[Tensor, "*#batc
     return torch.rad2deg(torch.atan2(twice_sin, twice_cos))
 
 
-def transform_points(
-    rotation: Float[Tensor, "*#batch 3 3"],
-    translation_m: Float[Tensor, "*#batch 3"],
-    points: Float[Tensor, "*#batch n 3"],
-) -> Float[Tensor, "... n 3"]:
-    """Points of the source frame in the target frame; leading dimensions broadcast."""
-    return points @ rotation.transpose(-1, -2) + translation_m.unsqueeze(-2)
+def camera_looking_at(eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"]) -> Pose[Tensor]:
+    """cam_from_world of an OpenCV camera at ``eye`` (world frame, y up) that points at ``target`` without roll.
 
-
-def invert(
-    rotation: Float[Tensor, "*batch 3 3"], translation_m: Float[Tensor, "*batch 3"]
-) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
-    """source_from_target of a target_from_source."""
-    transposed = rotation.transpose(-1, -2)
-    return transposed, -(transposed @ translation_m.unsqueeze(-1)).squeeze(-1)
-
-
-def compose(
-    a_from_b: tuple[Float[Tensor, "*#batch 3 3"], Float[Tensor, "*#batch 3"]],
-    b_from_c: tuple[Float[Tensor, "*#batch 3 3"], Float[Tensor, "*#batch 3"]],
-) -> tuple[Float[Tensor, "... 3 3"], Float[Tensor, "... 3"]]:
-    """a_from_c."""
-    rotation, translation_m = a_from_b
-    return rotation @ b_from_c[0], (rotation @ b_from_c[1].unsqueeze(-1)).squeeze(-1) + translation_m
-
-
-def camera_looking_at(
-    eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"]
-) -> tuple[Float[Tensor, "... 3 3"], Float[Tensor, "... 3"]]:
-    """cam_from_world of an OpenCV camera at ``eye`` (world frame, y up) that looks at ``target`` without roll.
-
-    Looking straight up or down, where "without roll" means nothing, the image's x axis is the world's.
+    Straight up or down, where roll is not defined, the image's x axis is the world's.
     """
     forward = target - eye
     forward = forward / torch.linalg.vector_norm(forward, dim=-1, keepdim=True)
     down = forward.new_tensor([0.0, -1.0, 0.0]).expand_as(forward)
     right = _unit(torch.linalg.cross(down, forward), forward.new_tensor([1.0, 0.0, 0.0]).expand_as(forward))
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-2)
-    return rotation, -(rotation @ eye.unsqueeze(-1)).squeeze(-1)
+    return Pose(rotation, -(rotation @ eye.unsqueeze(-1)).squeeze(-1))

@@ -30,6 +30,9 @@ class Call(Protocol):
     def time_remaining(self) -> float | None:
         """Seconds until the caller's deadline; None without one."""
 
+    def is_active(self) -> bool:
+        """Whether the call has not ended."""
+
     def add_callback(self, callback: Callable[[], None]) -> bool:
         """Have a function called when the call ends; False if it has ended already."""
 
@@ -192,6 +195,20 @@ class WorkQueue:
             f"try again in {retry_s:g} s",
             retry_s,
         )
+
+
+def check_is_wanted(call: Call) -> None:
+    """Check that somebody still waits for a call's answer.
+
+    Raises:
+        DeadlineError: Its deadline has passed.
+        CallCancelled: The client hung up, or the server's grace time is over.
+    """
+    remaining_s = call.time_remaining()
+    if remaining_s is not None and remaining_s <= 0:
+        raise DeadlineError("the deadline passed before the work was done; the rest of it was not begun")
+    if not call.is_active():
+        raise CallCancelled("the call was ended before the work was done; the rest of it was not begun")
 
 
 def _deadline_passed(waited_s: float) -> DeadlineError:

@@ -6,12 +6,13 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import grpc
 from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer
 
-from curio_serve.api.admission import WorkQueue
+from curio_serve.api.admission import WorkQueue, check_is_wanted
 from curio_serve.api.messages import camera_from_message, frame_from_raw, region_from_message
 from curio_serve.api.registration import only_message
 from curio_serve.api.status import CallLog, frame_error
@@ -55,7 +56,7 @@ class PoseService(PoseDetectorServicer):
             call.request_id = request.request_id
             detectors = self._detectors(request)
             with self._work.slot(context, place) as waited_s:
-                return self._detect(request, detectors, waited_s)
+                return self._detect(request, detectors, waited_s, context)
 
     def DetectStream(
         self, requests: Iterator[messages.DetectRequest], context: Context
@@ -82,7 +83,7 @@ class PoseService(PoseDetectorServicer):
                 call.request_id = request.request_id
                 detectors = self._detectors(request)
                 with self._work.slot(context, always=True) as waited_s:
-                    return self._detect(request, detectors, waited_s)
+                    return self._detect(request, detectors, waited_s, context)
         except CallEnded:
             raise
         except CurioError as exc:
@@ -110,11 +111,12 @@ class PoseService(PoseDetectorServicer):
         return answer
 
     def _detect(
-        self, request: messages.DetectRequest, detectors: list[Detector], waited_s: float
+        self, request: messages.DetectRequest, detectors: list[Detector], waited_s: float, context: Context
     ) -> messages.DetectResponse:
         """Decode a request's frame and run the models on it.
 
         Raises:
+            CallEnded: The deadline passed, or the client or the server ended the call, before the last run.
             RequestError: The image, the camera or a region is not acceptable.
             InternalError: A network failed.
         """
@@ -135,6 +137,7 @@ class PoseService(PoseDetectorServicer):
                 max_detections=request.max_detections or None,
                 reduction=frame.reduction,
                 results=answer.results,
+                before_run=partial(check_is_wanted, context),
             )
         inferred = time.perf_counter()
         # Only now: what writes messages has gone cold by the time that a network has run.
@@ -160,7 +163,16 @@ class PoseService(PoseDetectorServicer):
             raise ArgumentError(f"request_id has {len(request.request_id)} characters; at most {_MAX_ID_LENGTH}")
         if request.HasField("max_detections") and not request.max_detections:
             raise ArgumentError("max_detections is 0; leave it out for no limit, or give at least 1")
-        return [Detector(self._repository.get(model.name, model.version)) for model in models]
+        most_runs = max(limits.max_models, limits.max_regions)
+        if len(models) * num_regions > most_runs:
+            raise ArgumentError(
+                f"{len(models)} models times {num_regions} regions are {len(models) * num_regions} runs of a network; "
+                f"at most {most_runs} are accepted (the larger of --max-models and --max-regions)"
+            )
+        found = [self._repository.get(model.name, model.version) for model in models]
+        if len(set(found)) < len(found):
+            raise ArgumentError("models names a model more than once; expected each once")
+        return list(map(Detector, found))
 
 
 def new_request_id() -> str:

@@ -119,8 +119,8 @@ class PoseClient(_Client):
         Args:
             model: Name, or ``name/version``; several for several objects in one call.
             image: Path of a JPEG, PNG or WebP file, its bytes, or pixels uint8 RGB [height, width, 3].
-            camera: Camera file, :class:`~curio_serve.imaging.camera.PinholeCamera` or K [3, 3] in pixels; None for models
-                that need none.
+            camera: Camera file, :class:`~curio_serve.imaging.camera.PinholeCamera` or K [3, 3] in pixels; None for
+                models that need none.
             regions: Where to look, each (x, y, width, height) in pixels; none: everywhere.
             min_confidence: Leave out what is below; None: the server's own threshold.
             max_detections: Most confident first, a region and model; None: no limit.

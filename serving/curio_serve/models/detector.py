@@ -1,6 +1,6 @@
 """Image in, poses out: one loaded model over the regions of a frame. No gRPC here."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,6 +46,7 @@ class Detector:
         max_detections: int | None = None,
         reduction: int = 1,
         results: "Results | None" = None,
+        before_run: Callable[[], None] = lambda: None,
     ) -> "Results":
         """Poses in one frame.
 
@@ -57,6 +58,7 @@ class Detector:
             max_detections: Most detections a region; None: all.
             reduction: How much smaller than the frame the pixels were decoded.
             results: Those of an answer, to which these are added; None: of an answer that has none yet.
+            before_run: Called before each run of the network; what it raises ends the detection.
 
         Returns:
             One result a region, in order; detections most confident first.
@@ -74,7 +76,7 @@ class Detector:
             frame.look(region) if region.overlaps(frame.width, frame.height) else None
             for region in regions or [Region(0, 0, frame.width, frame.height)]
         ]
-        answers = iter(self._answers([view.image for view in views if view is not None]))
+        answers = iter(self._answers([view.image for view in views if view is not None], before_run))
         results = DetectResponse().results if results is None else results
         for index, view in enumerate(views):
             result = results.add(model=self.model.name, model_version=self.model.version, region=index)
@@ -84,10 +86,11 @@ class Detector:
                 _fill(result, view, self.model.slots, next(answers), min_confidence, max_detections)
         return results
 
-    def _answers(self, images: list[Array]) -> list[Values]:
+    def _answers(self, images: list[Array], before_run: Callable[[], None]) -> list[Values]:
         """What the network says of each image, computed a few at a time: memory stays flat however many there are."""
         answers: list[Values] = []
         for start in range(0, len(images), _MAX_BATCH):
+            before_run()
             batch = images[start : start + _MAX_BATCH]
             outputs = self.model.run(batch[0][None] if len(batch) == 1 else np.stack(batch))
             rows = zip(*[value.tolist() for value in outputs.values()], strict=True)

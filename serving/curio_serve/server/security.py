@@ -1,6 +1,7 @@
-"""Who may call: TLS, client certificates, bearer tokens."""
+"""Checks who may call: TLS, client certificates, bearer tokens."""
 
 import hmac
+import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -10,8 +11,9 @@ import grpc
 from grpc_health.v1 import health
 
 from curio_serve.api.status import status_from_error
-from curio_serve.errors import TokenError, UsageError
+from curio_serve.errors import TokenError, UsageError, status_of
 from curio_serve.server.config import ServeConfig
+from curio_serve.telemetry import Metrics, log
 
 _HEALTH_PREFIX = f"/{health.SERVICE_NAME}/"
 
@@ -29,7 +31,7 @@ class Tokens:
         shown = dict(metadata).get("authorization", "")
         text = shown.encode() if isinstance(shown, str) else shown
         token = text.removeprefix(b"Bearer ")
-        # Every token is compared, in constant time, so that timing tells nothing.
+        # Every token is compared, in constant time, so that timing reveals nothing.
         matches = [hmac.compare_digest(token, known) for known in self._known]
         if token != text and any(matches):
             return None
@@ -39,8 +41,9 @@ class Tokens:
 class TokenInterceptor(grpc.ServerInterceptor):
     """Lets calls pass that show a known bearer token, and health checks."""
 
-    def __init__(self, tokens: Tokens) -> None:
-        self._tokens = tokens
+    def __init__(self, tokens: Tokens, metrics: Metrics) -> None:
+        """Count refused calls in ``metrics``."""
+        self._tokens, self._metrics = tokens, metrics
 
     def intercept_service(
         self,
@@ -52,11 +55,16 @@ class TokenInterceptor(grpc.ServerInterceptor):
         error = self._tokens.refuse(handler_call_details.invocation_metadata)
         if error is None:
             return continuation(handler_call_details)
-        return grpc.stream_stream_rpc_method_handler(partial(_abort, status_from_error(error)))
+        # A handler of streams ends the call before its message is read.
+        return grpc.stream_stream_rpc_method_handler(partial(self._refuse, error, handler_call_details.method))
 
-
-def _abort(status: grpc.Status, _requests: Iterator[bytes], context: grpc.ServicerContext) -> NoReturn:
-    context.abort_with_status(status)
+    def _refuse(
+        self, error: TokenError, path: str, _requests: Iterator[bytes], context: grpc.ServicerContext
+    ) -> NoReturn:
+        # The caller chose the path, so it goes into the log, shortened, and not into a label.
+        self._metrics.requests.labels("any", status_of(error)).inc()
+        log(logging.INFO, "refused", reason=str(error), method=path[:100], code=status_of(error), peer=context.peer())
+        context.abort_with_status(status_from_error(error))
 
 
 def server_credentials(config: ServeConfig) -> grpc.ServerCredentials | None:

@@ -92,7 +92,7 @@ class PoseServer:
         server = grpc.server(
             # Threads are made as calls need them, so their number follows the load; one that waits takes 16 kB.
             ThreadPoolExecutor(config.max_calls, thread_name_prefix="curio-call"),
-            interceptors=[TokenInterceptor(tokens)],
+            interceptors=[TokenInterceptor(tokens, self._metrics)],
             options=channel_options(config),
             maximum_concurrent_rpcs=config.max_calls,
         )

@@ -339,9 +339,11 @@ def render(arguments: Sequence[str] | None = None) -> None:
 
 def _render(command: RenderCommand) -> int:
     from curio_train.drawing.album import draw
-    from curio_train.drawing.pictures import Wish
+    from curio_train.drawing.pictures import RenderOptions
 
-    wish = Wish(command.height, command.turn_deg, command.over_photograph, command.path_traced, command.samples)
+    wish = RenderOptions(
+        command.height, command.turn_deg, command.over_photograph, command.path_traced, command.samples
+    )
     for path in draw(command.scenes, command.out, command.mesh, command.mesh_unit, command.world, wish):
         print(path)
     return 0

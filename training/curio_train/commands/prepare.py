@@ -45,7 +45,7 @@ def _usual_network(config: RunConfig, options: CaptureOptions) -> NetworkConfig:
     """Parts on a plane are read by cells, unless the call, the paper, or wake–sleep wants it otherwise."""
     if options.plane is None or config.network.reading is not None:
         return config.network
-    whole = config.preset == "paper" or config.terms > {"sleep"}
+    whole = config.preset == "paper" or config.terms.perturbs_predictions
     return replace(config.network, reading="whole" if whole else "cells")
 
 
@@ -55,14 +55,14 @@ def _refuse_unreadable(options: LinemodOptions) -> None:
         return
     from curio_train.data.bop import BopDataset
     from curio_train.data.photographs import Photographs, read_frame
-    from curio_train.worlds.single_object.linemod import read_cameras
+    from curio_train.worlds.single_object.linemod import read_camera_poses
 
     camera = BopDataset(options.data).camera
     paths = Photographs(options.photos).paths
     for path in paths:
         read_frame(path, camera)
     if options.views is not None:
-        read_cameras(options.views, paths)
+        read_camera_poses(options.views, paths)
 
 
 def _with_paint(options: CaptureOptions, tell: Callable[[str], None]) -> CaptureOptions:

@@ -16,7 +16,7 @@ _SHADOW_TINT = 0.25  # how far the logarithms of a shadow's three ratios to the 
 _LEAST_LIGHT = 1e-3
 
 
-class PlateDifference(NamedTuple):
+class BackgroundDifference(NamedTuple):
     """Photographs beside their plate.
 
     Attributes:
@@ -32,7 +32,7 @@ class PlateDifference(NamedTuple):
 
 def compare(
     photographs: Float[Tensor, "num 3 height width"], plate: Float[Tensor, "3 height width"]
-) -> PlateDifference:
+) -> BackgroundDifference:
     """Compare photographs with the empty scene, both sRGB in [0, 1]."""
     light, empty = linear_from_srgb(photographs), linear_from_srgb(plate)
     ratio = (light + _LEAST_LIGHT) / (empty + _LEAST_LIGHT)
@@ -42,7 +42,7 @@ def compare(
     limit = (level + _DEVIATIONS * 1.4826 * _median((difference - level).abs())).clamp(min=_LEAST_DIFFERENCE)
     logs = ratio.clamp(min=_LEAST_LIGHT).log()
     shaded = (logs.amax(dim=1) - logs.amin(dim=1) < _SHADOW_TINT) & (logs.mean(dim=1) < 0)
-    return PlateDifference(difference, difference > limit, shaded)
+    return BackgroundDifference(difference, difference > limit, shaded)
 
 
 def _median(images: Tensor) -> Float[Tensor, "num 1 1"]:

@@ -17,7 +17,7 @@ from curio_train.camera import Intrinsics
 from curio_train.data.backgrounds import Backgrounds
 from curio_train.data.photographs import read_frame
 
-PLATE_SHARE = 0.85
+BACKGROUND_IMAGE_FRACTION = 0.85
 """Of backgrounds that are the plate where it is mixed with others, which are the rare case in use."""
 
 _LARGEST_SHIFT = 0.04  # of the frame's width, and as much of its height
@@ -30,7 +30,7 @@ _CAST_REACH, _CAST_SIZES = 0.2, (0.08, 0.25)  # of a crop's side: where a part's
 _DARKEST_CAST = 0.6
 
 
-class PlateBackgrounds(Backgrounds):
+class BackgroundImages(Backgrounds):
     """One photograph of the empty scene, shifted and lit a little differently each time."""
 
     def __init__(self, plate: np.ndarray, shares: tuple[float, float] | None = None) -> None:
@@ -45,7 +45,7 @@ class PlateBackgrounds(Backgrounds):
             self._levels.append(cv2.resize(self._levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
     @classmethod
-    def read(cls, path: Path, camera: Intrinsics) -> "PlateBackgrounds":
+    def read(cls, path: Path, camera: Intrinsics) -> "BackgroundImages":
         """The plate in a file.
 
         Raises:
@@ -53,12 +53,12 @@ class PlateBackgrounds(Backgrounds):
         """
         return cls(read_frame(path, camera))
 
-    def split(self, train: bool) -> "PlateBackgrounds":
+    def split(self, train: bool) -> "BackgroundImages":
         """The plate is known in use, so it is no secret of the test."""
         return self
 
-    def of_crops(self, least: float, largest: float) -> "PlateBackgrounds":
-        return PlateBackgrounds(self._levels[0], (least, largest))
+    def of_crops(self, least: float, largest: float) -> "BackgroundImages":
+        return BackgroundImages(self._levels[0], (least, largest))
 
     def draw(self, count: int, width: int, height: int, seed: tuple[int, ...]) -> Tensor:
         random = np.random.default_rng(seed)

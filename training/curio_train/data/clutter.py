@@ -15,7 +15,7 @@ _SHARES = {"plain": 0.5, "stripes": 0.15, "tiles": 0.15, "print": 0.2}
 _LETTERS = "ABCDEFGHJKLMNPRSTUVWXYZabdefghkmnpqrstuy0123456789=#&%"
 
 
-def scatter_leaves(image: Float[np.ndarray, "height width 3"], random: np.random.Generator) -> None:
+def dead_leaves_texture(image: Float[np.ndarray, "height width 3"], random: np.random.Generator) -> None:
     """Cover a picture with leaves, in place: with some twenty to a hundred and more, the largest below.
 
     Args:

@@ -6,14 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from curio_train.drawing.pictures import Surroundings, Wish, picture
+from curio_train.drawing.pictures import RenderOptions, SceneContext, picture
 from curio_train.drawing.scenes import mesh_world, read_scenes
 from curio_train.errors import DataError, UsageError
 from curio_train.meshes.meshes import Unit, load_mesh
 
 
 def draw(
-    scenes: Path, out: Path, meshes: Sequence[str], mesh_unit: Unit | None, world: str | None, wish: Wish
+    scenes: Path, out: Path, meshes: Sequence[str], mesh_unit: Unit | None, world: str | None, wish: RenderOptions
 ) -> Iterator[Path]:
     """Draw every scene of a file and yield the pictures' paths as they are written.
 
@@ -35,7 +35,7 @@ def draw(
         raise UsageError("--mesh and --world exclude each other: a world brings its own meshes")
     given = _surroundings(meshes, mesh_unit, world)
     for scene in read_scenes(scenes):
-        around = Surroundings.of_world(mesh_world(scene.world)) if scene.world else given
+        around = SceneContext.of_world(mesh_world(scene.world)) if scene.world else given
         if around is None:
             raise UsageError(f"{scenes}: detections don't say what the objects look like; add --mesh FILE or --world")
         path = out / f"{scene.name}.png"
@@ -43,13 +43,13 @@ def draw(
         yield path
 
 
-def _surroundings(meshes: Sequence[str], mesh_unit: Unit | None, world: str | None) -> Surroundings | None:
+def _surroundings(meshes: Sequence[str], mesh_unit: Unit | None, world: str | None) -> SceneContext | None:
     if world:
-        return Surroundings.of_world(mesh_world(world))
+        return SceneContext.of_world(mesh_world(world))
     files = {name if divided else "": Path(file if divided else name) for name, divided, file in map(_parts, meshes)}
     if len(files) < len(meshes):
         raise UsageError(f"--mesh {' '.join(meshes)}: expected one FILE, or NAME=FILE with different names")
-    return Surroundings({name: load_mesh(file, mesh_unit) for name, file in files.items()}) if files else None
+    return SceneContext({name: load_mesh(file, mesh_unit) for name, file in files.items()}) if files else None
 
 
 def _parts(text: str) -> tuple[str, str, str]:

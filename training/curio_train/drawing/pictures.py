@@ -29,7 +29,7 @@ LIGHT = (-0.25, -0.45, -0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class SceneContext:
     """What a scene itself does not say.
 
     Attributes:
@@ -49,16 +49,16 @@ class Surroundings:
     ground: Ground | None = None
 
     @classmethod
-    def of_world(cls, world: MeshWorld) -> "Surroundings":
+    def of_world(cls, world: MeshWorld) -> "SceneContext":
         """Those of a generated world."""
-        turn, shift = world.stage.cam_from_world
+        cam_from_world = world.stage.cam_from_world
         return cls(
             {kind.name: kind.mesh for kind in world.kinds},
             world.stage.ambient,
-            turn @ np.array(world.stage.sun),
-            turn @ np.array(world.stage.center_m) + shift,
-            tuple((turn @ np.array(world.stage.up)).tolist()),
-            world.ground(world.stage.cam_from_world),
+            cam_from_world.rotation @ np.array(world.stage.sun),
+            cam_from_world.apply(np.array(world.stage.center_m)),
+            tuple((cam_from_world.rotation @ np.array(world.stage.up)).tolist()),
+            world.ground(cam_from_world),
         )
 
     def mesh(self, kind: str) -> Mesh:
@@ -74,7 +74,7 @@ class Surroundings:
 
 
 @dataclass(frozen=True)
-class Wish:
+class RenderOptions:
     """How a scene is to be drawn.
 
     Attributes:
@@ -99,7 +99,7 @@ class Wish:
             raise UsageError("--over-photograph and --turn-deg exclude each other: the photograph shows one side alone")
 
 
-def picture(scene: Scene, around: Surroundings, wish: Wish) -> np.ndarray:
+def picture(scene: Scene, around: SceneContext, wish: RenderOptions) -> np.ndarray:
     """Draw a scene: [height, width, 3] uint8 sRGB.
 
     Raises:
@@ -124,7 +124,7 @@ def _resized(scene: Scene, height: int | None) -> Scene:
     return replace(scene, width=width, height=height, camera_matrix=matrix)
 
 
-def _with_light(scene: Scene, around: Surroundings) -> Surroundings:
+def _with_light(scene: Scene, around: SceneContext) -> SceneContext:
     known = scene.light if scene.light is not None else around.light
     return replace(around, light=np.array(LIGHT) if known is None else known)
 
@@ -143,17 +143,15 @@ def _photograph(scene: Scene) -> np.ndarray:
     return cv2.resize(pixels, (scene.width, scene.height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
 
 
-def _carried(scene: Scene, around: Surroundings, turn_deg: float) -> tuple[Scene, Surroundings]:
+def _carried(scene: Scene, around: SceneContext, turn_deg: float) -> tuple[Scene, SceneContext]:
     """Everything as the camera sees it that was carried round the middle, still looking at it."""
     places = [item.pose.translation_m for item in scene.objects]
     center = np.mean(places, axis=0) if around.center_m is None and places else around.center_m
     if turn_deg == 0 or center is None:
         return scene, around
     turn = Rotation.from_rotvec(-np.radians(turn_deg) * np.array(around.up)).as_matrix()
-    objects = tuple(
-        replace(item, pose=Pose(turn @ item.pose.rotation, turn @ (item.pose.translation_m - center) + center))
-        for item in scene.objects
-    )
+    orbit = Pose(turn, center - turn @ center)
+    objects = tuple(replace(item, pose=orbit @ item.pose) for item in scene.objects)
     ground = around.ground
     if ground is not None:
         up = turn @ ground.up
@@ -163,7 +161,7 @@ def _carried(scene: Scene, around: Surroundings, turn_deg: float) -> tuple[Scene
     return replace(scene, objects=objects), replace(around, light=turn @ around.light, ground=ground)
 
 
-def _rendered(scene: Scene, around: Surroundings, behind: np.ndarray | None, samples: int) -> np.ndarray:
+def _rendered(scene: Scene, around: SceneContext, behind: np.ndarray | None, samples: int) -> np.ndarray:
     light = torch.tensor(around.light, dtype=torch.float32)[None]
     blank = torch.zeros(1, 1, scene.height, scene.width)
     background = blank.expand(1, 3, -1, -1) if behind is None else torch.from_numpy(behind).permute(2, 0, 1)[None]
@@ -205,7 +203,7 @@ def _stack(values: Sequence[object]) -> Tensor:
     return torch.tensor(np.array(values), dtype=torch.float32)[None]
 
 
-def _path_traced(scene: Scene, around: Surroundings, behind: np.ndarray | None, samples: int) -> np.ndarray:
+def _path_traced(scene: Scene, around: SceneContext, behind: np.ndarray | None, samples: int) -> np.ndarray:
     assert around.light is not None  # settled before
     objects = [_posed(item, around) for item in scene.objects]
     image = path_traced(
@@ -222,5 +220,6 @@ def _path_traced(scene: Scene, around: Surroundings, behind: np.ndarray | None, 
     return color * alpha + (0 if behind is None else behind) * (1 - alpha)
 
 
-def _posed(item: Placed, around: Surroundings) -> PosedMesh:
-    return PosedMesh(around.mesh(item.kind), *item.pose, item.color_srgb, item.confidence)
+def _posed(item: Placed, around: SceneContext) -> PosedMesh:
+    rotation, translation_m = item.pose
+    return PosedMesh(around.mesh(item.kind), rotation, translation_m, item.color_srgb, item.confidence)

@@ -19,7 +19,7 @@ from curio_train.export.card import EVALUATION_FILE
 from curio_train.learning.runs.configuration import CONFIG_FILE, world_name
 from curio_train.learning.runs.initial import uses_synthetic_labels
 from curio_train.learning.runs.provenance import machine
-from curio_train.metrics.certainty import calibration_error, separation
+from curio_train.metrics.calibration import auroc, calibration_error
 from curio_train.metrics.poses import ADD_THRESHOLD
 from curio_train.refinement.render_and_compare import refined
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
@@ -65,7 +65,7 @@ def evaluate(
         num_images: How many; of a finite set at most all.
         data: A BOP data set whose real frames are scored as well, in the LineMOD world.
         bop_results: Folder for a results file of those frames in BOP's format.
-        refine: Score the poses once more after :class:`~curio_train.refinement.render_and_compare.Refinement`.
+        refine: Score the poses once more after :class:`~curio_train.refinement.render_and_compare.RenderAndCompare`.
         cache: Where worlds keep their image sets.
         progress: Told what is being done.
         warn: Told why photographs could not be judged by, or a report not written: no evaluation is thrown away for
@@ -159,7 +159,7 @@ def certainty(world: World, predicted: SceneCode, true: SceneCode, on_empty: Sce
     confidences, without = (code[CONFIDENCE].flatten().tolist() for code in (predicted, on_empty))
     return {
         "confidence_ece": calibration_error(confidences, [error < ADD_THRESHOLD for error in errors]),
-        "present_auroc": separation(confidences, without),
+        "present_auroc": auroc(confidences, without),
     }
 
 
@@ -179,7 +179,7 @@ def _origin(path: Path, subject: Subject) -> dict[str, Any]:
         "objects": [kind.name for kind in subject.world.objects],
         "method": config.method,
         "reading": config.network.reading or "whole",
-        "labels": config.labels if "label" in config.terms else 0.0,
+        "labels": config.labels if config.terms.label else 0.0,
         "labels_real": False,  # images with true codes are renderings in every world
         "labels_synthetic": uses_synthetic_labels(config),
         "preset": config.preset,

@@ -16,7 +16,7 @@ from curio_train.export.folder import find_model
 from curio_train.export.onnx import OnnxModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, from_json
-from curio_train.learning.runs.provenance import sittings
+from curio_train.learning.runs.provenance import run_sessions
 from curio_train.learning.state import TrainState
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World
@@ -74,9 +74,14 @@ def _from_run(path: Path) -> Subject:
     run = RunFolder.open(path)
     world = build(run.config.world)
     state = run.trained(world)
-    course = state.course
+    course = state.progress
     return Subject(
-        run.config, world, _reader(state.pose.network), course.all_images, course.all_seconds, sittings(path)[0].commit
+        run.config,
+        world,
+        _reader(state.pose.network),
+        course.all_images,
+        course.all_seconds,
+        run_sessions(path)[0].commit,
     )
 
 

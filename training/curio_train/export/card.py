@@ -10,8 +10,8 @@ from typing import Any
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_train.config import METHODS, RunConfig
-from curio_train.learning.runs.provenance import Sitting
-from curio_train.learning.state import Course
+from curio_train.learning.runs.provenance import RunSession
+from curio_train.learning.state import TrainingProgress
 from curio_train.worlds.base import ObjectKind
 
 EVALUATION_FILE = "evaluation.json"
@@ -24,7 +24,7 @@ _SUPERVISION = {
 
 
 @dataclass(frozen=True)
-class Making:
+class Provenance:
     """Where a version comes from.
 
     Attributes:
@@ -37,13 +37,13 @@ class Making:
 
     run: Path
     config: RunConfig
-    sitting: Sitting
-    course: Course
+    sitting: RunSession
+    course: TrainingProgress
     weights: str
 
 
 def card(
-    version: int, spec: ModelSpec, shapes: Mapping[str, Sequence[int]], objects: Sequence[ObjectKind], made: Making
+    version: int, spec: ModelSpec, shapes: Mapping[str, Sequence[int]], objects: Sequence[ObjectKind], made: Provenance
 ) -> str:
     """A section of Markdown.
 
@@ -76,9 +76,9 @@ def read_evaluation(run: Path, images: int) -> dict[str, Any] | None:
     return found if isinstance(found, dict) and found.get("images_seen") == images else None
 
 
-def _origin(version: int, spec: ModelSpec, made: Making) -> Iterable[tuple[str, str]]:
+def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[str, str]]:
     terms = METHODS[made.config.method]
-    supervision = [text for term, text in _SUPERVISION.items() if term in terms] or ["none: images alone"]
+    supervision = [text for term, text in _SUPERVISION.items() if getattr(terms, term)] or ["none: images alone"]
     yield "world", spec.world
     yield "method", f"{made.config.method}, preset {made.config.preset}, seed {made.config.seed}"
     yield "supervision", "; ".join(supervision)

@@ -18,13 +18,13 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from curio_train.errors import ExportError
-from curio_train.export.card import Making, card
+from curio_train.export.card import Provenance, card
 from curio_train.export.folder import GOLDEN_FILE, MODEL_FILE, WEIGHTS_FILE, ModelFolder, triton_config
 from curio_train.export.onnx import SCHEMA_VERSION, OnnxModel, put_spec, store_half, to_onnx
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
 from curio_train.learning.runs.initial import weights_file
-from curio_train.learning.runs.provenance import sittings
+from curio_train.learning.runs.provenance import run_sessions
 from curio_train.scene_code import Field
 from curio_train.worlds import build
 from curio_train.worlds.base import ObjectKind, World
@@ -112,11 +112,11 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
         store_half(model)
     spec = model_spec(world, target.path.name)
     spec.recipe = json.dumps(to_portable(folder.config))
-    first = sittings(run)[0]
+    first = run_sessions(run)[0]
     spec.commit, spec.images_seen, spec.training_seconds = (
         first.commit,
-        state.course.all_images,
-        state.course.all_seconds,
+        state.progress.all_images,
+        state.progress.all_seconds,
     )
     put_spec(model, spec)
 
@@ -126,7 +126,7 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     spec.parity_max_abs_error = refuse_disparity(answers, found)
     put_spec(model, spec)
     version = target.next_version()
-    made = Making(run, folder.config, first, state.course, _weights(half, rounding_error))
+    made = Provenance(run, folder.config, first, state.progress, _weights(half, rounding_error))
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),

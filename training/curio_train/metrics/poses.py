@@ -23,11 +23,6 @@ ADD_THRESHOLD = 0.1
 """A pose counts as found where ADD is below this share of the diameter."""
 
 
-def transform(pose: Pose, points: np.ndarray) -> np.ndarray:
-    """The points in the camera frame."""
-    return points @ pose.rotation.T + pose.translation_m
-
-
 def rotation_error_deg(estimate: Pose, truth: Pose) -> float:
     """Angle between the two rotations, in [0, 180]."""
     return float(rotation_angle_deg(torch.as_tensor(estimate.rotation), torch.as_tensor(truth.rotation)))
@@ -40,12 +35,12 @@ def translation_error_m(estimate: Pose, truth: Pose) -> float:
 
 def add_m(estimate: Pose, truth: Pose, points: np.ndarray) -> float:
     """ADD: mean distance of each model point under the two poses (Hinterstoisser et al. 2012)."""
-    return float(np.linalg.norm(transform(estimate, points) - transform(truth, points), axis=1).mean())
+    return float(np.linalg.norm(estimate.apply(points) - truth.apply(points), axis=1).mean())
 
 
 def add_s_m(estimate: Pose, truth: Pose, points: np.ndarray) -> float:
     """ADD-S: mean distance from each true point to the closest estimated one (Hinterstoisser et al. 2012)."""
-    distances, _ = KDTree(transform(estimate, points)).query(transform(truth, points))
+    distances, _ = KDTree(estimate.apply(points)).query(truth.apply(points))
     return float(np.mean(distances))
 
 
@@ -62,16 +57,11 @@ def symmetry_poses(info: ModelInfo, max_step: float = 0.01) -> list[Pose]:
         max_step: The point farthest from a continuous axis moves at most by this share of the diameter a step, which
             is BOP's choice: 315 steps for the default.
     """
-    discrete = [Pose(np.eye(3), np.zeros(3))] + [Pose(s[:3, :3], s[:3, 3]) for s in info.symmetries]
+    discrete = [Pose.identity(), *map(Pose.from_matrix, info.symmetries)]
     continuous = [
         turn for axis, point in info.symmetry_axes for turn in _turns(axis, point, int(np.ceil(np.pi / max_step)))
     ]
-    turns = continuous or [Pose(np.eye(3), np.zeros(3))]
-    return [
-        Pose(turn.rotation @ pose.rotation, turn.rotation @ pose.translation_m + turn.translation_m)
-        for pose in discrete
-        for turn in turns
-    ]
+    return [rotation @ pose for pose in discrete for rotation in continuous or [Pose.identity()]]
 
 
 def _turns(axis: np.ndarray, point: np.ndarray, num_steps: int) -> list[Pose]:
@@ -90,21 +80,21 @@ def mssd_m(estimate: Pose, truth: Pose, points: np.ndarray, symmetries: Sequence
         points: Of the evaluation model.
         symmetries: From :func:`symmetry_poses`.
     """
-    estimated = transform(estimate, points)
-    same = (transform(truth, transform(symmetry, points)) for symmetry in symmetries)
+    estimated = estimate.apply(points)
+    same = (truth.apply(symmetry.apply(points)) for symmetry in symmetries)
     return float(min(np.linalg.norm(estimated - points_of, axis=1).max() for points_of in same))
 
 
 def mspd_px(estimate: Pose, truth: Pose, points: np.ndarray, symmetries: Sequence[Pose], matrix: np.ndarray) -> float:
     """Maximum symmetry-aware projection distance (BOP Challenge 2020), pixels of the image of K."""
-    estimated = project(transform(estimate, points), matrix)
-    same = (project(transform(truth, transform(symmetry, points)), matrix) for symmetry in symmetries)
+    estimated = project(estimate.apply(points), matrix)
+    same = (project(truth.apply(symmetry.apply(points)), matrix) for symmetry in symmetries)
     return float(min(np.linalg.norm(estimated - pixels, axis=1).max() for pixels in same))
 
 
 def projection_error_px(estimate: Pose, truth: Pose, points: np.ndarray, matrix: np.ndarray) -> float:
     """Mean distance of the projected model points (Brachmann et al. 2016), pixels."""
-    offsets = project(transform(estimate, points), matrix) - project(transform(truth, points), matrix)
+    offsets = project(estimate.apply(points), matrix) - project(truth.apply(points), matrix)
     return float(np.linalg.norm(offsets, axis=1).mean())
 
 

@@ -20,8 +20,9 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from curio_train.data.photographs import CameraPoses
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
-from curio_train.refinement.render_and_compare import LEAST_SEEN, Refinement
+from curio_train.refinement.render_and_compare import LEAST_SEEN, RenderAndCompare
 from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode
 
 _FEWEST = 3  # photographs that a pose is agreed on by
@@ -37,25 +38,7 @@ _CREDIBLE, _WEAKER = 0.3, 0.1  # of what a photograph's own reading explains of 
 _CONTRADICTION = 0.25  # diameters across the view
 
 
-class Cameras(NamedTuple):
-    """Where the camera stood.
-
-    Attributes:
-        cam_from_world: Rigid, [num, 4, 4]; NaN for photographs of which it is not known.
-        in_metres: Else its unit is any.
-    """
-
-    cam_from_world: Float[np.ndarray, "num 4 4"]
-    in_metres: bool = False
-
-    @property
-    def known(self) -> Bool[np.ndarray, " num"]:
-        """Of which photographs."""
-        known: np.ndarray = np.isfinite(self.cam_from_world).all(axis=(1, 2))
-        return known
-
-
-class _Readings(NamedTuple):
+class _Predictions(NamedTuple):
     """What was read, one a row.
 
     Attributes:
@@ -82,7 +65,7 @@ class _Scene(NamedTuple):
     known: np.ndarray
     scale: float
 
-    def poses_of(self, readings: _Readings) -> tuple[np.ndarray, np.ndarray]:
+    def poses_of(self, readings: _Predictions) -> tuple[np.ndarray, np.ndarray]:
         """Rotations and positions, metres, in the scene's frame."""
         turn, shift = self.cam_from_world[readings.frame, :3, :3], self.cam_from_world[readings.frame, :3, 3]
         rotation = np.einsum("nji,njk->nik", turn, readings.rotation)
@@ -95,9 +78,9 @@ class _Scene(NamedTuple):
 
 
 def agreed(
-    refine: Refinement,
+    refine: RenderAndCompare,
     frames: Tensor,
-    cameras: Cameras,
+    cameras: CameraPoses,
     read: SceneCode,
     refined: tuple[SceneCode, Bool[Tensor, " num"]],
     symmetries: Sequence[Pose],
@@ -117,9 +100,9 @@ def agreed(
     """
     better, taken = refined
     known = cameras.known
-    sources = _readings(read, known), _readings(better, known & taken.numpy())
+    sources = _predictions(read, known), _predictions(better, known & taken.numpy())
     turns = np.stack([pose.rotation for pose in symmetries])
-    scales = [told_scale(cameras, code, taken, refine.diameter_m) for code in (read, better)]
+    scales = [estimate_scale(cameras, code, taken, refine.diameter_m) for code in (read, better)]
     found = [scale for scale in scales if scale is not None]
     if not found:
         return dict(read), torch.zeros(len(frames), dtype=torch.bool)
@@ -127,13 +110,15 @@ def agreed(
     # Each kind of reading errs in depth in its own way, which its scale tells.
     pairs = zip(sources, scales, strict=True)
     level = [r._replace(translation_m=r.translation_m * scale / s) for r, s in pairs if s is not None]
-    every = _Readings(*(np.concatenate(values) for values in zip(*level, strict=True)))
+    every = _Predictions(*(np.concatenate(values) for values in zip(*level, strict=True)))
     scene = _Scene(_without_gaps(cameras), known, scale)
     poses = _clusters(scene, every, refine.diameter_m, turns)
     return _looked_for(refine, frames, scene, poses, read, better, turns)
 
 
-def told_scale(cameras: Cameras, code: SceneCode, taken: Bool[Tensor, " num"], diameter_m: float) -> float | None:
+def estimate_scale(
+    cameras: CameraPoses, code: SceneCode, taken: Bool[Tensor, " num"], diameter_m: float
+) -> float | None:
     """Metres a unit of the scene, by how far an object that was read moved before the camera.
 
     Args:
@@ -143,21 +128,21 @@ def told_scale(cameras: Cameras, code: SceneCode, taken: Bool[Tensor, " num"], d
         diameter_m: Of the object.
     """
     matrices, known = _without_gaps(cameras), cameras.known
-    scale = _scale(matrices, _readings(code, known & taken.numpy()), diameter_m)
-    return scale or _scale(matrices, _readings(code, known), diameter_m)
+    scale = _scale(matrices, _predictions(code, known & taken.numpy()), diameter_m)
+    return scale or _scale(matrices, _predictions(code, known), diameter_m)
 
 
-def _without_gaps(cameras: Cameras) -> np.ndarray:
+def _without_gaps(cameras: CameraPoses) -> np.ndarray:
     return np.where(cameras.known[:, None, None], cameras.cam_from_world, np.eye(4))
 
 
-def _readings(code: SceneCode, chosen: np.ndarray) -> _Readings:
+def _predictions(code: SceneCode, chosen: np.ndarray) -> _Predictions:
     rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0]).double().numpy()
     translation_m = code[TRANSLATION][:, 0].double().numpy()
-    return _Readings(np.flatnonzero(chosen), rotation[chosen], translation_m[chosen])
+    return _Predictions(np.flatnonzero(chosen), rotation[chosen], translation_m[chosen])
 
 
-def _scale(cameras: np.ndarray, readings: _Readings, diameter_m: float) -> float | None:
+def _scale(cameras: np.ndarray, readings: _Predictions, diameter_m: float) -> float | None:
     """Metres a unit of the scene: what most pairs of photographs say, from how far the camera moved between them."""
     turn, shift = cameras[readings.frame, :3, :3], cameras[readings.frame, :3, 3]
     away = np.einsum("nji,nj->ni", turn, readings.translation_m)  # from the camera, in the scene's axes
@@ -177,7 +162,7 @@ def _scale(cameras: np.ndarray, readings: _Readings, diameter_m: float) -> float
     return float(np.exp(np.median(logs[near]))) if near.sum() >= _FEWEST_PAIRS else None
 
 
-def _clusters(scene: _Scene, readings: _Readings, diameter_m: float, turns: np.ndarray) -> list[Pose]:
+def _clusters(scene: _Scene, readings: _Predictions, diameter_m: float, turns: np.ndarray) -> list[Pose]:
     """Poses in the scene that readings of several photographs agree on, those of most readings first."""
     rotations, positions = scene.poses_of(readings)
     spread = _spread(scene, readings, diameter_m)
@@ -203,7 +188,7 @@ def _clusters(scene: _Scene, readings: _Readings, diameter_m: float, turns: np.n
     return found
 
 
-def _spread(scene: _Scene, readings: _Readings, diameter_m: float) -> Float[np.ndarray, "n 3 3"]:
+def _spread(scene: _Scene, readings: _Predictions, diameter_m: float) -> Float[np.ndarray, "n 3 3"]:
     """Covariance of each reading's position: what is across the view is known better than depth."""
     ray = np.einsum("nji,nj->ni", scene.cam_from_world[readings.frame, :3, :3], readings.translation_m)
     away = np.linalg.norm(ray, axis=1)
@@ -234,7 +219,7 @@ def _mean(rotations: np.ndarray, positions: np.ndarray, spread: np.ndarray, turn
 
 
 def _looked_for(
-    refine: Refinement,
+    refine: RenderAndCompare,
     frames: Tensor,
     scene: _Scene,
     poses: list[Pose],
@@ -249,7 +234,7 @@ def _looked_for(
     """
     own = refine.explained(frames, better).numpy()
     best, code = np.zeros(len(frames)), {name: value.clone() for name, value in read.items()}
-    _, read_rotation, read_m = _readings(better, np.ones(len(frames), dtype=bool))
+    _, read_rotation, read_m = _predictions(better, np.ones(len(frames), dtype=bool))
     for pose in poses:
         rotation, translation_m = scene.seen_from(pose)
         turned = _angles_deg(rotation, read_rotation, turns)[0] > 2 * _LARGEST_TURN_DEG

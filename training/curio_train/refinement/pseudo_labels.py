@@ -9,7 +9,6 @@ label of a photograph is used.
 """
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -18,35 +17,28 @@ import torch.nn.functional as F
 from jaxtyping import Bool, UInt8
 from torch import Tensor
 
-from curio_train.camera import gaze_at, sampling_grid
-from curio_train.data.photographs import read_frames
+from curio_train.data.photographs import CameraPoses, read_frames
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.metrics.poses import symmetry_poses
+from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
 from curio_train.networks.two_stage.network import OVERSAMPLING
-from curio_train.refinement.multi_view import Cameras, agreed
-from curio_train.refinement.render_and_compare import Refinement
+from curio_train.refinement.multi_view import agreed
+from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode
-from curio_train.worlds.single_object.two_stage import CROP_PX, FILL, SYMMETRY_STEP, GazeWorld
+from curio_train.worlds.base import World
+from curio_train.worlds.single_object.two_stage import CROP_PX, FILL, SYMMETRY_STEP, TwoStageWorld
 
-MOST_PHOTOGRAPHS = 300
-"""They are kept in memory, and each takes a sixth of a second to be refined."""
-
-FEWEST_AGREED = 10
+MIN_CONSENSUS = 10
 """Photographs with agreed poses that are worth more than all others with poses of their own."""
 
 _READ_AT_ONCE = 20
 _GAINS = (0.8, 1.25)  # of crops: light changes, and all else is the camera's own
 
 
-def spread(paths: Sequence[Path], count: int) -> list[Path]:
-    """At most so many, evenly over all."""
-    return [paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))] if paths else []
-
-
-class Lessons:
+class PseudoLabels:
     """Photographs with the poses that were read in them, as crops for the second look."""
 
-    def __init__(self, world: GazeWorld, frames: UInt8[Tensor, "num 3 height width"], code: SceneCode) -> None:
+    def __init__(self, world: TwoStageWorld, frames: UInt8[Tensor, "num 3 height width"], code: SceneCode) -> None:
         """Teach these.
 
         Args:
@@ -55,17 +47,17 @@ class Lessons:
             code: What they show.
         """
         assert world.camera.matrix is not None  # a gaze has a pinhole camera
-        self._look, self._frames, self._code = world.looks[1], frames, code
+        self._look, self._frames, self._code = world.stages[1], frames, code
         self._matrix = torch.from_numpy(np.asarray(world.camera.matrix)).float()[None]
 
     @classmethod
     @torch.no_grad()
-    def of_own_reading(
+    def from_predictions(
         cls,
-        world: GazeWorld,
+        world: TwoStageWorld,
         frames: UInt8[Tensor, "num 3 height width"],
         predict: Callable[[Tensor], SceneCode],
-        cameras: Cameras | None = None,
+        cameras: CameraPoses | None = None,
     ) -> Self | None:
         """Read photographs, refine what was read, and keep what several agree on; or, of single ones, what is better.
 
@@ -80,12 +72,12 @@ class Lessons:
             moved and enough of them agree; else of those whose refined pose, refined once more, is nearer to the
             picture. None if there is none.
         """
-        refine = Refinement(world)
-        read, refined, taken = read_twice(refine, frames, predict)
+        refine = RenderAndCompare(world)
+        read, refined, taken = predict_and_refine(refine, frames, predict)
         if cameras is not None:
             symmetries = symmetry_poses(world.object.kind.info, SYMMETRY_STEP)
             code, chosen = agreed(refine, frames, cameras, read, (refined, taken), symmetries)
-            if chosen.sum() >= FEWEST_AGREED:
+            if chosen.sum() >= MIN_CONSENSUS:
                 return cls(world, frames[chosen], {name: value[chosen] for name, value in code.items()})
         twice, taken_again = _refined(refine, frames, refined)
         chosen = taken | taken_again
@@ -93,21 +85,19 @@ class Lessons:
         return cls(world, frames[chosen], code) if chosen.any() else None
 
     @classmethod
-    def of_files(
-        cls,
-        world: GazeWorld,
-        paths: Sequence[Path],
-        predict: Callable[[Tensor], SceneCode],
-        cameras: Cameras | None = None,
-    ) -> Self | None:
-        """The same of photographs in files, :data:`MOST_PHOTOGRAPHS` of them at most, evenly over all.
+    def from_photographs(cls, world: World, predict: Callable[[Tensor], SceneCode]) -> Self | None:
+        """Predict and refine the poses in the unlabelled photographs of a world; None if it offers none.
 
         Raises:
-            DataError: One cannot be read, or is not of the camera's size.
+            DataError: A photograph cannot be read, or is not of the camera's size.
         """
-        chosen = spread(paths, MOST_PHOTOGRAPHS)
-        frames = read_frames(chosen, world.object.camera, world.camera.width, world.camera.height) if chosen else ()
-        return cls.of_own_reading(world, torch.from_numpy(frames), predict, cameras) if len(frames) else None
+        if not isinstance(world, TwoStageWorld):
+            return None
+        paths, cameras = world.unlabelled()
+        if not paths:
+            return None
+        frames = read_frames(paths, world.object.camera, world.camera.width, world.camera.height)
+        return cls.from_predictions(world, torch.from_numpy(frames), predict, cameras)
 
     def __len__(self) -> int:
         """How many photographs teach."""
@@ -127,7 +117,7 @@ class Lessons:
         place = self._look.mistaken(position_m, random)
         assumed = place.norm(dim=1)
         side = OVERSAMPLING * CROP_PX
-        gaze = gaze_at(place, FILL * side * assumed / self._look.object.kind.diameter_m, side, matrix)
+        gaze = crop_camera_at(place, FILL * side * assumed / self._look.object.kind.diameter_m, side, matrix)
         height, width = self._frames.shape[2:]
         grid = sampling_grid(gaze, matrix, side, width, height)
         fine = F.grid_sample(self._frames[chosen].float() / 255, grid, padding_mode="border", align_corners=False)
@@ -140,8 +130,8 @@ class Lessons:
 
 
 @torch.no_grad()
-def read_twice(
-    refine: Refinement, frames: UInt8[Tensor, "num 3 height width"], predict: Callable[[Tensor], SceneCode]
+def predict_and_refine(
+    refine: RenderAndCompare, frames: UInt8[Tensor, "num 3 height width"], predict: Callable[[Tensor], SceneCode]
 ) -> tuple[SceneCode, SceneCode, Bool[Tensor, " num"]]:
     """What a network reads in photographs, the same after render-and-compare, and where that found something better."""
     read = _joined([predict(chunk.float() / 255) for chunk in frames.split(_READ_AT_ONCE)])
@@ -149,7 +139,7 @@ def read_twice(
 
 
 @torch.enable_grad()
-def _refined(refine: Refinement, frames: Tensor, code: SceneCode) -> tuple[dict[str, Tensor], Tensor]:
+def _refined(refine: RenderAndCompare, frames: Tensor, code: SceneCode) -> tuple[dict[str, Tensor], Tensor]:
     """Better poses, and where they are found."""
     parts = []
     for first in range(0, len(frames), _READ_AT_ONCE):

@@ -22,9 +22,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from curio_train.camera import gaze_at, sampling_grid
 from curio_train.errors import UsageError
 from curio_train.geometry import rotation_angle_deg
+from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
 from curio_train.refinement.crops import Moves, Scene, View
 from curio_train.refinement.inpainting import blurred, filled_in, grown
 from curio_train.rendering.renderer import Renderer
@@ -77,11 +77,11 @@ def refined(predict: Callable[[Tensor], SceneCode], world: World) -> Callable[[T
     Raises:
         UsageError: The world is another.
     """
-    refine = Refinement(world)
+    refine = RenderAndCompare(world)
     return lambda images: refine(images, predict(images))
 
 
-class Refinement:
+class RenderAndCompare:
     """Refines poses of one object in pictures of a world's camera.
 
     Attributes:
@@ -178,7 +178,7 @@ class Refinement:
         place = code[TRANSLATION][:, 0]
         depth, frames = place.norm(dim=1), self._matrix.expand(len(place), 3, 3)
         focal = FILL * CROP_PX * depth / self.diameter_m
-        gaze = gaze_at(place, 2 * focal, 2 * CROP_PX, frames)  # two samples a pixel and side, then averaged
+        gaze = crop_camera_at(place, 2 * focal, 2 * CROP_PX, frames)  # two samples a pixel and side, then averaged
         grid = sampling_grid(gaze, frames, 2 * CROP_PX, images.shape[3], images.shape[2])
         fine = F.grid_sample(images.float() / 255, grid, padding_mode="border", align_corners=False)
         crops = F.avg_pool2d(fine, 2)

@@ -3,7 +3,7 @@
 from typing import Any
 
 from curio_train.rendering.edge_sampling import OFFSET_PX, PIECE_PX, OutlineSamples, Pieces
-from curio_train.rendering.instances import Rows
+from curio_train.rendering.instances import Instances
 from curio_train.rendering.launch import Launch
 from curio_train.rendering.pixels import Place
 
@@ -14,7 +14,7 @@ CONTRAST_FLOOR = 0.05
 class Outlines(Launch):
     """Rays beside the outlines of one part of a batch."""
 
-    def displacement(self, rows: Rows, image: Any, adjoint: Any) -> Any:
+    def displacement(self, rows: Instances, image: Any, adjoint: Any) -> Any:
         """Jump of colour · adjoint · displacement along the normal, attached to ``rows``; None without outlines."""
         dr, still, view = self.dr, rows.detached(), self.view
         points = self.set.outlines.sample(
@@ -55,7 +55,7 @@ class Outlines(Launch):
         inside = self.nearest_pixel(where, pieces.x, pieces.y, PIECE_PX)[1]
         return dr.select(inside, promise, 0)
 
-    def _jump(self, rows: Rows, points: OutlineSamples, adjoint: Any) -> Any:
+    def _jump(self, rows: Instances, points: OutlineSamples, adjoint: Any) -> Any:
         """Scalar product of the adjoint with the colour on one side of each point minus that on the other."""
         mi, dr = self.mi, self.dr
         num_points = len(points.row)

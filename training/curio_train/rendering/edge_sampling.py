@@ -16,7 +16,7 @@ from typing import Any
 
 from curio_train.rendering.bounds import NEAR_M
 from curio_train.rendering.edge_search import EdgeSearch
-from curio_train.rendering.instances import Rows
+from curio_train.rendering.instances import Instances
 from curio_train.rendering.silhouette_edges import EdgeTable
 
 OFFSET_PX = 0.001
@@ -26,7 +26,7 @@ PIECE_PX = 2.0
 MAX_PIECES = 256  # of one edge: next to the camera an edge can be endless
 _SEARCH_END = 1 << 25  # fixed, so that the number of steps and with it the program does not depend on the data
 
-Promise = Callable[["Pieces"], Any]
+SamplingImportance = Callable[["Pieces"], Any]
 """How much colour, weighed by the adjoint, may jump at pieces of outlines; zero only where it cannot."""
 
 
@@ -83,7 +83,9 @@ class OutlineSampler:
         self.mi, self.dr = mi, dr
         self.search = EdgeSearch(mi, dr, edges, kind_of_slot)
 
-    def sample(self, rows: Rows, num_rows: int, num_samples: int, key: Any, promise: Promise) -> OutlineSamples | None:
+    def sample(
+        self, rows: Instances, num_rows: int, num_samples: int, key: Any, promise: SamplingImportance
+    ) -> OutlineSamples | None:
         """Sample outlines by length and promise, evenly spaced in each row; None where no row has any.
 
         Args:
@@ -91,7 +93,7 @@ class OutlineSampler:
             num_rows: Their number.
             num_samples: Points a row.
             key: UInt32, added to the row's number to draw the offset of its points.
-            promise: See :data:`Promise`.
+            promise: See :data:`SamplingImportance`.
         """
         mi, dr = self.mi, self.dr
         row, edge = self.search.find(rows, num_rows)
@@ -118,7 +120,7 @@ class OutlineSampler:
         dr.eval(points.__dict__)
         return points
 
-    def _cut(self, rows: Rows, row: Any, edge: Any) -> Pieces:
+    def _cut(self, rows: Instances, row: Any, edge: Any) -> Pieces:
         """Cut edges, so that what is known of a piece's middle holds for all of it."""
         mi, dr = self.mi, self.dr
         ends = [rows.to_camera(row, p) for p in self.search.ends(edge)]
@@ -170,7 +172,7 @@ class OutlineSampler:
         dr.eval(first)
         return first
 
-    def _at(self, rows: Rows, pieces: Pieces, row: Any, piece: Any, within: Any, weight: Any) -> OutlineSamples:
+    def _at(self, rows: Instances, pieces: Pieces, row: Any, piece: Any, within: Any, weight: Any) -> OutlineSamples:
         mi, dr = self.mi, self.dr
         start, share, tangent_x, tangent_y = (
             dr.gather(mi.Float, v, piece) for v in (pieces.start, pieces.share, pieces.tangent_x, pieces.tangent_y)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Self
 
-ROW_SIZE = 19
+INSTANCE_SIZE = 19
 """Differentiable values a row: origin 3, matrix 9, light 3, linear albedo 3, confidence 1."""
 
 CAMERA_SIZE = 7
@@ -15,7 +15,7 @@ CAMERA_SIZE = 7
 
 
 @dataclass(frozen=True)
-class Rows:
+class Instances:
     """The rows of one part of a batch.
 
     With ``cam_from_obj`` = (R, t) and the static scene's placement (center c, radius s, offset w), the camera stands at
@@ -111,5 +111,5 @@ class Rows:
     def _take(self, row: Any, first: int, count: int) -> list[Any]:
         # Neighbouring rays belong to one row: gradients are summed within the vector before they reach memory.
         local = self.dr.ReduceMode.Local
-        start = row * ROW_SIZE + first
+        start = row * INSTANCE_SIZE + first
         return [self.dr.gather(self.mi.Float, self.values, start + i, mode=local) for i in range(count)]

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 NUM_WAVES = 3
-FINISH_SIZE = 3 + 1 + 2 + 1 + 2 + 4 * NUM_WAVES
+APPEARANCE_SIZE = 3 + 1 + 2 + 1 + 2 + 4 * NUM_WAVES
 """Values a row: fill light 3, ambient 1, gloss and its sharpness, shadow, grain and bumps, waves 3 and phase each."""
 
 _STRONGEST_FILL = 1.0
@@ -57,7 +57,7 @@ def finishes(
     return torch.from_numpy(np.concatenate(parts, axis=1)).float()[:, None]
 
 
-def random_finishes(count: int, random: np.random.Generator) -> Float[Tensor, "count 1 size"]:
+def random_appearances(count: int, random: np.random.Generator) -> Float[Tensor, "count 1 size"]:
     """Finishes of any kind."""
     one = (count, 1)
     directions = _unit(random.normal(size=(count, 3)))
@@ -91,7 +91,7 @@ def log_uniform(low: float, high: float, shape: tuple[int, ...], random: np.rand
 
 
 @dataclass(frozen=True)
-class Finish:
+class Appearance:
     """The finishes of the rows that hits belong to; see :func:`finishes`.
 
     Attributes:
@@ -116,12 +116,12 @@ class Finish:
     waves: list[tuple[Any, Any]]
 
     @staticmethod
-    def of_values(mi: ModuleType, dr: ModuleType, scene: Any, values: list[Any]) -> "Finish":
-        """From one array for each of the :data:`FINISH_SIZE` values, in the order of :func:`finishes`."""
+    def of_values(mi: ModuleType, dr: ModuleType, scene: Any, values: list[Any]) -> "Appearance":
+        """From one array for each of the :data:`APPEARANCE_SIZE` values, in the order of :func:`finishes`."""
         ambient, gloss, sharpness, shadow, grain, bumps, *waves = values[3:]
         each = [(mi.Vector3f(*waves[first : first + 3]), waves[first + 3]) for first in range(0, 4 * NUM_WAVES, 4)]
         fill = mi.Vector3f(*values[:3])
-        return Finish(mi, dr, scene, fill, ambient, gloss, sharpness, shadow, grain, bumps, each)
+        return Appearance(mi, dr, scene, fill, ambient, gloss, sharpness, shadow, grain, bumps, each)
 
     def roughened(self, point: Any, normal: Any) -> tuple[Any, Any]:
         """Factor on the albedo, and the normal, of points given from the object's middle, in its radii."""

@@ -16,7 +16,7 @@ _MIDDLE, _REACH = 0.55, 0.4
 _LEAST_SEEN = 0.5  # of a patch's area
 
 
-class SurfaceMap:
+class ObjectCoordinateMap:
     """Renders the surface of a mesh in its own coordinates.
 
     Attributes:

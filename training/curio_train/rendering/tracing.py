@@ -5,8 +5,8 @@ from types import ModuleType
 from typing import Any
 
 from curio_train.rendering.bounds import NEAR_M
-from curio_train.rendering.instances import Rows
-from curio_train.rendering.materials import FINISH_SIZE, Finish
+from curio_train.rendering.instances import Instances
+from curio_train.rendering.materials import APPEARANCE_SIZE, Appearance
 from curio_train.rendering.pixels import Place
 
 SPHERE = 1.001
@@ -22,13 +22,13 @@ class LayerTracer:
         shapes = scene.shapes()
         self.only_shape = shapes[0] if len(shapes) == 1 else None
 
-    def near(self, rows: Rows, row: Any, ray: Any) -> Any:
+    def near(self, rows: Instances, row: Any, ray: Any) -> Any:
         """Whether rays pass the rows' bounding spheres."""
         dr = self.dr
         arm = rows.sphere_center(row) - ray.o
         return dr.squared_norm(arm) - dr.square(dr.dot(arm, ray.d)) / dr.squared_norm(ray.d) <= SPHERE * SPHERE
 
-    def intersect(self, rows: Rows, row: Any, ray: Any, active: Any, nearest: float) -> Any:
+    def intersect(self, rows: Instances, row: Any, ray: Any, active: Any, nearest: float) -> Any:
         """The detached preliminary intersection with the row's own object: which face, where on it, at which depth.
 
         Only the part of the ray within the object's bounding sphere is traced. The other objects of the static scene
@@ -48,7 +48,7 @@ class LayerTracer:
             hit.t += start
             return hit
 
-    def shade(self, rows: Rows, row: Any, ray: Any, hit: Any, lit: Any) -> list[Any]:
+    def shade(self, rows: Instances, row: Any, ray: Any, hit: Any, lit: Any) -> list[Any]:
         """Colour of hits in sRGB, 3 arrays: albedo · (ambient + lit · max(0, n·l)), encoded."""
         mi, dr = self.mi, self.dr
         surface, bsdf = self._surface(ray, hit)
@@ -59,7 +59,7 @@ class LayerTracer:
         if rows.finish is None:
             radiance, shine = self.ambient + lit * dr.maximum(0, dr.dot(normal, light)), 0.0
         else:
-            finish = Finish.of_values(mi, dr, self.scene, rows.finish_values(row, FINISH_SIZE))
+            finish = Appearance.of_values(mi, dr, self.scene, rows.finish_values(row, APPEARANCE_SIZE))
             grain, normal = finish.roughened(surface.p - rows.sphere_center(row), normal)
             radiance, lit = finish.radiance(self.ambient, lit, surface, normal, light)
             radiance, shine = grain * radiance, finish.highlight(lit, -ray.d, normal, light)
@@ -74,7 +74,7 @@ class LayerTracer:
         return surface, surface.bsdf(ray)
 
 
-class Sight(ABC):
+class RayQuery(ABC):
     """What rays through pixels look for, and what they show of it.
 
     Attributes:
@@ -88,15 +88,15 @@ class Sight(ABC):
     reach_from_m: float
 
     @abstractmethod
-    def rows(self, values: Any, camera: Any) -> Rows:
+    def rows(self, values: Any, camera: Any) -> Instances:
         """Rows as they are looked at, of packed values."""
 
     @abstractmethod
-    def colors(self, tracer: LayerTracer, rows: Rows, place: Place, hit: Any, lit: Any) -> list[Any]:
+    def colors(self, tracer: LayerTracer, rows: Instances, place: Place, hit: Any, lit: Any) -> list[Any]:
         """What hits look like, one array a channel; ``lit`` is the share of the light that reaches them."""
 
 
-class Objects(Sight):
+class Objects(RayQuery):
     """Shows the objects themselves."""
 
     channels = 3
@@ -106,11 +106,11 @@ class Objects(Sight):
     def __init__(self, mi: ModuleType, dr: ModuleType) -> None:
         self.mi, self.dr = mi, dr
 
-    def rows(self, values: Any, camera: Any) -> Rows:
+    def rows(self, values: Any, camera: Any) -> Instances:
         """Seen by the camera."""
-        return Rows(self.mi, self.dr, values, camera)
+        return Instances(self.mi, self.dr, values, camera)
 
-    def colors(self, tracer: LayerTracer, rows: Rows, place: Place, hit: Any, lit: Any) -> list[Any]:
+    def colors(self, tracer: LayerTracer, rows: Instances, place: Place, hit: Any, lit: Any) -> list[Any]:
         """Shaded by the mesh's own BSDF."""
         return tracer.shade(rows, place.row, rows.ray(place.row, place.x, place.y), hit, lit)
 

@@ -7,10 +7,10 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from curio_train.config import Method, WorldOptions
+from curio_train.config import MethodName, WorldOptions
 from curio_train.errors import UsageError
 
-_GAZE_RECIPE: Mapping[str, Any] = {
+_TWO_STAGE_RECIPE: Mapping[str, Any] = {
     "matrix_learning_rate": 0.01,
     "learning_rate": 1e-3,
     "warm_up_steps": 100,
@@ -77,8 +77,8 @@ class LinemodOptions(WorldOptions):
             one encoder sees the frame squeezed to 128x128.
     """
 
-    default_method: ClassVar[Method] = "sleep"
-    default_recipe: ClassVar[Mapping[str, Any]] = _GAZE_RECIPE
+    default_method: ClassVar[MethodName] = "sleep"
+    default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     class_name: Annotated[str, tyro.conf.arg(name="class")]
     data: Path | None = None
@@ -128,8 +128,8 @@ class CaptureOptions(WorldOptions):
             1 compares them as they are.
     """
 
-    default_method: ClassVar[Method] = "sleep"
-    default_recipe: ClassVar[Mapping[str, Any]] = _GAZE_RECIPE
+    default_method: ClassVar[MethodName] = "sleep"
+    default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     mesh: tuple[Path, ...]
     camera: Path

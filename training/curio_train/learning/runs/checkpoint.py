@@ -23,7 +23,7 @@ from torch import Tensor
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.learning.runs.configuration import CONFIG_FILE, load_config, to_json
-from curio_train.learning.state import Course, TrainState
+from curio_train.learning.state import TrainingProgress, TrainState
 from curio_train.worlds.base import World
 
 _NUM_KEPT = 2
@@ -83,14 +83,14 @@ class RunFolder:
         Raises:
             CheckpointError: It could not be written (disk full, …). The earlier ones are untouched.
         """
-        target = self.path / "checkpoints" / f"{state.course.step:08d}"
+        target = self.path / "checkpoints" / f"{state.progress.step:08d}"
         draft = target.with_name("draft.tmp")
         try:
             shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed while writing
             draft.mkdir(parents=True)
             tensors = {name: value.detach().cpu().contiguous() for name, value in state.tensors().items()}
             _write_synced(draft / "tensors.safetensors", save(tensors))
-            _write_synced(draft / "course.json", json.dumps(asdict(state.course)).encode())
+            _write_synced(draft / "course.json", json.dumps(asdict(state.progress)).encode())
             _sync_folder(draft)
             if not target.exists():  # the same step is the same checkpoint
                 draft.rename(target)
@@ -115,7 +115,7 @@ class RunFolder:
         except RuntimeError as exc:
             raise CheckpointError(_unreadable(self.checkpoints()[-1], exc)) from exc
 
-    def last(self) -> tuple[dict[str, Tensor], Course]:
+    def last(self) -> tuple[dict[str, Tensor], TrainingProgress]:
         """The last checkpoint: all tensors of the :class:`TrainState` by name, and how far the run was.
 
         Raises:
@@ -126,7 +126,7 @@ class RunFolder:
             raise CheckpointError(f"{self.path} has no checkpoint yet; train it first: --resume {self.path}")
         last = checkpoints[-1]
         try:
-            course = Course(**json.loads((last / "course.json").read_bytes()))
+            course = TrainingProgress(**json.loads((last / "course.json").read_bytes()))
             return load((last / "tensors.safetensors").read_bytes()), course
         except (OSError, ValueError, TypeError, SafetensorError) as exc:
             raise CheckpointError(_unreadable(last, exc)) from exc

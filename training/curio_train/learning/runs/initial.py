@@ -68,7 +68,7 @@ def begin_with(state: TrainState, path: Path) -> None:
             f"--init {path}: its network does not fit this world ({str(exc).splitlines()[-1].strip()}); "
             "expected a run or a model of the same world and the same network flags"
         ) from exc
-    state.course.images_before, state.course.seconds_before = initial.images_seen, initial.training_seconds
+    state.progress.images_before, state.progress.seconds_before = initial.images_seen, initial.training_seconds
 
 
 def weights_file(state: TrainState, config: RunConfig, *, half: bool) -> bytes:
@@ -88,8 +88,8 @@ def weights_file(state: TrainState, config: RunConfig, *, half: bool) -> bytes:
         if not all(value.isfinite().all() for value in tensors.values()):
             raise ExportError("a weight is too large for float16; export without --half")
     notes = {
-        _IMAGES: str(state.course.all_images),
-        _SECONDS: str(state.course.all_seconds),
+        _IMAGES: str(state.progress.all_images),
+        _SECONDS: str(state.progress.all_seconds),
         _TAUGHT: str(uses_synthetic_labels(config)),
     }
     return save(tensors, notes)
@@ -100,7 +100,7 @@ def uses_synthetic_labels(config: RunConfig) -> bool:
 
     A network that began as another, of which nothing is known any more, counts as so taught.
     """
-    if config.terms & {"label", "sleep"}:
+    if config.terms.label or config.terms.sleep:
         return True
     if config.init is None:
         return False

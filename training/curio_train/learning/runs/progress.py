@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from curio_train.errors import CheckpointError
-from curio_train.learning.state import Course
+from curio_train.learning.state import TrainingProgress
 
 _HISTORY = "history.jsonl"
 _STEPS_A_LINE = 20  # of history and curves
@@ -32,7 +32,7 @@ _SECONDS_A_LINE = 10  # of the log where stderr is no terminal
 class Reporter:
     """Follows one run; see :func:`reporting`."""
 
-    def __init__(self, run: Path, course: Course, console: Console) -> None:
+    def __init__(self, run: Path, course: TrainingProgress, console: Console) -> None:
         self._run = run
         self._course = course
         self._console = console
@@ -106,7 +106,7 @@ class Reporter:
 
 
 @contextmanager
-def reporting(run: Path, course: Course) -> Iterator[Reporter]:
+def reporting(run: Path, course: TrainingProgress) -> Iterator[Reporter]:
     """Follow a run from ``course`` on; what was noted after that point, by a session since killed, is dropped."""
     with _writing_into(run):
         _drop_after(run, course.step)

@@ -23,7 +23,7 @@ _FILE = "sittings.jsonl"
 
 
 @dataclass(frozen=True)
-class Sitting:
+class RunSession:
     """One call of a command.
 
     Attributes:
@@ -39,14 +39,14 @@ class Sitting:
     started: str
 
 
-def this_sitting() -> Sitting:
+def this_session() -> RunSession:
     """What this process is."""
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    return Sitting(command, commit(), machine(), now)
+    return RunSession(command, commit(), machine(), now)
 
 
-def note_sitting(run: Path) -> None:
+def record_session(run: Path) -> None:
     """Add this process to a run's sittings.
 
     Raises:
@@ -54,12 +54,12 @@ def note_sitting(run: Path) -> None:
     """
     try:
         with (run / _FILE).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(asdict(this_sitting())) + "\n")
+            file.write(json.dumps(asdict(this_session())) + "\n")
     except OSError as exc:
         raise CheckpointError(f"cannot write {run / _FILE}: {exc.strerror}; name another run folder: --out") from exc
 
 
-def sittings(run: Path) -> list[Sitting]:
+def run_sessions(run: Path) -> list[RunSession]:
     """A run's sittings, oldest first.
 
     Raises:
@@ -67,7 +67,9 @@ def sittings(run: Path) -> list[Sitting]:
     """
     try:
         lines = (run / _FILE).read_text(encoding="utf-8").splitlines()
-        found = [Sitting(**json.loads(line)) for line in lines if line.endswith("}")]  # the rest was cut off by a kill
+        found = [
+            RunSession(**json.loads(line)) for line in lines if line.endswith("}")
+        ]  # the rest was cut off by a kill
     except (OSError, ValueError, TypeError) as exc:
         raise CheckpointError(f"{run / _FILE} cannot be read ({exc}); is {run} a whole run folder?") from exc
     if not found:
@@ -76,7 +78,7 @@ def sittings(run: Path) -> list[Sitting]:
 
 
 def commit() -> str:
-    """Of this package's source, see :class:`Sitting`."""
+    """Of this package's source, see :class:`RunSession`."""
     here = Path(__file__).resolve()
     if _git(here.parent, "ls-files", here.name) == "":
         return ""  # not in a checkout, or in one that does not track it (a venv inside another project)
@@ -93,7 +95,7 @@ def _git(folder: Path, *arguments: str) -> str:
 
 
 def machine() -> str:
-    """This machine, see :class:`Sitting`."""
+    """This machine, see :class:`RunSession`."""
     names = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
     return ", ".join([_processor(), f"{len(os.sched_getaffinity(0))} cores", *names])
 

@@ -5,15 +5,16 @@ from pathlib import Path
 from typing import Literal
 
 from curio_train.config import RunConfig
-from curio_train.learning.loop import Outcome, Trainer, train
+from curio_train.learning.loop import Outcome, train
 from curio_train.learning.parallel import ranks
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.initial import begin_with
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.progress import reporting
-from curio_train.learning.runs.provenance import note_sitting
-from curio_train.learning.state import Course
+from curio_train.learning.runs.provenance import record_session
+from curio_train.learning.state import TrainingProgress
 from curio_train.learning.threads import choose_threads
+from curio_train.learning.trainer import Trainer
 from curio_train.worlds import build
 
 
@@ -26,7 +27,7 @@ def learn(
     cache: Path,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     checkpoint_minutes: float = 1.0,
-) -> tuple[Outcome, Course]:
+) -> tuple[Outcome, TrainingProgress]:
     """Train, alone or as one of torchrun's processes.
 
     Args:
@@ -47,23 +48,24 @@ def learn(
     with ranks(device) as here:
         # The world comes first: what is wrong with its data shows before a run folder is there.
         world = build(config.world)
-        labelled = "label" in config.terms
-        sources = [look.source("train", config.seed, with_code=labelled, cache=cache) for look in world.looks]
+        sources = [
+            stage.source("train", config.seed, with_code=config.terms.label, cache=cache) for stage in world.stages
+        ]
         if config.labels < 1:
             sources = [source.subset(config.labels) for source in sources]
         run = RunFolder(path, config)
         if here.leads:
             run.write_config(new=not resume)
-            note_sitting(path)
+            record_session(path)
         trainer = Trainer(config, world, sources, here)
         if here.device.type == "cpu":
-            # A run that only sleeps draws its images in a thread of its own.
-            choose_threads(trainer.rehearse, reserved=int(config.terms == {"sleep"}))
+            # The thread that renders synthetic batches ahead needs a core of its own.
+            choose_threads(trainer.warm_up, reserved=int(not config.terms.reads_images))
         if resume and run.checkpoints():
             run.restore(trainer.state)
         elif config.init is not None:
             begin_with(trainer.state, config.init)
-        with reporting(path, trainer.state.course) if here.leads else nullcontext() as reporter:
+        with reporting(path, trainer.state.progress) if here.leads else nullcontext() as reporter:
             outcome = train(
                 trainer,
                 run,
@@ -72,4 +74,4 @@ def learn(
                 checkpoint_minutes,
                 finish=lambda: world.finish(trainer.state.pose.network, cache),
             )
-        return outcome, trainer.state.course
+        return outcome, trainer.state.progress

@@ -5,13 +5,13 @@ from torch import Tensor
 
 from curio_train.config import NetworkConfig
 from curio_train.errors import UsageError
-from curio_train.networks.base import Look
+from curio_train.networks.base import StageNetwork
 from curio_train.networks.paper.encoder import Encoder
 from curio_train.networks.paper.heads import Heads
 from curio_train.scene_code import Layout
 
 
-class PoseNetwork(Look):
+class PoseNetwork(StageNetwork):
     """Image to scene code: all that is left of training at test time."""
 
     def __init__(self, layout: Layout, image_side: int = 128, config: NetworkConfig | None = None) -> None:

@@ -30,7 +30,7 @@ from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.ground import Ground
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW, Field, Layout, SceneCode
 from curio_train.worlds.base import Camera
-from curio_train.worlds.generated.mesh_world import Kind, MeshWorld, Stage
+from curio_train.worlds.generated.mesh_world import Kind, MeshWorld, SceneSetup
 
 SIDE_PX, FOCAL_PX = 128, 175.0
 DISTANCE_M, ELEVATION_DEG, TARGET_HEIGHT_M = 4.0, 40.0, 0.15
@@ -45,7 +45,7 @@ POSITION = Field(
 TURN = Field(YAW, 2, frame="world", activation="tanh", lower=(-1.0, -1.0), upper=(1.0, 1.0))
 
 
-def stage() -> Stage:
+def stage() -> SceneSetup:
     """Camera and light of all worlds on the ground."""
     up, across = np.sin(np.radians(ELEVATION_DEG)), np.cos(np.radians(ELEVATION_DEG))
     target = torch.tensor([0.0, TARGET_HEIGHT_M, 0.0], dtype=torch.float64)
@@ -55,7 +55,7 @@ def stage() -> Stage:
     elevation, azimuth = np.radians(SUN_ELEVATION_DEG), np.radians(SUN_AZIMUTH_DEG)
     level = np.cos(elevation)
     sun = SUN * np.array([-level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)])
-    return Stage(
+    return SceneSetup(
         Camera(SIDE_PX, SIDE_PX, matrix, is_default=True),
         Pose(rotation.numpy(), shift.numpy()),
         center_m=(0.0, 0.0, 0.0),
@@ -83,7 +83,7 @@ class GroundWorld(MeshWorld):
         self,
         fields: Sequence[Field],
         kinds: Sequence[Kind],
-        where: Stage | None = None,
+        where: SceneSetup | None = None,
         poses: Sequence[Field] = (POSITION, TURN),
     ) -> None:
         """Stand the objects on the ground.

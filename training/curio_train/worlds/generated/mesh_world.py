@@ -16,12 +16,12 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from curio_train.config import NetworkConfig, Reading
+from curio_train.config import DecoderKind, NetworkConfig
 from curio_train.geometry import Pose, direction_from_hemisphere, matrix_from_yaw
 from curio_train.meshes.meshes import Mesh
-from curio_train.networks.base import Look
+from curio_train.networks.base import StageNetwork
 from curio_train.networks.grid import CellGrid
-from curio_train.networks.set_detector import AMOUNTS, CellNetwork, cell_error
+from curio_train.networks.set_detector import HEAT_MAP, SetDetector, dense_loss
 from curio_train.rendering.ground import Ground
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, YAW, Layout, SceneCode
@@ -45,7 +45,7 @@ class Kind:
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class SceneSetup:
     """What is the same in all scenes of a world.
 
     Attributes:
@@ -86,12 +86,12 @@ class MeshWorld(World):
         on_plane: Whether they lie on the plane y = 0.
     """
 
-    readings: ClassVar[frozenset[Reading]] = frozenset({"whole", "cells"})
+    readings: ClassVar[frozenset[DecoderKind]] = frozenset({"whole", "cells"})
     outline_samples = 512
     object_shadows = False
     on_plane = False
 
-    def __init__(self, layout: Layout, kinds: Sequence[Kind], stage: Stage) -> None:
+    def __init__(self, layout: Layout, kinds: Sequence[Kind], stage: SceneSetup) -> None:
         """Build the renderer.
 
         Raises:
@@ -153,18 +153,18 @@ class MeshWorld(World):
         """2,000, 500 and 500 images, the paper's numbers."""
         return stored(self, self.recipe, split, seed, with_code=with_code, cache=cache)
 
-    def network(self, config: NetworkConfig) -> Look:
+    def network(self, config: NetworkConfig) -> StageNetwork:
         """The paper's, or one that reads cell by cell."""
         if config.reading == "cells":
-            return CellNetwork(self.layout, self._slots_of_kinds, self._new_grid())
+            return SetDetector(self.layout, self._slots_of_kinds, self._new_grid())
         return super().network(config)
 
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
         """Eq. 1, or where cells were read what is wrong with them, mean over the batch."""
-        if AMOUNTS not in predicted:
+        if HEAT_MAP not in predicted:
             return super().code_loss(predicted, true)
         grid = self._grid.to(true[TRANSLATION].device)
-        return cell_error(self.layout, self._slots_of_kinds, grid, predicted, true).mean()
+        return dense_loss(self.layout, self._slots_of_kinds, grid, predicted, true).mean()
 
     @property
     def _slots_of_kinds(self) -> tuple[tuple[int, ...], ...]:

@@ -22,7 +22,7 @@ from curio_train.geometry import Pose
 from curio_train.meshes.shapes import sphere
 from curio_train.scene_code import COLOR, TRANSLATION, Field, Layout
 from curio_train.worlds.base import Camera
-from curio_train.worlds.generated.mesh_world import Kind, MeshWorld, Stage
+from curio_train.worlds.generated.mesh_world import Kind, MeshWorld, SceneSetup
 from curio_train.worlds.options import SpheresOptions
 from curio_train.worlds.placement import LEAST_SATURATION, LEAST_VALUE, colors, places
 
@@ -44,11 +44,11 @@ FIELDS = (
 )
 
 
-def stage() -> Stage:
+def stage() -> SceneSetup:
     """Camera and light of all worlds of spheres."""
     middle = (SIDE_PX - 1) / 2
     matrix = np.array([[FOCAL_PX, 0, middle], [0, FOCAL_PX, middle], [0, 0, 1]])
-    return Stage(
+    return SceneSetup(
         Camera(SIDE_PX, SIDE_PX, matrix, is_default=True),
         Pose(np.eye(3), np.zeros(3)),
         center_m=(0.0, 0.0, DISTANCE_M),

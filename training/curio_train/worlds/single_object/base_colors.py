@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from curio_train.errors import UsageError
-from curio_train.worlds.single_object.world import Paints, any_paint
+from curio_train.worlds.single_object.world import BaseColorPrior, any_base_color
 
 ANY_SHARE = 0.15
 """Of images in which the part has any colour, so that a colour that was wrongly found is not fatal."""
@@ -17,7 +17,7 @@ _LEAST_VALUE = 0.05
 _TINT = 0.06  # standard deviation of each channel, as a share of the largest: light of other things, white balance
 
 
-def paints_like(color: str) -> Paints:
+def base_colors_near(color: str) -> BaseColorPrior:
     """Draws colours about one given as #rrggbb, sRGB.
 
     Raises:
@@ -39,4 +39,4 @@ def _paints(srgb: np.ndarray, count: int, random: np.random.Generator) -> Tensor
     factors = np.exp(random.uniform(np.log(_LEAST_FACTOR), np.log(_LARGEST_FACTOR), (count, 1, 1)))
     near = torch.from_numpy(tints.clip(0, 1) * (value * factors).clip(_LEAST_VALUE, 1)).float()
     anything = torch.from_numpy(random.random((count, 1, 1)) < ANY_SHARE)
-    return torch.where(anything, any_paint(count, random), near)
+    return torch.where(anything, any_base_color(count, random), near)

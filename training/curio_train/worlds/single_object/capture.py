@@ -10,7 +10,7 @@ Images are rendered without end, as for LineMOD; what a data set's authors publi
 * light is that of LineMOD: from the camera's half space, over an ambient radiance of 0.4.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -19,22 +19,20 @@ import torch
 from torch import Tensor
 
 from curio_train.camera import Intrinsics, load_intrinsics
-from curio_train.data.background_image import PLATE_SHARE, MixedBackgrounds, PlateBackgrounds
+from curio_train.data.background_image import BACKGROUND_IMAGE_FRACTION, BackgroundImages, MixedBackgrounds
 from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
 from curio_train.data.part_color import is_unpainted
-from curio_train.data.photographs import Photographs, read_frames
+from curio_train.data.photographs import MAX_UNLABELLED, Photographs, UnlabelledPhotographs, read_frames, spread
 from curio_train.errors import UsageError
 from curio_train.geometry import random_rotations
 from curio_train.meshes.meshes import Mesh, load_mesh
 from curio_train.meshes.symmetries import find_symmetries
-from curio_train.refinement.pseudo_labels import Lessons, spread
-from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import ObjectKind, World
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object.base_colors import paints_like
-from curio_train.worlds.single_object.two_stage import LARGEST_LOG_SCALE, GazeWorld
+from curio_train.worlds.single_object.base_colors import base_colors_near
+from curio_train.worlds.single_object.two_stage import LARGEST_LOG_SCALE, TwoStageWorld
 from curio_train.worlds.single_object.viewpoints import upper_views
-from curio_train.worlds.single_object.world import Object, any_paint
+from curio_train.worlds.single_object.world import Object, any_base_color
 from curio_train.worlds.tabletop.files import build_table
 
 NUM_JUDGED = 40
@@ -42,7 +40,7 @@ NUM_JUDGED = 40
 from none."""
 
 
-class Capture(GazeWorld):
+class Capture(TwoStageWorld):
     """One part before the camera that took a folder of photographs."""
 
     def __init__(self, thing: Object, images: Path, background: Path | None = None) -> None:
@@ -54,9 +52,9 @@ class Capture(GazeWorld):
         """Those that teach nothing, without the lens's distortion, in the canonical size."""
         return self._read(spread(self._divided[0], count)).float() / 255
 
-    def lessons(self, predict: Callable[[Tensor], SceneCode]) -> Lessons | None:
-        """Of the photographs that it is not judged by."""
-        return Lessons.of_files(self, self._divided[1], predict)
+    def unlabelled(self) -> UnlabelledPhotographs:
+        """The photographs that the model is not judged by."""
+        return UnlabelledPhotographs(spread(self._divided[1], MAX_UNLABELLED))
 
     def plate(self) -> Tensor | None:
         """What ``--background`` shows, as the photographs come."""
@@ -104,7 +102,7 @@ def build(options: CaptureOptions) -> World:
         partial(_backgrounds, options, camera),
         upper_views if options.upright else random_rotations,
         painted=is_unpainted(mesh),
-        paints=any_paint if options.paint is None else paints_like(options.paint),
+        paints=any_base_color if options.paint is None else base_colors_near(options.paint),
         known_scene=options.background is not None,
     )
     return Capture(thing, options.photos, options.background)
@@ -133,5 +131,5 @@ def _backgrounds(options: CaptureOptions, camera: Intrinsics, cache: Path) -> Ba
         return PhotographBackgrounds(Photographs(options.backgrounds))
     if options.background is None:
         return ClutterBackgrounds.cached(cache)
-    plate = PlateBackgrounds.read(options.background, camera)  # before half a minute is spent on clutter
-    return MixedBackgrounds(plate, ClutterBackgrounds.cached(cache), PLATE_SHARE)
+    plate = BackgroundImages.read(options.background, camera)  # before half a minute is spent on clutter
+    return MixedBackgrounds(plate, ClutterBackgrounds.cached(cache), BACKGROUND_IMAGE_FRACTION)

@@ -12,24 +12,19 @@ Constants fixed before any training:
 """
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from torch import Tensor
 
-from curio_train.capture.plane import CameraPlaces
+from curio_train.capture.plane import CameraPoseFile
 from curio_train.capture.structure import recover
 from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
 from curio_train.data.bop import BopDataset
-from curio_train.data.photographs import Photographs
+from curio_train.data.photographs import MAX_UNLABELLED, CameraPoses, Photographs, UnlabelledPhotographs, spread
 from curio_train.errors import CameraError, CurioError, UsageError
-from curio_train.refinement.multi_view import Cameras
-from curio_train.refinement.pseudo_labels import MOST_PHOTOGRAPHS, Lessons, spread
-from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.options import LinemodOptions
-from curio_train.worlds.single_object.two_stage import GazeWorld
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object, SingleObjectWorld, pose_layout, position_field, squeezed
 
 SIDE_PX = 128
@@ -47,7 +42,7 @@ class Linemod(SingleObjectWorld):
         super().__init__(thing, squeezed(thing.camera, SIDE_PX), pose_layout(position_field(thing), confidence=False))
 
 
-class LinemodGaze(GazeWorld):
+class TwoStageLinemod(TwoStageWorld):
     """One LineMOD object read at two looks, in frames of which some may be there without labels."""
 
     def __init__(self, thing: Object, photographs: Path | None, views: Path | None = None) -> None:
@@ -60,25 +55,25 @@ class LinemodGaze(GazeWorld):
         """
         super().__init__(Linemod.name, thing)
         self._folder, self._views = photographs, views
-        self._placed: tuple[list[Path], Cameras | None] | None = None
+        self._placed: UnlabelledPhotographs | None = None
 
-    def lessons(self, predict: Callable[[Tensor], SceneCode]) -> Lessons | None:
-        """Of the photographs, if there are any; their cameras are placed once."""
+    def unlabelled(self) -> UnlabelledPhotographs:
+        """The photographs of the given folder; the poses of their cameras are found once."""
         if self._folder is None:
-            return None
-        paths = spread(Photographs(self._folder).paths, MOST_PHOTOGRAPHS)
-        if self._placed is None or self._placed[0] != paths:
-            self._placed = paths, self.cameras(paths)
-        return Lessons.of_files(self, paths, predict, self._placed[1])
+            return UnlabelledPhotographs(())
+        paths = spread(Photographs(self._folder).paths, MAX_UNLABELLED)
+        if self._placed is None or self._placed.paths != paths:
+            self._placed = UnlabelledPhotographs(paths, self.cameras(paths))
+        return self._placed
 
-    def cameras(self, paths: list[Path]) -> Cameras | None:
+    def cameras(self, paths: list[Path]) -> CameraPoses | None:
         """Where the camera stood; None if it is known of no photograph.
 
         Raises:
             CameraError: There is a file that should say it, and it does not do.
         """
         if self._views is not None:
-            return read_cameras(self._views, paths)
+            return read_camera_poses(self._views, paths)
         try:
             structure = recover(paths, self.object.camera)
         except CurioError as exc:
@@ -86,19 +81,19 @@ class LinemodGaze(GazeWorld):
             return None
         matrices = np.full((len(paths), 4, 4), np.nan)
         matrices[[paths.index(path) for path in structure.photographs]] = structure.cam_from_world
-        return Cameras(matrices)
+        return CameraPoses(matrices)
 
 
-def read_cameras(file: Path, paths: list[Path]) -> Cameras:
+def read_camera_poses(file: Path, paths: list[Path]) -> CameraPoses:
     """Where photographs were taken, in metres, by a file of ``--views-out``.
 
     Raises:
         CameraError: It cannot be read, says nothing of these photographs in metres, or a place is none.
     """
-    places = CameraPlaces.read(file, "--views")
+    places = CameraPoseFile.read(file, "--views")
     unknown = np.full((4, 4), np.nan)
     matrices = [places.anywhere(path) if places.in_metres(path) else unknown for path in paths]
-    cameras = Cameras(np.stack(matrices), in_metres=True)
+    cameras = CameraPoses(np.stack(matrices), in_metres=True)
     if not cameras.known.any():
         raise CameraError(
             f'--views {file}: has none of {paths[0].name} and {len(paths) - 1} more with "unit": "m"; write it with '
@@ -147,4 +142,4 @@ def build(options: LinemodOptions) -> SingleObjectWorld:
         if options.photos is not None:
             raise UsageError(f"--photos {options.photos}: they teach the second look of a gaze; leave out --no-gaze")
         return Linemod(thing)
-    return LinemodGaze(thing, options.photos, options.views)
+    return TwoStageLinemod(thing, options.photos, options.views)

@@ -27,16 +27,17 @@ from torch import Tensor, nn
 
 from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
-from curio_train.data.augmentation import WHOLE_FRAME, Disturbance
+from curio_train.data.augmentation import WHOLE_FRAME, AugmentationStrength
 from curio_train.data.backgrounds import Backgrounds
+from curio_train.data.photographs import UnlabelledPhotographs
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.metrics.poses import ADD_THRESHOLD, symmetry_poses
-from curio_train.networks.base import Look
-from curio_train.networks.grid import STRIDE, CellGrid, amounts_error, of_cells, said_by
-from curio_train.networks.two_stage.crop_pose import SURFACE, SURFACE_SHARE, CropNetwork
-from curio_train.networks.two_stage.localise import AMOUNTS, PLACES, PlaceNetwork
-from curio_train.networks.two_stage.network import GazeNetwork, Optics
-from curio_train.rendering.object_coordinates import SurfaceMap
+from curio_train.networks.base import StageNetwork
+from curio_train.networks.grid import STRIDE, CellGrid, gather_cells, heat_map_loss, per_cell
+from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES, OBJECT_COORDINATES_STRIDE, CropPoseNetwork
+from curio_train.networks.two_stage.localise import HEAT_MAP, PROPOSALS, LocalisationNetwork
+from curio_train.networks.two_stage.network import Optics, TwoStageNetwork
+from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Camera
 from curio_train.worlds.single_object.confidence import calibrate
@@ -54,11 +55,11 @@ ASSUMED_M = "assumed_depth_m"
 """How far the first look says the object is [batch, 1]: known beside the code, never predicted."""
 
 LONGEST_SIDE_PX = 640
-FIRST_LOOK_SHARE = 4
+LOCALISATION_STRIDE = 4
 CROP_PX, FILL = 64, 0.6
 LARGEST_OFFSET, LARGEST_LOG_SCALE = 0.25, 0.25
 ABSENT_SHARE = 1 / 7
-TURNS, TURNS_IN_KNOWN_SCENE = (0, 1, 1), (0, 1, 1, 1, 1)
+STAGE_SCHEDULE, STAGE_SCHEDULE_IN_KNOWN_SCENE = (0, 1, 1), (0, 1, 1, 1, 1)
 """Which look each step teaches: rotation takes longer than place, most of all before a known scene."""
 
 _PLACE_SCALE_PX = 2.0  # of the first look's pixels: what counts as near
@@ -73,65 +74,74 @@ _CONFIDENCE_WEIGHT = 0.2
 SYMMETRY_STEP = 0.1  # continuous symmetries count as one in so many parts of a turn: 31
 
 
-def gaze_camera(frame: Intrinsics) -> Camera:
+def frame_camera(frame: Intrinsics) -> Camera:
     """The canonical camera of a gaze: the frame's own, at most 640 pixels long, in whole pixels of the first look."""
     scale = min(1.0, LONGEST_SIDE_PX / max(frame.width, frame.height))
-    step = 2 * FIRST_LOOK_SHARE
+    step = 2 * LOCALISATION_STRIDE
     return resized(frame, step * round(frame.width * scale / step), step * round(frame.height * scale / step))
 
 
-class GazeWorld(SingleObjectWorld):
+class TwoStageWorld(SingleObjectWorld):
     """One object anywhere in a frame that is read at two looks."""
 
     def __init__(self, name: str, thing: Object) -> None:
         """Name it as it is called on the command line."""
         self.name = name
-        camera = gaze_camera(thing.camera)
+        camera = frame_camera(thing.camera)
         super().__init__(thing, camera, pose_layout(position_field(thing), confidence=True, color=thing.painted))
-        self._looks = FirstLook(thing, camera), SecondLook(thing)
+        self._stages = LocalisationStage(thing, camera), CropPoseStage(thing)
 
     @property
-    def looks(self) -> tuple["FirstLook", "SecondLook"]:
+    def stages(self) -> tuple["LocalisationStage", "CropPoseStage"]:
         """The whole frame and the crop."""
-        return self._looks
+        return self._stages
 
     @property
     def turns(self) -> tuple[int, ...]:
         """A step for the frame, then several for the crop."""
-        return TURNS_IN_KNOWN_SCENE if self.object.known_scene else TURNS
+        return STAGE_SCHEDULE_IN_KNOWN_SCENE if self.object.known_scene else STAGE_SCHEDULE
 
     @property
     def exposure(self) -> Exposure:
         """That of the look which has to find the object."""
-        return self.looks[0].exposure
+        return self.stages[0].exposure
+
+    def unlabelled(self) -> UnlabelledPhotographs:
+        """The photographs that self-training learns from; none, unless a world has some.
+
+        Raises:
+            DataError: The folder of photographs cannot be read.
+            CameraError: The file of camera poses cannot be used.
+        """
+        return UnlabelledPhotographs(())
 
     def finish(self, network: nn.Module, cache: Path) -> None:
         """The confidence is calibrated."""
         calibrate(network, self, cache)
 
-    def assemble(self, networks: Sequence[Look]) -> nn.Module:
+    def assemble(self, networks: Sequence[StageNetwork]) -> nn.Module:
         """Both looks in one."""
         first, second = networks
         assert self.camera.matrix is not None
         optics = Optics(
-            self.camera.matrix, self.object.kind.diameter_m, self.object.near_m, FIRST_LOOK_SHARE, CROP_PX, FILL
+            self.camera.matrix, self.object.kind.diameter_m, self.object.near_m, LOCALISATION_STRIDE, CROP_PX, FILL
         )
-        return GazeNetwork(first, second, optics)
+        return TwoStageNetwork(first, second, optics)
 
 
-class FirstLook(SingleObjectWorld):
+class LocalisationStage(SingleObjectWorld):
     """Whole frames at low resolution, of which only the place is read."""
 
     name, num_shown, finished = "first look", 3, True
 
     def __init__(self, thing: Object, frame: Camera) -> None:
-        camera = resized(thing.camera, frame.width // FIRST_LOOK_SHARE, frame.height // FIRST_LOOK_SHARE)
+        camera = resized(thing.camera, frame.width // LOCALISATION_STRIDE, frame.height // LOCALISATION_STRIDE)
         super().__init__(thing, camera, Layout((position_field(thing),)))
 
     @property
-    def disturbance(self) -> Disturbance:
+    def augmentation(self) -> AugmentationStrength:
         """Little of colours: at a dozen pixels they are what tells the object from other things."""
-        return super().disturbance if self.object.known_scene else WHOLE_FRAME
+        return super().augmentation if self.object.known_scene else WHOLE_FRAME
 
     @property
     def exposure(self) -> Exposure:
@@ -144,9 +154,9 @@ class FirstLook(SingleObjectWorld):
         light = code.pop(LIGHT)[:count]
         return {name: value.reshape(count, self.num_shown, -1) for name, value in code.items()} | {LIGHT: light}
 
-    def network(self, config: NetworkConfig) -> PlaceNetwork:
+    def network(self, config: NetworkConfig) -> LocalisationNetwork:
         """Hypotheses on a grid."""
-        return PlaceNetwork(_grid(self))
+        return LocalisationNetwork(_grid(self))
 
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
         """Which cells have an object beside them, and where those say that it is (after Zhou et al. 2019).
@@ -155,13 +165,13 @@ class FirstLook(SingleObjectWorld):
         things in the picture are two hypotheses, and never a mean between them.
         """
         place, grid = true[TRANSLATION], _grid(self).to(true[TRANSLATION].device)
-        here = grid.share(grid.project(place))
-        said, wanted = said_by(predicted[PLACES], here), place[:, :, None]  # [batch, objects, 4, 3]
+        here = grid.splat_weights(grid.project(place))
+        said, wanted = gather_cells(predicted[PROPOSALS], here), place[:, :, None]  # [batch, objects, 4, 3]
         slope = said[..., :2] / said[..., 2:] - wanted[..., :2] / wanted[..., 2:]
         depth = said[..., 2].log() - wanted[..., 2].log()
         distance = slope.norm(dim=-1) / self._slope_scale + depth.abs() / _DEPTH_SCALE
         placed = (distance * here.weight).sum(dim=-1).mean()
-        return amounts_error(predicted[AMOUNTS], here).mean() / place.shape[1] + _PLACE_WEIGHT * placed
+        return heat_map_loss(predicted[HEAT_MAP], here).mean() / place.shape[1] + _PLACE_WEIGHT * placed
 
     @property
     def _slope_scale(self) -> float:
@@ -169,7 +179,7 @@ class FirstLook(SingleObjectWorld):
         return _PLACE_SCALE_PX / float(self.camera.matrix[0, 0])
 
 
-class SecondLook(SingleObjectWorld):
+class CropPoseStage(SingleObjectWorld):
     """Crops around the object, read as position relative to the crop, rotation and light in the crop's camera.
 
     The position is (x, y) in diameters and z in assumed depths, so that the crop's K is the same for all: focal
@@ -195,9 +205,9 @@ class SecondLook(SingleObjectWorld):
         )
         super().__init__(thing, camera, pose_layout(position, confidence=True, color=thing.painted))
 
-    def network(self, config: NetworkConfig) -> CropNetwork:
+    def network(self, config: NetworkConfig) -> CropPoseNetwork:
         """A small residual network whose cells say the pose."""
-        return CropNetwork(self.layout, _grid(self))
+        return CropPoseNetwork(self.layout, _grid(self))
 
     def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:
         """Objects near the middle of crops, as a first look that errs leaves them."""
@@ -242,8 +252,8 @@ class SecondLook(SingleObjectWorld):
         return self._with_surface(code, rotation, position_m)
 
     def _with_surface(self, code: dict[str, Tensor], rotation: Tensor, position_m: Tensor) -> dict[str, Tensor]:
-        points, seen = self._surface(rotation, position_m, self._matrices(code, CROP_PX // SURFACE_SHARE))
-        return code | {SURFACE: torch.cat([points, seen[:, None]], dim=1)}
+        points, seen = self._surface(rotation, position_m, self._matrices(code, CROP_PX // OBJECT_COORDINATES_STRIDE))
+        return code | {OBJECT_COORDINATES: torch.cat([points, seen[:, None]], dim=1)}
 
     def backgrounds(self, cache: Path) -> Backgrounds:
         """Such parts of them as crops show."""
@@ -283,7 +293,7 @@ class SecondLook(SingleObjectWorld):
         sure = F.binary_cross_entropy(predicted[CONFIDENCE][:, 0, 0].clamp(1e-6, 1 - 1e-6), right)
         pose = pose + self._cell_error(predicted, wanted_6d, true)
         pose_loss = (pose * there).sum() / there.sum().clamp(min=1)
-        surface = self._surface_loss(predicted[SURFACE], true)
+        surface = self._surface_loss(predicted[OBJECT_COORDINATES], true)
         return pose_loss + _CONFIDENCE_WEIGHT * sure + _SURFACE_WEIGHT * surface
 
     def _cell_error(self, predicted: SceneCode, rotation_6d: Tensor, true: SceneCode) -> Float[Tensor, " batch"]:
@@ -291,10 +301,10 @@ class SecondLook(SingleObjectWorld):
 
         Of poses that look alike cells are taught the one that is nearest to the answer: they are to agree.
         """
-        seen = F.avg_pool2d(true[SURFACE][:, 3:], STRIDE // SURFACE_SHARE).flatten(1)
+        seen = F.avg_pool2d(true[OBJECT_COORDINATES][:, 3:], STRIDE // OBJECT_COORDINATES_STRIDE).flatten(1)
         share = seen / seen.sum(dim=1, keepdim=True).clamp(min=1)
-        numbers = (predicted[of_cells(ROTATION_6D)] - rotation_6d[:, None]).square().sum(dim=-1)
-        offset, depth = self._place_error(predicted[of_cells(TRANSLATION)], true[TRANSLATION], true[ASSUMED_M])
+        numbers = (predicted[per_cell(ROTATION_6D)] - rotation_6d[:, None]).square().sum(dim=-1)
+        offset, depth = self._place_error(predicted[per_cell(TRANSLATION)], true[TRANSLATION], true[ASSUMED_M])
         return (share * (_NUMBERS_WEIGHT * numbers + offset + depth)).sum(dim=1)
 
     def _place_error(self, place: Tensor, true_place: Tensor, assumed: Tensor) -> tuple[Tensor, Tensor]:
@@ -305,7 +315,7 @@ class SecondLook(SingleObjectWorld):
 
     def _surface_loss(self, surface: Float[Tensor, "batch 4 side side"], true: SceneCode) -> Float[Tensor, ""]:
         """Whether each patch sees the object, and where it does, which point of it (mean absolute coordinate error)."""
-        points, seen = true[SURFACE].split((3, 1), dim=1)
+        points, seen = true[OBJECT_COORDINATES].split((3, 1), dim=1)
         mask = (seen * true[CONFIDENCE][..., None])[:, None]  # [batch, 1, 1, side, side]
         turned = torch.einsum("sij,bjvu->bsivu", self._turns.to(points).transpose(1, 2), points)
         errors = ((surface[:, None, :3] - turned).abs() * mask).sum((2, 3, 4)) / mask.sum((2, 3, 4)).clamp(min=1)
@@ -324,8 +334,8 @@ class SecondLook(SingleObjectWorld):
         return torch.cat([place[:, :2] * self.object.kind.diameter_m, place[:, 2:] * assumed], dim=-1)
 
     @cached_property
-    def _surface(self) -> SurfaceMap:
-        return SurfaceMap(self.object.mesh, CROP_PX // SURFACE_SHARE)
+    def _surface(self) -> ObjectCoordinateMap:
+        return ObjectCoordinateMap(self.object.mesh, CROP_PX // OBJECT_COORDINATES_STRIDE)
 
     @cached_property
     def _points(self) -> Tensor:

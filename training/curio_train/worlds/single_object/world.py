@@ -11,11 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.camera import Intrinsics, scale_matrix
-from curio_train.data.augmentation import KNOWN_SCENE, UNKNOWN_SCENE, Disturbance, disturb
+from curio_train.data.augmentation import KNOWN_SCENE, UNKNOWN_SCENE, AugmentationStrength, augment
 from curio_train.data.backgrounds import Backgrounds
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.meshes.meshes import Mesh
-from curio_train.rendering.materials import random_finishes
+from curio_train.rendering.materials import random_appearances
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Batch, Camera, ImageSource, ObjectKind, Split, World, jitter_seed
@@ -38,7 +38,7 @@ from curio_train.worlds.single_object.viewpoints import (
 Views = Callable[[int, np.random.Generator], Float[Tensor, "count 3 3"]]
 """Draws rotations cam_from_obj of objects on the optical axis."""
 
-Paints = Callable[[int, np.random.Generator], Float[Tensor, "count 1 3"]]
+BaseColorPrior = Callable[[int, np.random.Generator], Float[Tensor, "count 1 3"]]
 """Draws sRGB colours of objects."""
 
 EXPOSURE = "exposure"
@@ -55,7 +55,7 @@ _FINISH_DRAWS = 1  # of the draws of a step
 _SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 
 
-def any_paint(count: int, random: np.random.Generator) -> Float[Tensor, "count 1 3"]:
+def any_base_color(count: int, random: np.random.Generator) -> Float[Tensor, "count 1 3"]:
     """Colours of a part of which nothing is known: black, white, grey or anything between."""
     return colors(count, 1, random, 0.0, LEAST_PAINT_VALUE)
 
@@ -85,7 +85,7 @@ class Object:
     backgrounds: Callable[[Path], Backgrounds]
     views: Views = field(default=upper_views)
     painted: bool = False
-    paints: Paints = field(default=any_paint)
+    paints: BaseColorPrior = field(default=any_base_color)
     known_scene: bool = False
 
 
@@ -126,16 +126,16 @@ class SingleObjectWorld(World):
         assert self.camera.matrix is not None  # these worlds have pinhole cameras
         return self._image(code, code[TRANSLATION].float(), self.camera.matrix, backgrounds)
 
-    def disturb(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
-        """What real cameras and scenes do to a picture, see :func:`~curio_train.data.augmentation.disturb`."""
-        return disturb(images, np.random.default_rng(seed), self.disturbance)
+    def augment(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
+        """What real cameras and scenes do to a picture, see :func:`~curio_train.data.augmentation.augment`."""
+        return augment(images, np.random.default_rng(seed), self.augmentation)
 
     def lights(self, count: int, random: np.random.Generator) -> Tensor:
         """Light of any strength, or, in a known scene, as a place where things are looked at is lit, [count, 3]."""
         return lights(count, random, WEAKEST_KNOWN_LIGHT if self.object.known_scene else WEAKEST_LIGHT)
 
     @property
-    def disturbance(self) -> Disturbance:
+    def augmentation(self) -> AugmentationStrength:
         """How much its images are disturbed."""
         return KNOWN_SCENE if self.object.known_scene else UNKNOWN_SCENE
 
@@ -153,7 +153,7 @@ class SingleObjectWorld(World):
     def finishes(self, code: SceneCode, seed: tuple[int, ...]) -> dict[str, Tensor]:
         """The entry of a code that says what its surfaces are like, of any kind [batch, slots, FINISH_SIZE]."""
         count, slots = code[TRANSLATION].shape[:2]
-        drawn = random_finishes(count * slots, np.random.default_rng((*seed, _FINISH_DRAWS)))
+        drawn = random_appearances(count * slots, np.random.default_rng((*seed, _FINISH_DRAWS)))
         return {FINISH: drawn.reshape(count, slots, -1)}
 
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> "RenderedStream":

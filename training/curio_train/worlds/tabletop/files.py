@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from curio_train.camera import Intrinsics, load_intrinsics
-from curio_train.capture.plane import CameraPlaces, ever_changed, seen_points
+from curio_train.capture.plane import CameraPoseFile, ever_changed, seen_points
 from curio_train.data.photographs import Photographs, read_frames
 from curio_train.errors import DataError
 from curio_train.geometry import Pose
@@ -18,7 +18,7 @@ from curio_train.meshes.symmetries import Symmetries, find_symmetries
 from curio_train.scene_code import TRANSLATION, Field
 from curio_train.worlds.base import Camera, ObjectKind, View
 from curio_train.worlds.generated.ground import AMBIENT, SUN
-from curio_train.worlds.generated.mesh_world import Stage
+from curio_train.worlds.generated.mesh_world import SceneSetup
 from curio_train.worlds.options import CaptureOptions
 from curio_train.worlds.single_object.world import resized
 from curio_train.worlds.tabletop.world import Part, Pictures, Table
@@ -46,14 +46,14 @@ def build_table(options: CaptureOptions) -> Table:
     assert options.plane is not None  # what makes it a table
     assert options.background is not None  # refused by the options
     amounts, intrinsics = options.amounts, load_intrinsics(options.camera)
-    cameras = CameraPlaces.read(options.plane)
+    cameras = CameraPoseFile.read(options.plane)
     parts = [
         _part(load_mesh(file, options.mesh_unit), file.stem, options, *amount)
         for file, amount in zip(options.mesh, amounts, strict=True)
     ]
     camera = resized(intrinsics, SIDE_PX, SIDE_PX)
     pose = _pose(cameras.cam_from_world(options.background))
-    stage = Stage(camera, pose, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), AMBIENT, (0.0, SUN, 0.0))
+    stage = SceneSetup(camera, pose, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), AMBIENT, (0.0, SUN, 0.0))
     highest = max(float(np.linalg.norm(part.mesh.vertices_m, axis=1).max()) for part in parts) if options.lying else 0.0
     pictures = _pictures(options, cameras, intrinsics, camera, highest)
     return Table(parts, stage, pictures, lying=options.lying, blur_px=options.blur_px)
@@ -83,7 +83,7 @@ def _fold(found: Symmetries, up: np.ndarray) -> int:
 
 
 def _pictures(
-    options: CaptureOptions, cameras: CameraPlaces, intrinsics: Intrinsics, camera: Camera, highest_m: float
+    options: CaptureOptions, cameras: CameraPoseFile, intrinsics: Intrinsics, camera: Camera, highest_m: float
 ) -> Pictures:
     assert options.background is not None  # refused by the options
     paths = Photographs(options.photos).paths
@@ -102,7 +102,7 @@ def _pictures(
 
 
 def _views(
-    options: CaptureOptions, cameras: CameraPlaces, intrinsics: Intrinsics, paths: Sequence[Path], plate: Tensor
+    options: CaptureOptions, cameras: CameraPoseFile, intrinsics: Intrinsics, paths: Sequence[Path], plate: Tensor
 ) -> tuple[tuple[View, ...], Pose | None]:
     if options.second is None or options.second_background is None:
         return (View(_frames(paths, intrinsics), plate),), None

@@ -44,7 +44,7 @@ from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSL
 from curio_train.worlds.base import ObjectKind, Split, View
 from curio_train.worlds.generated.ground import TURN, GroundWorld
 from curio_train.worlds.generated.light import SUN_FIELD, suns
-from curio_train.worlds.generated.mesh_world import Kind, Stage
+from curio_train.worlds.generated.mesh_world import Kind, SceneSetup
 from curio_train.worlds.generated.multi import COLOR_FIELD
 from curio_train.worlds.generated.varied import CONFIDENCE_FIELD
 from curio_train.worlds.image_sets import StoredImages
@@ -105,7 +105,9 @@ class Table(GroundWorld):
     name = "capture"
     object_shadows = False
 
-    def __init__(self, parts: Sequence[Part], where: Stage, pictures: Pictures, *, lying: bool, blur_px: int) -> None:
+    def __init__(
+        self, parts: Sequence[Part], where: SceneSetup, pictures: Pictures, *, lying: bool, blur_px: int
+    ) -> None:
         """Build the renderer.
 
         Raises:
@@ -166,7 +168,7 @@ class Table(GroundWorld):
             code[CONFIDENCE] = torch.cat(there, dim=1)
         return {field.name: code[field.name].float() for field in self.layout.fields}
 
-    def disturb(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
+    def augment(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
         """What differs from photograph to photograph of one camera: exposure, white balance, noise."""
         random = np.random.default_rng(seed)
         gain = 1 + random.uniform(-_GAIN, _GAIN, (len(images), 1)) + random.uniform(-_TINT, _TINT, (len(images), 3))
