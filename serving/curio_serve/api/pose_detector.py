@@ -4,6 +4,7 @@ import itertools
 import secrets
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +26,8 @@ from curio_serve.telemetry import Metrics
 
 Context = grpc.ServicerContext
 _MAX_ID_LENGTH = 128
+# One connection may have this part of the streams, but at least so many.
+_STREAM_FRACTION, _LEAST_STREAMS = 4, 8
 _ID_PREFIX, _ID_NUMBERS = secrets.token_hex(8), itertools.count()
 
 
@@ -46,8 +49,9 @@ class PoseService(PoseDetectorServicer):
     def __init__(self, repository: Repository, work: WorkQueue, limits: Limits, metrics: Metrics) -> None:
         self._repository, self._work, self._limits, self._metrics = repository, work, limits, metrics
         self._calls = CallLog(metrics)
-        self._num_streams, self._lock = 0, threading.Lock()
-        metrics.streams.set_function(lambda: self._num_streams)
+        self._streams: Counter[str] = Counter()  # of each connection
+        self._lock = threading.Lock()
+        metrics.streams.set_function(self._streams.total)
 
     def Detect(self, requests: Iterator[messages.DetectRequest], context: Context) -> messages.DetectResponse:
         """Answer the one request; a full queue refuses it before it is read."""
@@ -91,16 +95,26 @@ class PoseService(PoseDetectorServicer):
             return messages.DetectResponse(request_id=request_id, error=frame_error(exc))
 
     def _open_stream(self, context: Context) -> None:
+        peer, most = context.peer(), self._limits.max_streams
+        most_of_peer = max(_LEAST_STREAMS, most // _STREAM_FRACTION)
         with self._lock:
-            if self._num_streams >= self._limits.max_streams:
-                raise Overloaded(f"{self._num_streams} streams are open, which is the limit (--max-streams)", 1.0)
-            self._num_streams += 1
-        if not context.add_callback(self._close_stream):
-            self._close_stream()
+            if self._streams.total() >= most:
+                raise Overloaded(f"{most} streams are open, which is the limit (--max-streams)", 1.0)
+            if self._streams[peer] >= most_of_peer:
+                raise Overloaded(
+                    f"{most_of_peer} streams of this connection are open, which is the limit of one connection "
+                    f"(a part of --max-streams {most}); open another connection, or close a stream",
+                    1.0,
+                )
+            self._streams[peer] += 1
+        if not context.add_callback(partial(self._close_stream, peer)):
+            self._close_stream(peer)
 
-    def _close_stream(self) -> None:
+    def _close_stream(self, peer: str) -> None:
         with self._lock:
-            self._num_streams -= 1
+            self._streams[peer] -= 1
+            if not self._streams[peer]:
+                del self._streams[peer]
 
     def _list(self) -> messages.ListModelsResponse:
         answer = messages.ListModelsResponse()

@@ -19,7 +19,7 @@ from curio_serve.errors import CallEnded, CurioError, InternalError, Overloaded,
 from curio_serve.telemetry import LOGGER, Metrics, log
 
 DOMAIN = "curio-pose"
-_MAX_TEXT = 1000
+_MAX_TEXT_BYTES = 1000  # trailers are limited to 8 KiB, and carry the text twice: percent-encoded, and in base64
 _MAX_ID_LENGTH = 128
 
 
@@ -111,4 +111,4 @@ def _status(name: str, reason: str, message: str, retry_s: float | None) -> grpc
 
 def _text(error: CurioError) -> str:
     """An error's text, cut so that it fits into gRPC's trailers."""
-    return str(error)[:_MAX_TEXT]
+    return str(error).encode(errors="replace")[:_MAX_TEXT_BYTES].decode(errors="ignore")

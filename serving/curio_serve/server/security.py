@@ -2,6 +2,7 @@
 
 import hmac
 import logging
+import ssl
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -71,12 +72,12 @@ def server_credentials(config: ServeConfig) -> grpc.ServerCredentials | None:
     """TLS as configured, or None.
 
     Raises:
-        UsageError: A file cannot be read.
+        UsageError: A file cannot be read, or --client-ca holds no certificate.
     """
     if config.tls_certificate is None or config.tls_key is None:
         return None
     pair = (_read(config.tls_key, "--tls-key"), _read(config.tls_certificate, "--tls-certificate"))
-    authority = _read(config.client_ca, "--client-ca") if config.client_ca else None
+    authority = _read_authority(config.client_ca) if config.client_ca else None
     return grpc.ssl_server_credentials([pair], authority, require_client_auth=authority is not None)
 
 
@@ -90,6 +91,15 @@ def read_tokens(path: Path) -> list[bytes]:
     if not tokens:
         raise UsageError(f"--token-file {path} holds no token; expected one a line")
     return tokens
+
+
+def _read_authority(path: Path) -> bytes:
+    data = _read(path, "--client-ca")
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_verify_locations(cadata=data.decode("ascii"))
+    except (ssl.SSLError, UnicodeDecodeError) as exc:
+        raise UsageError(f"--client-ca {path} cannot be used; expected a PEM file of certificates") from exc
+    return data
 
 
 def _read(path: Path, flag: str) -> bytes:
