@@ -208,10 +208,8 @@ def test_configurations_survive_their_file(tmp_path: Path, config: RunConfig) ->
         ('{"world": {"name": "circles"}, "methods": "our"}', r"is no configuration .*\(methods\) @ config"),
         ('{"world": {"name": "circles", "class": "ape"}}', r"\(class\) @ config.world"),
         ('{"world": {"name": "circles"}, "method": "ours"}', r"ours not in literal .* @ config.method"),
-        (
-            '{"world": {"name": "circles"}, "recipe": {"swap_colors": "no"}}',
-            "found 'no', expected bool @ config.recipe",
-        ),
+        ('{"world": {"name": "circles"}, "seed": "1"}', "found '1', expected int @ config.seed"),
+        ('{"world": {"name": "circles"}, "recipe": {"seed": 1}}', r"\(seed\) @ config.recipe"),
         ('{"world": {"name": "circles"}, "labels": 7.0}', "is no fraction"),
         ('{"method": "our"}', "required field missing @ config.world"),
         ("[]", "is no configuration of this version"),

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from curio_train.metrics.calibration import auroc, calibration, calibration_error
+from curio_train.metrics.calibration import auroc, calibration_error, fit_calibration
 
 
 def test_a_confidence_that_is_right_as_often_as_it_says_has_no_error() -> None:
@@ -15,7 +15,7 @@ def test_error_by_hand() -> None:
     assert calibration_error([1.0], [True]) == 0
 
 
-def test_separation_counts_pairs() -> None:
+def test_auroc_counts_pairs() -> None:
     assert auroc([0.9, 0.8], [0.1, 0.2, 0.3]) == 1
     assert auroc([0.1], [0.9]) == 0
     assert auroc([0.5, 0.5], [0.5]) == 0.5
@@ -38,20 +38,20 @@ def test_calibration_mends_confidences_that_say_too_little() -> None:
     confidences = [0.3] * 500 + [0.1] * 500
     right = [True] * 450 + [False] * 50 + [True] * 250 + [False] * 250
     logits = np.log(np.array(confidences) / (1 - np.array(confidences)))
-    slope, offset = calibration(logits[:, None], right)
+    slope, offset = fit_calibration(logits[:, None], right)
     found = 1 / (1 + np.exp(-(slope * logits + offset)))
     assert found[0] == pytest.approx(0.9, abs=0.02)
     assert found[-1] == pytest.approx(0.5, abs=0.02)
     assert calibration_error(found, right) < 0.02
 
 
-def test_calibration_weighs_what_tells_apart_and_nothing_against_its_meaning() -> None:
-    """Of two signs beside the logit one knows which predictions are right, the other which are wrong."""
+def test_calibration_weights_informative_features_and_none_negatively() -> None:
+    """Of two features beside the logit one tells which predictions are correct, the other which are wrong."""
     random = np.random.default_rng(0)
     right = random.random(400) < 0.5
     noise = random.normal(size=(3, 400))
     logit, telling, misleading = noise[0], 3 * right + noise[1], noise[2] - 3 * right
-    first, second, third, offset = calibration(np.stack([logit, telling, misleading], axis=1), right.tolist())
+    first, second, third, offset = fit_calibration(np.stack([logit, telling, misleading], axis=1), right.tolist())
     assert second > 1
     assert abs(first) < 0.3
     assert third == 0
@@ -60,6 +60,6 @@ def test_calibration_weighs_what_tells_apart_and_nothing_against_its_meaning() -
 
 
 def test_calibration_stays_finite_where_all_is_right() -> None:
-    weights = calibration([[0.0], [0.4], [13.0]], [True] * 3)
+    weights = fit_calibration([[0.0], [0.4], [13.0]], [True] * 3)
     assert np.isfinite(weights).all()
     assert weights[0] > 0

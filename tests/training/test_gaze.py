@@ -140,7 +140,7 @@ def test_surface_points_project_to_the_patches_that_see_them(brick_world: TwoSta
         assert (pixels - torch.stack([u, v], dim=1)).abs().mean() < 0.3
 
 
-def test_first_look_reads_the_likeliest_place(brick_world: TwoStageWorld) -> None:
+def test_localisation_gives_the_likeliest_position(brick_world: TwoStageWorld) -> None:
     """A network that scores brightness must answer with the bright spot's place, between the depth bounds."""
     first = brick_world.stages[0]
     network = first.network(NetworkConfig()).eval()
@@ -228,10 +228,10 @@ def test_confidence_weighs_what_all_glances_see(brick_world: TwoStageWorld) -> N
     weights = torch.tensor([[-3.0, -0.5]]).expand(3, 2)
     frames = torch.tensor([0.2, 0.5, 0.9])[:, None, None, None].expand(3, 3, 480, 640)
     network = brick_world.assemble([Told({TOP_PROPOSALS: candidates, TOP_LOG_WEIGHTS: weights}), Bright()])
-    _, signs = network.uncalibrated(frames)
+    _, features = network.uncalibrated(frames)
     brightness = frames[:, 0, 0, 0]
-    assert torch.allclose(signs.pose_correct[:, 0], brightness.logit(), atol=1e-4)
-    assert torch.allclose(signs.presence, torch.stack([brightness, torch.full((3,), -0.5)], dim=1), atol=1e-4)
+    assert torch.allclose(features.pose_correct[:, 0], brightness.logit(), atol=1e-4)
+    assert torch.allclose(features.presence, torch.stack([brightness, torch.full((3,), -0.5)], dim=1), atol=1e-4)
     assert torch.allclose(network(frames)[CONFIDENCE].flatten(), brightness, atol=1e-4)
     network.rightness.copy_(torch.tensor([2.0, 0.5]))
     network.presence.copy_(torch.tensor([2.0, 1.0, 0.25]))
@@ -273,20 +273,20 @@ def test_calibration_knows_empty_frames(brick_world: TwoStageWorld, tmp_path: Pa
     assert empty < 0.6 * full
 
 
-def test_candidates_are_apart_and_the_likeliest_comes_first(brick_world: TwoStageWorld) -> None:
+def test_top_proposals_are_apart_and_the_likeliest_comes_first(brick_world: TwoStageWorld) -> None:
     first = brick_world.stages[0]
     network = first.network(NetworkConfig())
     weights = torch.full((1, 20 * 15), 1e-6)
     chosen = torch.tensor([5 * 20 + 5, 5 * 20 + 6, 10 * 20 + 12, 2 * 20 + 17])
     weights[0, chosen] = torch.tensor([0.5, 0.3, 0.15, 0.05])
     places = network.grid.locate(network.grid.pixels, torch.zeros(300, 1))[None]
-    found, of_found = network._candidates(places, weights)
+    found, of_found = network._top_proposals(places, weights)
     assert found.shape == (1, NUM_TOP, 3)
     assert torch.equal(found[0, :3], places[0, chosen[[0, 2, 3]]])
     assert torch.equal(of_found[0, :3], weights[0, chosen[[0, 2, 3]]])
     # Cells far from each other that mean one place are one candidate.
     places[0, chosen[2]] = places[0, chosen[0]] + 0.01
-    found, _ = network._candidates(places, weights)
+    found, _ = network._top_proposals(places, weights)
     assert torch.equal(found[0, :2], places[0, chosen[[0, 3]]])
 
 

@@ -254,7 +254,7 @@ def test_the_paper_preset_is_the_papers_table() -> None:
 
 
 def test_processes_share_micro_batches_evenly_or_not_at_all() -> None:
-    shares = [list(Ranks(rank, 2, torch.device("cpu")).share(4)) for rank in range(2)]
+    shares = [list(Ranks(rank, 2, torch.device("cpu")).micro_batches(4)) for rank in range(2)]
     assert np.array(shares).tolist() == [[0, 2], [1, 3]]
-    with pytest.raises(UsageError, match="3 micro-batches a step cannot be shared by 2 processes"):
-        Ranks(0, 2, torch.device("cpu")).share(3)
+    with pytest.raises(UsageError, match="3 micro-batches a step cannot be divided among 2 processes"):
+        Ranks(0, 2, torch.device("cpu")).micro_batches(3)

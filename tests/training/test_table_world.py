@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train.commands import cli
+from curio_train.commands import train as train_command
 from curio_train.config import METHODS, NetworkConfig, Recipe, RunConfig
-from curio_train.doctor.before_training import refuse_unfit
+from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.photographed import judge
@@ -300,7 +300,7 @@ def test_photographs_have_no_labels(world: Table, tmp_path: Path) -> None:
 
 def call(*words: object) -> int:
     with pytest.raises(SystemExit) as exit_:
-        cli.train(["capture", *map(str, words)])
+        train_command.train(["capture", *map(str, words)])
     return int(exit_.value.code or 0)
 
 

@@ -18,8 +18,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-# Below this length a vector has no direction one could trust. Gradients of a direction grow as 1 / length, so it also
-# bounds them.
+# Shorter vectors count as without a direction. Gradients of a direction grow as 1 / length, so this also bounds them.
 _SHORTEST = 1e-6
 
 Array = TypeVar("Array", np.ndarray, Tensor)
@@ -93,22 +92,22 @@ def _any_perpendicular(unit: Tensor) -> Tensor:
 
 
 def _without(vector: Tensor, unit: Tensor) -> Tensor:
-    """What is left of a vector without its part along a unit vector."""
+    """A vector minus its component along a unit vector."""
     return vector - (unit * vector).sum(dim=-1, keepdim=True) * unit
 
 
 def matrix_from_rotation_6d(rotation_6d: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a 6D rotation by Gram–Schmidt, Zhou et al. 2019, section B.
 
-    Any finite input gives a rotation with finite gradients: a first column without a direction becomes the x axis, a
-    second one without a direction of its own (zero, or along the first) becomes some perpendicular.
+    Any finite input gives a rotation with finite gradients: the x axis replaces a first column that is too short, any
+    perpendicular replaces a second one that is too short or parallel to the first.
     """
     first, second = rotation_6d[..., :3], rotation_6d[..., 3:]
     x = _unit(first, torch.eye(3, dtype=first.dtype, device=first.device)[0].expand_as(first))
-    # The second column is brought to length 1 first, so that "along the first" means the same at every scale.
+    # The second column is normalised first, so that "parallel" means the same at every scale.
     second = _unit(second, _any_perpendicular(x))
     y = _unit(_without(second, x), _any_perpendicular(x))
-    # Once more: of nearly parallel columns the first pass leaves little but rounding.
+    # Twice, because nearly parallel columns leave mostly rounding errors after the first pass.
     y = _unit(_without(y, x), _any_perpendicular(x))
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
 
@@ -119,9 +118,9 @@ def rotation_6d_from_matrix(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tens
 
 
 def matrix_from_yaw(yaw_ij: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation about the world's y axis (up, right-handed) by atan2(j, i); the length of (i, j) means nothing.
+    """Rotation about the world's y axis (up, right-handed) by atan2(j, i), whatever the length of (i, j).
 
-    (0, 0) is no rotation; gradients are finite there too.
+    (0, 0) gives the identity, with finite gradients.
     """
     forward = torch.eye(2, dtype=yaw_ij.dtype, device=yaw_ij.device)[0].expand_as(yaw_ij)
     cos, sin = _unit(yaw_ij, forward).unbind(-1)
@@ -131,9 +130,9 @@ def matrix_from_yaw(yaw_ij: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 
 
 
 def direction_from_hemisphere(light: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
-    """Unit vector above the ground (world frame, y up) of the two numbers (x / y, z / y).
+    """Unit vector above the ground (world frame, y up) from (x / y, z / y).
 
-    Every pair of real numbers is a direction above the horizon, and straight up is (0, 0).
+    Every pair of real numbers gives a direction above the horizon; (0, 0) is straight up.
     """
     x, z = light.unbind(-1)
     vector = torch.stack([x, torch.ones_like(x), z], dim=-1)
@@ -149,9 +148,9 @@ def random_rotations(count: int, generator: np.random.Generator) -> Float[Tensor
 def rotation_between(
     source: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "... 3 3"]:
-    """The smallest rotation that turns the direction ``source`` into ``target`` (Rodrigues).
+    """The smallest rotation from the direction ``source`` to ``target`` (Rodrigues), whatever their lengths.
 
-    Opposite directions leave the axis open; there the result is not a rotation. Lengths do not matter.
+    For opposite directions the axis is undefined and the result is not a rotation.
     """
     source = source / torch.linalg.vector_norm(source, dim=-1, keepdim=True)
     target = target / torch.linalg.vector_norm(target, dim=-1, keepdim=True)
@@ -163,7 +162,7 @@ def rotation_between(
 
 
 def rotation_angle_deg(a: Float[Tensor, "*#batch 3 3"], b: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "..."]:
-    """Angle of the rotation between two, in [0, 180] degrees.
+    """Angle of the relative rotation, in [0, 180] degrees.
 
     atan2 of sine and cosine is exact at both ends, where the usual arccos((trace - 1) / 2) loses half its digits.
     """

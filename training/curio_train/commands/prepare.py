@@ -33,7 +33,7 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
     if isinstance(config.world, LinemodOptions):
         _refuse_unreadable(config.world)
     if isinstance(options, CaptureOptions):
-        from curio_train.doctor.before_training import refuse_unfit
+        from curio_train.doctor.examine import refuse_unfit
 
         for doubt in refuse_unfit(options):
             warn(doubt)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from curio_train.config import RunConfig
 from curio_train.learning.parallel import Ranks
-from curio_train.learning.prefetch import Prefetcher
+from curio_train.learning.prefetch import Prefetcher, prefetching
 from curio_train.learning.self_training import SelfTraining
 from curio_train.metrics.assignment import canonical
 from curio_train.scene_code import SceneCode
@@ -62,7 +62,7 @@ class SyntheticBatches:
         if self._config.terms.reads_images:
             yield
             return
-        with Prefetcher(self._draw, self._ranks.size) as self._prefetcher:
+        with prefetching(self._draw, self._ranks.size) as self._prefetcher:
             try:
                 yield
             finally:

@@ -14,10 +14,9 @@ from torch import Tensor
 
 from curio_train.config import RunConfig
 from curio_train.errors import TrainingError, UsageError
-from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, gradient_penalty
-from curio_train.learning.losses import image_loss
+from curio_train.learning.hardware import autocast
+from curio_train.learning.losses import critic_loss, curiosity_loss, frozen, gradient_penalty, image_loss
 from curio_train.learning.parallel import Ranks
-from curio_train.learning.precision import autocast
 from curio_train.learning.recoloring import recolored
 from curio_train.learning.self_training import SelfTraining
 from curio_train.learning.sleep import SyntheticBatches, scheduled_stage
@@ -73,7 +72,7 @@ class Trainer:
         self.config, self.world, self.ranks = config, world, ranks
         self.state = TrainState(config, world, ranks.device)
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
-        self._micro_batches = ranks.share(self._num_micro)
+        self._micro_batches = ranks.micro_batches(self._num_micro)
         self._stages = [Stage(*parts) for parts in zip(world.stages, self.state.stages, sources, strict=True)]
         network, fraction = self.state.pose.network, config.recipe.self_training
         self_training = SelfTraining(network, world, fraction, ranks.device, pretrained=config.init is not None)

@@ -1,6 +1,7 @@
 """Virtual crop cameras in torch: perspective-correct crops of a frame, inside an exported graph as well.
 
-K is in pixels with pixel centres at integer coordinates, the camera frame is OpenCV's: x right, y down, z forward, metres.
+K is in pixels with pixel centres at integer coordinates; the camera frame is OpenCV's: x right, y down, z forward, in
+metres.
 """
 
 from typing import NamedTuple

@@ -1,10 +1,11 @@
-"""One sitting of training: from a configuration to a run folder, new or resumed."""
+"""One session of training: from a configuration to a run folder, new or resumed."""
 
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Literal
 
 from curio_train.config import RunConfig
+from curio_train.learning.hardware import choose_threads
 from curio_train.learning.loop import Outcome, train
 from curio_train.learning.parallel import ranks
 from curio_train.learning.runs.checkpoint import RunFolder
@@ -13,7 +14,6 @@ from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.progress import reporting
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress
-from curio_train.learning.threads import choose_threads
 from curio_train.learning.trainer import Trainer
 from curio_train.worlds import build
 
@@ -34,19 +34,19 @@ def learn(
         config: What to learn; of a resumed run, its own (see ``configuration.refuse_other``).
         path: The run folder.
         interruption: How signals arrive.
-        resume: Go on from the folder's last checkpoint instead of starting a run.
-        cache: Where worlds keep the image sets they draw once.
+        resume: Continue from the folder's last checkpoint instead of starting a run.
+        cache: Folder of the image sets that worlds draw once.
         device: See ``parallel.ranks``.
         checkpoint_minutes: Minutes of training between checkpoints.
 
     Returns:
-        Why training ended, and how far it came.
+        Why training ended, and the run's progress.
 
     Raises:
         CurioError: Any of this package's errors; checkpoints that were written stay.
     """
     with ranks(device) as here:
-        # The world comes first: what is wrong with its data shows before a run folder is there.
+        # The world comes first, so that an error in its data leaves no run folder behind.
         world = build(config.world)
         sources = [
             stage.source("train", config.seed, with_code=config.terms.label, cache=cache) for stage in world.stages

@@ -1,9 +1,9 @@
 """Network of the crop-pose stage: pose and light of one object that fills a crop.
 
-Its auxiliary output are dense object coordinates: for each of 16x16 patches, whether the object is visible there and
-which of its points (as in Wang et al. 2021, "GDR-Net"). These 1,024 numbers an image train the features long before the
-nine numbers of a pose can. Each of 8x8 cells then predicts the whole pose and a weight; the result is the weighted mean.
-Every cell that sees the object has a loss of its own (after Wang et al. 2019, "DenseFusion").
+Dense object coordinates are an auxiliary output: for each of 16x16 patches, whether the object is visible there and
+which of its points (as in Wang et al. 2021, "GDR-Net"). These 1,024 numbers an image train the features long before
+the nine numbers of a pose can. Each of 8x8 cells then predicts the whole pose and a weight; the result is the weighted
+mean. Every cell that sees the object has a loss of its own (after Wang et al. 2019, "DenseFusion").
 """
 
 import torch
@@ -17,8 +17,9 @@ from curio_train.scene_code import ROTATION_6D, TRANSLATION, Layout
 
 OBJECT_COORDINATES = "surface"
 """Key beside the code that ``CropPoseNetwork.decode`` returns: [batch, 4, 16, 16], the object's point that each patch
-sees (three coordinates, in half extents from the middle of its box), then the logit of seeing the object at all. Position
-and rotation as predicted by each cell are under :func:`~curio_train.networks.grid.per_cell` [batch, cells, size]."""
+sees (three coordinates, in half extents from the middle of its box), then the logit of seeing the object at all.
+Position and rotation as predicted by each cell are under :func:`~curio_train.networks.grid.per_cell`
+[batch, cells, size]."""
 
 OBJECT_COORDINATES_STRIDE = 4
 """Side of a patch in pixels."""

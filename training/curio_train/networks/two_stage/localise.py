@@ -15,8 +15,8 @@ from curio_train.networks.layers import convolution
 from curio_train.scene_code import TRANSLATION
 
 PROPOSALS, HEAT_MAP = "proposals_m", "heat_map_logits"
-"""Keys beside the position that ``LocalisationNetwork.decode`` returns: the proposal of each cell [batch, cells, 3], and
-the logits of the centre heat map [batch, cells]."""
+"""Keys beside the position that ``LocalisationNetwork.decode`` returns: the proposal of each cell [batch, cells, 3],
+and the logits of the centre heat map [batch, cells]."""
 TOP_PROPOSALS, TOP_LOG_WEIGHTS = "top_proposals_m", "top_log_weights"
 """Keys of the likeliest proposals that are not neighbours [batch, NUM_TOP, 3], and of the logarithm of the heat around
 each [batch, NUM_TOP]."""

@@ -57,8 +57,8 @@ class TwoStageNetwork(nn.Module):
     """Whole frame to scene code, all in one graph.
 
     The crop-pose stage runs on a crop around each top proposal. The proposal with the highest sum of log weight and
-    visibility then goes through a refinement pass: crops at three assumed distances around the estimated position. Their
-    errors are nearly independent, so the final position is their mean.
+    visibility then goes through a refinement pass: crops at three assumed distances around the estimated position.
+    Their errors are nearly independent, so the final position is their mean.
     """
 
     first: StageNetwork

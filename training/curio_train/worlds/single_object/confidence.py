@@ -33,17 +33,17 @@ def calibrate(network: nn.Module, world: SingleObjectWorld, cache: Path) -> None
     for step in range(steps):
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
-        code, signs = network.uncalibrated(batch.images.clamp(0, 1))
+        code, features = network.uncalibrated(batch.images.clamp(0, 1))
         errors = map(add_or_add_s_m, poses(code), poses(batch.code), repeat(points), repeat(kind.info))
         right += [error < ADD_THRESHOLD * kind.diameter_m for error in errors]
-        full.append(signs)
+        full.append(features)
         behind = source.backgrounds(steps + step, _BATCH_SIZE)
         assert behind is not None  # of a gaze's world there always are
         empty.append(network.uncalibrated(behind.clamp(0, 1))[1])
-    network.rightness.copy_(_fit([signs.pose_correct for signs in full], right))
+    network.rightness.copy_(_fit([features.pose_correct for features in full], right))
     there = [True] * _NUM_FRAMES + [False] * _NUM_FRAMES
-    network.presence.copy_(_fit([signs.presence for signs in (*full, *empty)], there))
+    network.presence.copy_(_fit([features.presence for features in (*full, *empty)], there))
 
 
-def _fit(signs: list[Tensor], is_so: list[bool]) -> Tensor:
-    return torch.tensor(fit_calibration(torch.cat(signs).cpu().numpy(), is_so))
+def _fit(features: list[Tensor], correct: list[bool]) -> Tensor:
+    return torch.tensor(fit_calibration(torch.cat(features).cpu().numpy(), correct))
