@@ -186,7 +186,7 @@ def test_streams_end_when_the_process_takes_too_much(
     make_desk: Callable[..., Desk], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = 0
-    monkeypatch.setattr(module, "resident_bytes", lambda: size)
+    monkeypatch.setattr(module.memory, "resident_bytes", lambda: size)
     desk, stream, call = make_desk(process_bytes=1000), Caller(), Caller()
     ended, kept = desk.call(stream, is_stream=True), desk.call(call)
     assert stream.is_reading.wait(30)
@@ -199,10 +199,10 @@ def test_streams_end_when_the_process_takes_too_much(
     assert kept.result(30) == b"kept"
 
 
-def test_the_resident_memory_is_measured() -> None:
-    before = module.resident_bytes()
-    held = bytearray(b"x" * (64 << 20))
-    assert module.resident_bytes() > before + (32 << 20)
-    del held
-    module.give_back_memory()
-    assert module.resident_bytes() < before + (32 << 20)
+def test_freed_memory_is_returned() -> None:
+    before = module.memory.resident_bytes()
+    held = [b"x" * 10_000 for _ in range(10_000)]
+    assert module.memory.resident_bytes() > before + (50 << 20)
+    held.clear()
+    module.memory.give_back()
+    assert module.memory.resident_bytes() < before + (50 << 20)

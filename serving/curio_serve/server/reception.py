@@ -1,33 +1,31 @@
 """Bounds the memory that arriving and waiting messages take, and the time that they may take to arrive.
 
 gRPC tells the length of a message only once it is there. So a call reserves memory for the longest message before it
-reads its own, keeps as much as its message takes, and gives that back when it ends. A call without memory waits; the
-connection that holds least comes first.
+reads its own, keeps as much as its message takes, and gives that back when it ends. A call without memory waits;
+connections come first whose messages have arrived before, and among them the one that holds least.
 
 A stream may be idle for long, so it reserves nothing before a message is there. If the whole process takes too much
 memory, the streams that are waiting for messages are ended.
 """
 
-import ctypes
 import logging
-import resource
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import grpc
 
 from curio_serve.api.admission import Place
 from curio_serve.errors import CallCancelled
+from curio_serve.server import memory
 from curio_serve.telemetry import log
 
 _TICK_S = 0.1
 # While other calls wait for memory, a message has to arrive within this time.
 _HURRIED_S = 1.0
-_STATM = Path("/proc/self/statm")
+_MOST_PROVEN = 4096
 
 
 @dataclass(frozen=True)
@@ -72,6 +70,7 @@ class Reception:
         self._lock = threading.Lock()
         self._free = max(limits.held_bytes, limits.message_bytes)
         self._held: Counter[str] = Counter()  # bytes of each connection
+        self._proven: dict[str, None] = {}  # connections whose messages have arrived, oldest first
         self._waiting: list[_Arrival] = []
         self._arriving: set[_Arrival] = set()
         self._stopped = threading.Event()
@@ -124,7 +123,19 @@ class Reception:
         finally:
             self._arriving.discard(arrival)
         self._release(arrival, arrival.num_bytes - len(data))
+        if arrival.peer not in self._proven:
+            self._prove(arrival.peer)
         return data
+
+    def _prove(self, peer: str) -> None:
+        with self._lock:
+            if len(self._proven) >= _MOST_PROVEN:
+                del self._proven[next(iter(self._proven))]
+            self._proven[peer] = None
+
+    def _rank(self, waiting: _Arrival) -> tuple[bool, int]:
+        """Who comes first when there is memory: connections that have delivered, then those that hold least."""
+        return waiting.peer not in self._proven, self._held[waiting.peer]
 
     def _reserve(self, arrival: _Arrival) -> None:
         """Reserve memory for the longest message, if need be after others."""
@@ -163,7 +174,7 @@ class Reception:
             if not self._held[arrival.peer]:
                 del self._held[arrival.peer]
             while self._waiting and self._free >= self._limits.message_bytes:
-                following = min(self._waiting, key=lambda waiting: self._held[waiting.peer])
+                following = min(self._waiting, key=self._rank)
                 self._waiting.remove(following)
                 self._grant(following)
                 following.place.wake()
@@ -182,10 +193,10 @@ class Reception:
     def _relax(self) -> None:
         """End the waiting streams if the process takes too much memory."""
         most = self._limits.process_bytes
-        if most is None or resident_bytes() <= most:
+        if most is None or memory.resident_bytes() <= most:
             return
-        give_back_memory()
-        if resident_bytes() <= most:
+        memory.give_back()
+        if memory.resident_bytes() <= most:
             return
         streams = [arrival for arrival in self._arriving.copy() if arrival.is_stream]
         if streams:
@@ -197,15 +208,3 @@ class Reception:
     def _end(arrival: _Arrival) -> None:
         arrival.is_late = True
         arrival.context.cancel()
-
-
-def resident_bytes() -> int:
-    """Memory of this process."""
-    return int(_STATM.read_text().split()[1]) * resource.getpagesize()
-
-
-def give_back_memory() -> None:
-    """Have the C library return freed memory to the operating system; glibc keeps what is freed in pieces."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)

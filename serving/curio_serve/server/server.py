@@ -23,6 +23,7 @@ from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.models.model import Runtime
 from curio_serve.models.model_check import ChildCheck
 from curio_serve.models.repository import Change, Repository
+from curio_serve.server import memory
 from curio_serve.server.config import ServeConfig
 from curio_serve.server.reception import Reception, ReceptionLimits
 from curio_serve.server.security import TokenInterceptor, Tokens, read_tokens, server_credentials
@@ -75,6 +76,7 @@ class PoseServer:
         """
         # Frames run in parallel already, one a core; OpenCV's own threads would only get in their way.
         cv2.setNumThreads(1)
+        memory.bound_heaps()
         self._report(self._repository.refresh())
         if not list(self._repository):
             raise ModelError(
@@ -219,6 +221,8 @@ def channel_options(config: ServeConfig) -> list[tuple[str, int]]:
         # The part of --max-calls that one connection may have. Well above the queue: a call that is refused early
         # counts until its client knows, and calls beyond this limit are reset without the time to come back.
         ("grpc.max_concurrent_streams", 512),
+        # Before a message is asked for, 64 kB of it are received; with probing it would be megabytes of each call.
+        ("grpc.http2.bdp_probe", 0),
         # Half-open connections are found out; idle clients may ping, but not more often than every 10 s.
         ("grpc.keepalive_time_ms", 60_000),
         ("grpc.keepalive_timeout_ms", 20_000),
