@@ -42,9 +42,9 @@ def raw_frames(address: str, seconds: float, num_callers: int = 40) -> int:
 
 def much_work(address: str, seconds: float) -> int:
     """Small messages that ask for 16 models times 64 regions, with deadlines of half a second; the number sent."""
-    regions = [Region(x=0, y=0, width=640, height=480)] * 64
+    regions = [Region(x=0, y=0, width=128, height=96)] * 64
     raw = RawImage(format=PIXEL_FORMAT_RGB8, width=128, height=96, data=bytes(128 * 96 * 3))
-    camera = Camera(camera_matrix=np.ravel(K) / 5)
+    camera = Camera(camera_matrix=np.ravel(np.diag([0.2, 0.2, 1]) @ K))
     request = DetectRequest(models=[ModelSelector(name=MODEL)] * 16, camera=camera, raw=raw, regions=regions)
     data = request.SerializeToString()
     return _repeat(address, seconds, 8, lambda channel: channel.unary_unary(_DETECT)(data, timeout=0.5))

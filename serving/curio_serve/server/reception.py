@@ -2,7 +2,7 @@
 
 gRPC tells the length of a message only once it is there. So a call reserves memory for the longest message before it
 reads its own, keeps as much as its message takes, and gives that back when it ends. A call without memory waits;
-connections come first whose messages have arrived before, and among them the one that holds least.
+the connection that holds least comes first, and among equals one whose messages have arrived before.
 
 A stream may be idle for long, so it reserves nothing before a message is there. If the whole process takes too much
 memory, the streams that are waiting for messages are ended.
@@ -133,9 +133,9 @@ class Reception:
                 del self._proven[next(iter(self._proven))]
             self._proven[peer] = None
 
-    def _rank(self, waiting: _Arrival) -> tuple[bool, int]:
-        """Who comes first when there is memory: connections that have delivered, then those that hold least."""
-        return waiting.peer not in self._proven, self._held[waiting.peer]
+    def _rank(self, waiting: _Arrival) -> tuple[int, bool]:
+        """Sorts the waiting: connections that hold least come first, and among them those that have delivered."""
+        return self._held[waiting.peer], waiting.peer not in self._proven
 
     def _reserve(self, arrival: _Arrival) -> None:
         """Reserve memory for the longest message, if need be after others."""
