@@ -1,4 +1,5 @@
-"""The paper's Table 4 on stand-ins for its captures: make photographs, learn from them, judge from a second camera.
+"""The paper's Table 4 on synthetic captures for its captures: make photographs, learn from them, judge from a second
+camera.
 
     python benchmarks/captures.py [--only sphere_real] [--methods noncur our] [--images 16000] [--jobs 2] [--dry-run]
 

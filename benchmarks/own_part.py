@@ -2,10 +2,10 @@
 
     python benchmarks/own_part.py [--minutes 26.5] [--photos 200] [--tests 50] [--out runs/own_part] [--json]
 
-An unpainted STL, 200 path traced photographs of it on a table, a plate and a camera file, calibrated from photographs
-of a chessboard, are made first (see ``benchmarks/make_captures.py``); what is there already is kept. Then the installed
-commands look at the files, train and export, and detect in 50 photographs that nothing has seen. The last line is the
-result, also in OUT/own_part.json:
+An unpainted STL, 200 path traced photographs of it on a table, a background image and a camera file, calibrated from
+photographs of a chessboard, are made first (see ``benchmarks/make_captures.py``); what is there already is kept. Then
+the installed commands look at the files, train and export, and detect in 50 photographs that nothing has seen. The last
+line is the result, also in OUT/own_part.json:
 
 right       share of the unseen photographs in which ADD(-S) is below a tenth of the diameter
 add_median  of ADD(-S), in diameters

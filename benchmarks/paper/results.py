@@ -45,7 +45,7 @@ _M_PER_MM = 1e-3
 
 
 def method_name(method: str, labels: float, reading: str) -> str:
-    """The name of a row: of supervision with its share of labels, of images read by cells with those."""
+    """The name of a row: of supervision with its share of labels, of images read by the dense decoder with those."""
     of_method = f"super_{labels:g}" if labels not in (0, 1) else REFERENCE if method == "super" else method
     return of_method if reading == "whole" else f"{of_method}_{reading}"
 

@@ -23,7 +23,7 @@ _LAMP_RADIANCE, _SKY_RADIANCE = (60.0, 56.0, 49.0), (0.5, 0.53, 0.6)
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
+class SyntheticObject:
     """An object of a scene.
 
     Attributes:
@@ -40,7 +40,7 @@ class PathTracedScene:
 
     def __init__(
         self,
-        things: Sequence[Thing],
+        objects: Sequence[SyntheticObject],
         table_srgb: np.ndarray,
         table_side_m: float,
         camera_matrix: np.ndarray,
@@ -68,7 +68,7 @@ class PathTracedScene:
         self._mitsuba = load_mitsuba()
         self._vertices = []
         shapes = {}
-        for number, thing in enumerate(things):
+        for number, thing in enumerate(objects):
             shapes[f"thing_{number}"], vertices = self._shape(f"thing_{number}", thing)
             self._vertices.append(vertices)
         pinhole = sensor(self._mitsuba, camera_matrix, *size, samples_per_pixel)
@@ -105,7 +105,7 @@ class PathTracedScene:
         image = np.array(mitsuba.render(self._scene, seed=seed), dtype=np.float32)
         return image[..., :3]
 
-    def _shape(self, name: str, thing: Thing) -> tuple[Any, np.ndarray]:
+    def _shape(self, name: str, thing: SyntheticObject) -> tuple[Any, np.ndarray]:
         """A glossy ``mitsuba.Mesh`` and its vertices [v, 3], doubled along folds. Normals follow the vertices."""
         mesh, mitsuba = thing.mesh, self._mitsuba
         source, faces, _ = smooth_normals(mesh.vertices_m, adjacency(mesh.vertices_m / mesh.diameter_m, mesh.faces))
@@ -135,7 +135,7 @@ class PathTracedScene:
 
     def _lamp(self, side_m: float) -> dict[str, Any]:
         """A square lamp to one side above the table, a fifth of its side wide."""
-        look = self._mitsuba.ScalarTransform4f().look_at(
+        look = self._mitsuba.ScalarTransform4f().measure(
             origin=[-0.35 * side_m, 0.6 * side_m, 0.25 * side_m], target=[0, 0, 0], up=[0, 0, 1]
         )
         radiance = {"type": "area", "radiance": {"type": "rgb", "value": list(_LAMP_RADIANCE)}}

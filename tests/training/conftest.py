@@ -1,4 +1,4 @@
-"""Run folders for what comes after training, and a gaze at a brick."""
+"""Run folders for what comes after training, and a two-stage network at a brick."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -58,5 +58,5 @@ def brick() -> Object:
 
 @pytest.fixture(scope="session")
 def brick_world(brick: Object) -> TwoStageWorld:
-    """The two looks at it."""
+    """The two stages at it."""
     return TwoStageWorld("linemod", brick)

@@ -1,4 +1,4 @@
-"""Intrinsics: what is refused and why, half pixels, and the gaze's homography."""
+"""Intrinsics: what is refused and why, half pixels, and the two-stage network's homography."""
 
 import json
 from pathlib import Path

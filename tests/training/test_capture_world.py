@@ -1,4 +1,4 @@
-"""A part of one's own: an STL, a camera file, photographs and a plate become a world that can be learned."""
+"""A part of one's own: an STL, a camera file, photographs and a background image become a world that can be learned."""
 
 import json
 import shutil
@@ -34,7 +34,7 @@ WIDTH, HEIGHT = 160, 120
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An unpainted bracket in millimetres, symmetric under half a turn; twelve photographs, a plate, clutter."""
+    """An unpainted bracket in millimetres, symmetric under half a turn; twelve photographs, a background image, clutter."""
     root = tmp_path_factory.mktemp("part")
     base = trimesh.creation.box((80, 40, 20))
     tower = trimesh.creation.box((20, 20, 50))
@@ -138,7 +138,7 @@ def test_backgrounds_are_the_plate_and_clutter(folder: Path, world: Capture, cac
     small = torch.from_numpy(cv2.resize(plate, (WIDTH // 4, HEIGHT // 4), interpolation=cv2.INTER_AREA) / 255)
     flat = torch.cat([frames.flatten(1), small.permute(2, 0, 1).float().flatten()[None]])
     alike = torch.corrcoef(flat)[-1, :-1] > 0.7
-    assert 42 <= alike.sum() <= 58, "seventeen of twenty are the plate"
+    assert 42 <= alike.sum() <= 58, "seventeen of twenty are the background image"
     crops = world.stages[1].source("train", 0, with_code=False, cache=cache).backgrounds(0, 8)
     assert crops.shape == (8, 3, 64, 64)
 
@@ -263,7 +263,7 @@ def test_from_files_to_a_model_by_a_project_file(
     """The whole way, three steps long; the report shows photographs beside what was found in them."""
     project = folder / "bracket.toml"
     project.write_text(
-        'mesh = "bracket.stl"\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "photos"\nbackground = "plate.png"\n'
+        'mesh = "bracket.stl"\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "photos"\nbackground = "background image.png"\n'
         "upright = true\nimages = 1200\nbatch-size = 4\nmicro-batch-size = 4\n"
     )
     run = tmp_path / "run"
@@ -278,7 +278,7 @@ def test_from_files_to_a_model_by_a_project_file(
     assert (config.images, config.recipe.batch_size) == (12, 4)
     report = (run / "report.html").read_text()
     assert 'id="photographs"' in report
-    assert "what was found covers what differs from the plate" in report
+    assert "what was found covers what differs from the background image" in report
     assert str(folder) not in (run / "models" / "bracket" / "CARD.md").read_text()
     with pytest.raises(UsageError, match="run folder"):
         load_subject(run / "models" / "bracket" / "1")

@@ -205,7 +205,7 @@ def test_some_raw_frames_saved_as_bgr(files: Files) -> None:
     assert "11 of 64" in finding.text
 
 
-# Faults of the background plate.
+# Faults of the background image.
 
 
 def other_scene() -> np.ndarray:

@@ -22,8 +22,8 @@ from curio_train.export.graph import (
     check_images,
     export,
     largest_difference,
+    numerically_stable,
     refuse_disparity,
-    settled,
 )
 from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
@@ -148,8 +148,8 @@ def test_versions_stand_beside_each_other(single: Exported, half: Exported, mode
 
 def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Exported, tmp_path: Path) -> None:
     spec = ExportedModel.open(single.path / "model.onnx").spec
-    config, course = RunConfig(CirclesOptions(), method="noncur"), TrainingProgress(step=2, images=64, seconds=1.5)
-    made = Provenance(tmp_path, config, this_session(), course, "float32")
+    config, progress = RunConfig(CirclesOptions(), method="noncur"), TrainingProgress(step=2, images=64, seconds=1.5)
+    made = Provenance(tmp_path, config, this_session(), progress, "float32")
     result = {"split": "test", "num_images": 500, "metrics": {"position_px": 1.25}, "untrained": {"position_px": 40.0}}
     for images_seen, quoted in ((32, False), (64, True)):
         (tmp_path / EVALUATION_FILE).write_text(json.dumps(result | {"images_seen": images_seen}))
@@ -169,9 +169,9 @@ def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Expor
 def test_commands_on_cards_name_no_folder_of_a_machine() -> None:
     typed = "curio-train linemod --data /mnt/a b/lmo --out=/data/runs/ape --init ~/ape --class ape --cache ../c"
     words = ["curio-train", "linemod", "--data", "/mnt/a b/lmo", *typed.split()[5:]]
-    told = "curio-train linemod --data lmo --out=ape --init ape --class ape --cache ../c"
-    assert portable(shlex.join(words)) == told
-    assert portable(told) == told
+    scales = "curio-train linemod --data lmo --out=ape --init ape --class ape --cache ../c"
+    assert portable(shlex.join(words)) == scales
+    assert portable(scales) == scales
 
 
 def test_disagreement_is_refused_and_leaves_nothing(tmp_path: Path, write_run: WriteRun) -> None:
@@ -201,9 +201,9 @@ def test_images_on_which_rounding_decides_can_tell_nothing() -> None:
     graph = Graph(_Brighter(), Circles())
     images = torch.zeros(8, 128, 128, 3, dtype=torch.uint8)
     images[:5, :, 64:] = 100
-    assert settled(graph, images).tolist() == [True] * 5 + [False] * 3
+    assert numerically_stable(graph, images).tolist() == [True] * 5 + [False] * 3
     with pytest.raises(ExportError, match=r"answers to 7 of 8 check images"):
-        settled(graph, images[[0, 5, 6, 7, 5, 6, 7, 5]])
+        numerically_stable(graph, images[[0, 5, 6, 7, 5, 6, 7, 5]])
 
 
 class _Surer(torch.nn.Module):
@@ -226,7 +226,7 @@ def test_layers_that_rounding_decides_can_tell_nothing(difference: float, expect
     """Two cells are moved alike by any pixel, so pixels do not tell; where all is black they differ by all they say."""
     images = torch.full((8, 128, 128, 3), 200, dtype=torch.uint8)
     images[4:] = 0
-    assert settled(Graph(_Surer(difference), Circles()), images).sum() == expected
+    assert numerically_stable(Graph(_Surer(difference), Circles()), images).sum() == expected
 
 
 def test_weights_too_large_for_half_are_refused(tmp_path: Path, write_run: WriteRun) -> None:

@@ -1,4 +1,4 @@
-"""The gaze: crops are what a turned camera would see, and what is read in them is turned back."""
+"""The two-stage network: crops are what a turned camera would see, and what is read in them is turned back."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -73,7 +73,7 @@ def test_the_canonical_camera_is_the_frames_own_at_most_640_pixels_long(brick: O
 def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(brick_world: TwoStageWorld) -> None:
     """A frame is rendered, looked at where the object is, and the crop compared with one rendered as a crop.
 
-    Told the truth about the crop, the gaze must answer the truth about the frame.
+    Told the truth about the crop, the two-stage network must answer the truth about the frame.
     """
     code = brick_world.sample(6, (5,))
     code[TRANSLATION][..., 2] = code[TRANSLATION][..., 2].clamp(0.62, 0.8)  # near enough, and so if taken nearer
@@ -205,7 +205,8 @@ class Bright(StageNetwork):
 
 
 def test_of_several_candidates_the_likeliest_is_answered(brick_world: TwoStageWorld) -> None:
-    """Two frames, each bright at another of three candidates; then a first look that knows better than the second."""
+    """Two frames, each bright at another of three candidates; then a localisation stage that knows better than the
+    second."""
     candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8], [0.0, 0.2, 1.2]]).expand(2, 3, 3)
     pixels = project(candidates, torch.from_numpy(brick_world.camera.matrix).float()[None]).round().int()
     frames = torch.zeros(2, 3, 480, 640)
@@ -291,7 +292,8 @@ def test_top_proposals_are_apart_and_the_likeliest_comes_first(brick_world: TwoS
 
 
 def test_colours_differ_least_where_they_tell_most(brick: Object, brick_world: TwoStageWorld) -> None:
-    """The first look, and all looks at a known scene, see milder light than the second look at an unknown one."""
+    """The localisation stage, and all looks at a known scene, see milder light than the crop-pose stage at an unknown
+    one."""
     first, second = brick_world.stages
     known = TwoStageWorld("capture", replace(brick, known_scene=True))
     spread = {

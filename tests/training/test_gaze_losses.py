@@ -1,4 +1,5 @@
-"""What the two looks of a gaze are taught: each cell what it can know, confidence whether the answer is right."""
+"""What the two stages of a two-stage network are taught: each cell what it can know, confidence whether the answer is
+right."""
 
 import torch
 from curio_train.config import NetworkConfig

@@ -132,7 +132,7 @@ def test_unknown_class_and_missing_data_are_named(data, tmp_path):
 
 
 def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
-    with pytest.raises(UsageError, match=r"--photos .*leave out --no-gaze"):
+    with pytest.raises(UsageError, match=r"--photos .*leave out --no-two-stage network"):
         build(LinemodOptions("ape", data, photographs, photos=photographs, gaze=False))
     read = []
 

@@ -40,7 +40,7 @@ def test_where_things_ever_were_is_told_from_noise_and_exposure() -> None:
     random = np.random.default_rng(0)
     plate = random.integers(100, 140, (3, 64, 64)).astype(np.uint8)
     photographs = [(plate * random.uniform(0.95, 1.05)).clip(0, 255).astype(np.uint8) for _ in range(20)]
-    with pytest.raises(DataError, match="nothing but the plate"):
+    with pytest.raises(DataError, match="nothing but the background image"):
         ever_changed(photographs, [plate] * 20)
     for number, photograph in enumerate(photographs):
         photograph[:, 20:30, 2 * number : 2 * number + 8] = 20
@@ -56,7 +56,7 @@ def test_where_things_ever_were_is_told_from_noise_and_exposure() -> None:
         (None, "cannot be read"),
         ("{", "not JSON"),
         ("[1]", "expected an object"),
-        ("{}", r"says nothing of plate\.png"),
+        ("{}", r"says nothing of background image\.png"),
         (json.dumps({"plate.png": {"cam_from_world": [[1, 2], [3, 4]]}}), r"shape \(2, 2\)"),
         (json.dumps({"plate.png": {"cam_from_world": "here"}}), "no matrix"),
         (json.dumps({"plate.png": {"cam_from_world": np.diag([2, 2, 2, 1]).tolist()}}), "not rigid"),

@@ -178,9 +178,9 @@ def test_the_sweep_keeps_what_other_worlds_and_earlier_calls_found(
     results = json.loads((tmp_path / "curiosity.json").read_text())
     assert {world: {name: row["para"] for name, row in rows.items()} for world, rows in results.items()} == {
         "circles": {"our": 1.5, "noncur": 3.5},
-        "spheres, read by cells": {"noncur": 2.5},
+        "spheres, read by the dense decoder": {"noncur": 2.5},
     }
-    assert "## Spheres, read by cells" in (tmp_path / "curiosity.md").read_text()
+    assert "## Spheres, read by the dense decoder" in (tmp_path / "curiosity.md").read_text()
 
 
 def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

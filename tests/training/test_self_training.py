@@ -1,4 +1,5 @@
-"""What a gaze is taught of photographs agrees with what they show, and nothing is taught of what was not found."""
+"""What a two-stage network is taught of photographs agrees with what they show, and nothing is taught of what was not
+found."""
 
 from pathlib import Path
 

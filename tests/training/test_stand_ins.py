@@ -26,7 +26,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_labels_say_where_things_are_seen(capture: Path) -> None:
-    """Against the empty plate, each sphere is where its pose and the true camera put it."""
+    """Against the empty background image, each sphere is where its pose and the true camera put it."""
     labels = json.loads((capture / "labels" / "test.json").read_text())
     views = json.loads((capture / "views.json").read_text())
     for file, things in labels["photographs"].items():

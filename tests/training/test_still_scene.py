@@ -1,4 +1,4 @@
-"""Photographs of a still scene correct each other's readings, and nothing is made up where they do not agree."""
+"""Photographs of a static scene correct each other's readings, and nothing is made up where they do not agree."""
 
 import logging
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""Parts on a plane: STL files, photographs, plates and cameras become a world that is learned from the photographs."""
+"""Parts on a plane: STL files, photographs, background images and cameras become a world that is learned from the
+photographs."""
 
 import json
 from pathlib import Path
@@ -309,8 +310,8 @@ def test_from_files_to_a_model_by_a_project_file(folder: Path, tmp_path: Path, m
     monkeypatch.setattr("curio_train.worlds.image_sets.NUM_IMAGES", {"train": 4, "validation": 4, "test": 4})
     project = folder / "table.toml"
     project.write_text(
-        'mesh = ["wedge.stl"]\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "a"\nbackground = "plate-a.png"\n'
-        'plane = "views.json"\ncounts = [2]\nsecond = "b"\nsecond-background = "plate-b.png"\nmethod = "our"\n'
+        'mesh = ["wedge.stl"]\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "a"\nbackground = "background image-a.png"\n'
+        'plane = "views.json"\ncounts = [2]\nsecond = "b"\nsecond-background = "background image-b.png"\nmethod = "our"\n'
         "batch-size = 4\nmicro-batch-size = 4\n"
     )
     run = tmp_path / "run"

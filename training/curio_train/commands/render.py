@@ -48,9 +48,9 @@ def _render(command: RenderCommand) -> int:
     from curio_train.drawing.album import draw
     from curio_train.drawing.pictures import RenderOptions
 
-    wish = RenderOptions(
+    options = RenderOptions(
         command.height, command.turn_deg, command.over_photograph, command.path_traced, command.samples
     )
-    for path in draw(command.scenes, command.out, command.mesh, command.mesh_unit, command.world, wish):
+    for path in draw(command.scenes, command.out, command.mesh, command.mesh_unit, command.world, options):
         print(path)
     return 0

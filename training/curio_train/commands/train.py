@@ -125,7 +125,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     session = command.session
     config = command.config if session.resume else prepared(command.config, session.cache, warn, tell)
     path = session.resume or session.out or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
-    outcome, course = learn(
+    outcome, progress = learn(
         config,
         path,
         interruption,
@@ -135,8 +135,8 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         checkpoint_minutes=session.checkpoint_minutes,
     )
     if int(os.environ.get("RANK", "0")) == 0:
-        loss = "" if course.image_loss is None else f", image loss {course.image_loss:.4g}"
-        print(f"{path}: {outcome.value} after {course.images:,} images in {course.seconds / 60:.1f} minutes{loss}")
+        loss = "" if progress.image_loss is None else f", image loss {progress.image_loss:.4g}"
+        print(f"{path}: {outcome.value} after {progress.images:,} images in {progress.seconds / 60:.1f} minutes{loss}")
         if outcome is Outcome.INTERRUPTED:
             print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
         else:

@@ -1,7 +1,7 @@
 """Where photographs of a scene differ from a photograph of it empty, and where that is no more than a shadow.
 
-Each photograph is brought to the plate's exposure and white balance first. What clearly differs is parts and their
-shadows; what is merely darker than the plate, in the plate's own tint, is a shadow.
+Each photograph is brought to the background image's exposure and white balance first. What clearly differs is parts and
+their shadows; what is merely darker than the background image, in the background image's own tint, is a shadow.
 """
 
 from typing import NamedTuple
@@ -12,22 +12,19 @@ from torch import Tensor
 from curio_train.color import linear_from_srgb, srgb_from_linear
 
 _LEAST_DIFFERENCE, _DEVIATIONS = 0.08, 6.0  # sRGB; what noise, vignettes and drifting light do not reach
-_SHADOW_TINT = 0.25  # how far the logarithms of a shadow's three ratios to the plate may lie apart
+_SHADOW_TINT = 0.25  # how far the logarithms of a shadow's three ratios to the background image may lie apart
 _LEAST_LIGHT = 1e-3
 
 
 class BackgroundDifference(NamedTuple):
-    """Photographs beside their plate.
-
-    Attributes:
-        difference: Largest of the three channels', sRGB, exposure allowed for.
-        differs: Where it is clear.
-        shaded: Where the photograph is the plate made darker.
-    """
+    """Photographs beside their background image."""
 
     difference: Float[Tensor, "num height width"]
+    """Largest of the three channels', sRGB, exposure allowed for."""
     differs: Bool[Tensor, "num height width"]
+    """Where it is clear."""
     shaded: Bool[Tensor, "num height width"]
+    """Where the photograph is the background image made darker."""
 
 
 def compare(

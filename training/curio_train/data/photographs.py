@@ -19,15 +19,12 @@ from curio_train.errors import DataError
 
 
 class CameraPoses(NamedTuple):
-    """Poses of the camera that took some photographs of one scene.
-
-    Attributes:
-        cam_from_world: Rigid, [num, 4, 4]; NaN for photographs whose camera pose is unknown.
-        in_metres: Whether translations are in metres; else the scene has an arbitrary scale.
-    """
+    """Poses of the camera that took some photographs of one scene."""
 
     cam_from_world: Float[np.ndarray, "num 4 4"]
+    """Rigid, [num, 4, 4]; NaN for photographs whose camera pose is unknown."""
     in_metres: bool = False
+    """Whether translations are in metres; else the scene has an arbitrary scale."""
 
     @property
     def known(self) -> Bool[np.ndarray, " num"]:
@@ -37,15 +34,12 @@ class CameraPoses(NamedTuple):
 
 
 class UnlabelledPhotographs(NamedTuple):
-    """Photographs that a world offers for self-training.
-
-    Attributes:
-        paths: Their files; at most :data:`MAX_UNLABELLED`.
-        cameras: Where the camera stood for each; None if unknown.
-    """
+    """Photographs that a world offers for self-training."""
 
     paths: Sequence[Path]
+    """Their files; at most :data:`MAX_UNLABELLED`."""
     cameras: CameraPoses | None = None
+    """Where the camera stood for each; None if unknown."""
 
 
 MAX_UNLABELLED = 300

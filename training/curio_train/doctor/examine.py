@@ -24,23 +24,20 @@ from curio_train.worlds.options import CaptureOptions
 
 @dataclass(frozen=True)
 class Subjects:
-    """What is to be looked at, in any combination; what belongs together is compared.
-
-    Attributes:
-        mesh: A mesh file.
-        mesh_unit: Of its coordinates; the file's own unless given.
-        camera: Camera JSON, or BOP's ``camera.json``.
-        photos: A folder of photographs, taken with that camera.
-        background: The empty scene, taken with that camera.
-        model: A model folder, a version's folder or an .onnx file, trained for that mesh.
-    """
+    """What is to be looked at, in any combination; what belongs together is compared."""
 
     mesh: Path | None = None
+    """A mesh file."""
     mesh_unit: Unit | None = None
+    """Of its coordinates; the file's own unless given."""
     camera: Path | None = None
+    """Camera JSON, or BOP's ``camera.json``."""
     photos: Path | None = None
+    """A folder of photographs, taken with that camera."""
     background: Path | None = None
+    """The empty scene, taken with that camera."""
     model: Path | None = None
+    """A model folder, a version's folder or an .onnx file, trained for that mesh."""
 
 
 def examine(subjects: Subjects, cache: Path) -> Iterator[Finding]:
@@ -99,7 +96,7 @@ _BROKEN = "photographs unreadable"  # all that matters about other scenes: they 
 
 
 def refuse_unfit(options: CaptureOptions) -> list[str]:
-    """Compare the meshes, the camera, the photographs and the plate; read every other background.
+    """Compare the meshes, the camera, the photographs and the background image; read every other background.
 
     Returns:
         What is doubtful about them, a line each.

@@ -7,7 +7,7 @@ from pathlib import Path
 from curio_train.camera import Intrinsics
 from curio_train.data.photographs import Photographs
 from curio_train.doctor.finding import Finding, State
-from curio_train.doctor.picture_content import Photograph, examine_content, look_at
+from curio_train.doctor.picture_content import Photograph, examine_content, measure
 from curio_train.errors import CurioError
 
 _FEWEST, _FEW = 10, 60
@@ -29,7 +29,7 @@ def examine_photographs(folder: Path, camera: Intrinsics | None) -> tuple[list[P
     photographs, broken = [], []
     for path in paths:
         try:
-            photographs.append(look_at(path))
+            photographs.append(measure(path))
         except CurioError as exc:
             broken.append(str(exc))
     findings = [*_unreadable(broken, len(paths))]

@@ -14,36 +14,33 @@ from curio_train.doctor.finding import Finding
 from curio_train.errors import CurioError
 
 THUMBNAIL_PX = 64
-_LOOKED_AT_PX = 640
+_MEASURED_PX = 640
 _BLACK, _WHITE = 3, 252
 
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A photograph's vital signs.
-
-    Attributes:
-        path: Its file.
-        width: As stored, pixels.
-        height: As stored, pixels.
-        orientation: EXIF's; 1 is as stored.
-        focal_35mm: EXIF's focal length on 35 mm film, or 0.
-        thumbnail: [64, 64, 3] float sRGB, 0 to 255.
-        blur: 0 sharp to 1 blurred (Crété-Roffet et al. 2007), at no more than 640 pixels a side.
-        lost: Share of the pixels that are black or white, and say nothing.
-    """
+    """A photograph's vital signs."""
 
     path: Path
+    """Its file."""
     width: int
+    """As stored, pixels."""
     height: int
+    """As stored, pixels."""
     orientation: int
+    """EXIF's; 1 is as stored."""
     focal_35mm: float
+    """EXIF's focal length on 35 mm film, or 0."""
     thumbnail: np.ndarray
+    """[64, 64, 3] float sRGB, 0 to 255."""
     blur: float
+    """0 sharp to 1 blurred (Crété-Roffet et al. 2007), at no more than 640 pixels a side."""
     lost: float
+    """Share of the pixels that are black or white, and say nothing."""
 
 
-def look_at(path: Path) -> Photograph:
+def measure(path: Path) -> Photograph:
     """Read a photograph once.
 
     Raises:
@@ -51,7 +48,7 @@ def look_at(path: Path) -> Photograph:
     """
     pixels = read_photograph(path)
     height, width = pixels.shape[:2]
-    scale = min(1.0, _LOOKED_AT_PX / max(width, height))
+    scale = min(1.0, _MEASURED_PX / max(width, height))
     small = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else pixels
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     orientation, focal = _exif(path)
@@ -85,7 +82,7 @@ def _exif(path: Path) -> tuple[int, float]:
 
 _BLURRED = 0.6  # sharp photographs of clutter: up to 0.45; blurred with a sigma of 2.5 pixels: 0.65 and more
 _TOLERATED = 0.1  # share of photographs
-_EQUAL_LEVELS = 4.0  # two frames of one still scene differ by more somewhere, if anything moved
+_EQUAL_LEVELS = 4.0  # two frames of one static scene differ by more somewhere, if anything moved
 _COMPARED = 60  # neighbours in brightness that each is compared with
 _MOSTLY_LOST = 0.6
 _BETTER_SWAPPED = 0.6
@@ -138,7 +135,7 @@ def _swapped(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     """Raw frames read as BGR here and RGB there: some look like the others only with red and blue exchanged."""
     thumbnails = np.stack([photo.thumbnail for photo in photographs])
     typical = np.median(thumbnails, axis=0)
-    swapped = [photo for photo in photographs if looks_swapped(photo.thumbnail, typical)]
+    swapped = [photo for photo in photographs if has_swapped_channels(photo.thumbnail, typical)]
     if 0 < len(swapped) < len(photographs):
         text = f"{len(swapped)} of {len(photographs)} have red and blue exchanged, for instance {swapped[0].path.name}"
         yield Finding(
@@ -151,7 +148,7 @@ def _swapped(photographs: Sequence[Photograph]) -> Iterator[Finding]:
         )
 
 
-def looks_swapped(picture: np.ndarray, reference: np.ndarray) -> bool:
+def has_swapped_channels(picture: np.ndarray, reference: np.ndarray) -> bool:
     """Whether a thumbnail is much closer to the reference with red and blue exchanged."""
     as_is = np.abs(picture - reference).mean()
     exchanged = np.abs(picture[..., ::-1] - reference).mean()
@@ -159,16 +156,16 @@ def looks_swapped(picture: np.ndarray, reference: np.ndarray) -> bool:
 
 
 _SAME_LEVEL = 20.0  # of 255: noise, shadows and reflections of the object stay below
-_OTHER_SCENE = 0.25  # share of the plate that may differ from most photographs
+_OTHER_SCENE = 0.25  # share of the background image that may differ from most photographs
 _UNLIKE_WHEN_SHIFTED_BACK = 0.6
 _MOST_COMPARED = 100
 
 
 def examine_background(path: Path, photographs: Sequence[Photograph]) -> Iterator[Finding]:
-    """Whether the plate can be read, and fits to photographs.
+    """Whether the background image can be read, and fits to photographs.
 
     Args:
-        path: The plate's file.
+        path: The background image's file.
         photographs: What was taken before it; nothing is compared where there are none.
     """
     try:
@@ -193,15 +190,15 @@ def _compare(plate: np.ndarray, photographs: Sequence[Photograph]) -> Iterator[F
     scene = np.median(seen, axis=0)
     if _unlike(scene, plate) <= _OTHER_SCENE:
         return
-    if looks_swapped(plate, scene):
-        text = "the plate fits to the photographs with red and blue exchanged"
+    if has_swapped_channels(plate, scene):
+        text = "the background image fits to the photographs with red and blue exchanged"
         remedy = "One of them was saved as BGR (OpenCV's order): save both as RGB"
         yield Finding("background colours", "bad", text, remedy, "likely", fault="swapped colours")
         return
     gain = np.median(scene + 1, axis=(0, 1)) / np.median(plate + 1, axis=(0, 1))
     if _unlike(scene, plate * gain) <= _OTHER_SCENE:
-        text = f"the photographs are {gain.mean():.2f} times as bright as the plate, which otherwise fits"
-        remedy = "Fix exposure and white balance, then take the plate again"
+        text = f"the photographs are {gain.mean():.2f} times as bright as the background image, which otherwise fits"
+        remedy = "Fix exposure and white balance, then take the background image again"
         yield Finding("background exposure", "warning", text, remedy, "likely", fault="background exposure")
         return
     yield _shifted_or_other(scene, plate)
@@ -214,10 +211,10 @@ def _shifted_or_other(scene: np.ndarray, plate: np.ndarray) -> Finding:
     carried = np.roll(plate, (round(down), round(right)), axis=(0, 1))
     if _unlike(scene, carried) < _UNLIKE_WHEN_SHIFTED_BACK * _unlike(scene, plate):
         across, along = (f"{step / THUMBNAIL_PX:.0%}" for step in (right, down))
-        text = f"the plate seems shifted by {across} of the width and {along} of the height"
-        remedy = "The camera was moved: take plate and photographs from one tripod position"
+        text = f"the background image seems shifted by {across} of the width and {along} of the height"
+        remedy = "The camera was moved: take background image and photographs from one tripod position"
         return Finding("background", "bad", text, remedy, "likely", fault="background shifted")
-    text = f"{_unlike(scene, plate):.0%} of the plate differs from what most photographs show there"
+    text = f"{_unlike(scene, plate):.0%} of the background image differs from what most photographs show there"
     remedy = "It is of another scene, light or camera position: take it again, or use --backgrounds"
     return Finding("background", "bad", text, remedy, "likely", fault="other background")
 

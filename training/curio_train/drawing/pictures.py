@@ -30,23 +30,20 @@ LIGHT = (-0.25, -0.45, -0.5)
 
 @dataclass(frozen=True, eq=False)
 class SceneContext:
-    """What a scene itself does not say.
-
-    Attributes:
-        meshes: By the object's name; the one named "" stands for every object without its own.
-        ambient: Radiance from everywhere.
-        light: Camera frame, towards the light [3], where the scene has none.
-        center_m: Camera frame, what the camera is carried round; None: the middle of the objects.
-        up: Camera frame, the axis that it is carried round.
-        ground: What the objects stand on, camera frame, or None.
-    """
+    """What a scene itself does not say."""
 
     meshes: Mapping[str, Mesh]
+    """By the object's name; the one named "" stands for every object without its own."""
     ambient: float = AMBIENT
+    """Radiance from everywhere."""
     light: np.ndarray | None = None
+    """Camera frame, towards the light [3], where the scene has none."""
     center_m: np.ndarray | None = None
+    """Camera frame, what the camera is carried round; None: the middle of the objects."""
     up: tuple[float, ...] = (0.0, -1.0, 0.0)
+    """Camera frame, the axis that it is carried round."""
     ground: Ground | None = None
+    """What the objects stand on, camera frame, or None."""
 
     @classmethod
     def of_world(cls, world: MeshWorld) -> "SceneContext":
@@ -75,21 +72,18 @@ class SceneContext:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How a scene is to be drawn.
-
-    Attributes:
-        height: Of the picture, pixels; None: the scene's own.
-        turn_deg: How far the camera is carried round the objects; 90 is the novel view of the paper's image error.
-        over_photograph: Draw over the photograph that the objects were found in.
-        path_traced: By stock Mitsuba's path tracer, with the light that surfaces give each other.
-        samples: A pixel.
-    """
+    """How a scene is to be drawn."""
 
     height: int | None = None
+    """Of the picture, pixels; None: the scene's own."""
     turn_deg: float = 0.0
+    """How far the camera is carried round the objects; 90 is the novel view of the paper's image error."""
     over_photograph: bool = False
+    """Draw over the photograph that the objects were found in."""
     path_traced: bool = False
+    """By stock Mitsuba's path tracer, with the light that surfaces give each other."""
     samples: int = 64
+    """A pixel."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be drawn."""
@@ -99,20 +93,20 @@ class RenderOptions:
             raise UsageError("--over-photograph and --turn-deg exclude each other: the photograph shows one side alone")
 
 
-def picture(scene: Scene, around: SceneContext, wish: RenderOptions) -> np.ndarray:
+def picture(scene: Scene, around: SceneContext, options: RenderOptions) -> np.ndarray:
     """Draw a scene: [height, width, 3] uint8 sRGB.
 
     Raises:
         DataError: An object without a mesh, or a photograph that is missing or of another size.
         RendererError: No usable libLLVM, or a mesh that cannot be rendered.
     """
-    scene, around = _resized(scene, wish.height), _with_light(scene, around)
-    behind = _photograph(scene) if wish.over_photograph else None
+    scene, around = _resized(scene, options.height), _with_light(scene, around)
+    behind = _photograph(scene) if options.over_photograph else None
     if behind is not None:
         around = replace(around, ground=None)
-    scene, around = _carried(scene, around, wish.turn_deg)
-    draw = _path_traced if wish.path_traced else _rendered
-    image = draw(scene, around, behind, wish.samples)
+    scene, around = _carried(scene, around, options.turn_deg)
+    draw = _path_traced if options.path_traced else _rendered
+    image = draw(scene, around, behind, options.samples)
     return np.asarray((image.clip(0, 1) * 255 + 0.5).astype(np.uint8))
 
 

@@ -23,44 +23,38 @@ EXPECTED = 'a line of curio-detect with "detections", or {"world": NAME, "code":
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """One object of a scene.
-
-    Attributes:
-        kind: Its name, by which its mesh is found.
-        pose: cam_from_obj, metres.
-        color_srgb: Albedo [3] that multiplies the mesh's own.
-        confidence: Its opacity.
-    """
+    """One object of a scene."""
 
     kind: str
+    """Its name, by which its mesh is found."""
     pose: Pose
+    """Cam_from_obj, metres."""
     color_srgb: tuple[float, ...] = (1.0, 1.0, 1.0)
+    """Albedo [3] that multiplies the mesh's own."""
     confidence: float = 1.0
+    """Its opacity."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Objects before a camera.
-
-    Attributes:
-        name: For the picture's file.
-        width: Of the image that the camera matrix belongs to, pixels.
-        height: Likewise.
-        camera_matrix: K [3, 3].
-        objects: In the camera's frame.
-        light: Camera frame, towards the light [3], or None: not known.
-        photograph: That the objects were found in, or None.
-        world: Name of the generated world that the scene is a code of, or None.
-    """
+    """Objects before a camera."""
 
     name: str
+    """For the picture's file."""
     width: int
+    """Of the image that the camera matrix belongs to, pixels."""
     height: int
+    """Likewise."""
     camera_matrix: np.ndarray
+    """K [3, 3]."""
     objects: tuple[Placed, ...]
+    """In the camera's frame."""
     light: np.ndarray | None
+    """Camera frame, towards the light [3], or None: not known."""
     photograph: Path | None = None
+    """That the objects were found in, or None."""
     world: str | None = None
+    """Name of the generated world that the scene is a code of, or None."""
 
 
 @functools.cache

@@ -21,19 +21,16 @@ SELF_TRAINED = ", self-trained"
 
 @dataclass(frozen=True)
 class Candidate:
-    """A run or a model of one LineMOD class.
-
-    Attributes:
-        path: Its folder.
-        name: The class.
-        method: That trained it; ``, self-trained`` follows where unlabelled real frames took part.
-        weights_sha256: Of the last checkpoint's tensors, or of the model file.
-    """
+    """A run or a model of one LineMOD class."""
 
     path: Path
+    """Its folder."""
     name: str
+    """The class."""
     method: str
+    """That trained it; ``, self-trained`` follows where unlabelled real frames took part."""
     weights_sha256: str
+    """Of the last checkpoint's tensors, or of the model file."""
 
 
 def candidates(folder: Path, flag: str = "--runs", *, of_any_method: bool = True) -> list[Candidate]:
@@ -80,9 +77,9 @@ def _found(folder: Path) -> Iterator[Candidate]:
                 yield Candidate(path, spec.objects[0].name, _method(json.loads(spec.recipe)), files_sha256(file))
 
 
-def _method(making: Mapping[str, Any]) -> str:
+def _method(provenance: Mapping[str, Any]) -> str:
     """Models that are older than self-training say nothing of it."""
-    return str(making["method"]) + (SELF_TRAINED if making["recipe"].get("self_training") else "")
+    return str(provenance["method"]) + (SELF_TRAINED if provenance["recipe"].get("self_training") else "")
 
 
 def files_sha256(*files: Path) -> str:

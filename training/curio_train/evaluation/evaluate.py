@@ -32,17 +32,14 @@ _SEED = 0  # of the images: the same for every run, so that figures can be compa
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Images of a split with their true codes.
-
-    Attributes:
-        images: uint8 [num_images, 3, height, width].
-        code: Of all images.
-        empty: uint8 [num, 3, height, width], backgrounds without the object, in worlds whose codes have a confidence.
-    """
+    """Images of a split with their true codes."""
 
     images: Tensor
+    """Uint8 [num_images, 3, height, width]."""
     code: SceneCode
+    """Of all images."""
     empty: Tensor | None = None
+    """Uint8 [num, 3, height, width], backgrounds without the object, in worlds whose codes have a confidence."""
 
 
 def evaluate(
@@ -149,7 +146,7 @@ def score(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, floa
     return scores
 
 
-def certainty(world: World, predicted: SceneCode, true: SceneCode, on_empty: SceneCode) -> dict[str, float]:
+def calibration(world: World, predicted: SceneCode, true: SceneCode, on_empty: SceneCode) -> dict[str, float]:
     """What the confidence of one object is worth.
 
     Once as the probability that ADD(-S) is below a tenth of the diameter, once as a sign that the object is there.
@@ -167,7 +164,7 @@ def _scored(world: World, predict: Predict, held_out: HeldOut) -> tuple[SceneCod
     predicted = read(predict, held_out.images)
     scores = score(world, predicted, held_out.code)
     if held_out.empty is not None:
-        scores |= certainty(world, predicted, held_out.code, read(predict, held_out.empty))
+        scores |= calibration(world, predicted, held_out.code, read(predict, held_out.empty))
     return predicted, scores
 
 

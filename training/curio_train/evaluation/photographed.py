@@ -2,15 +2,15 @@
 
 The prediction is rendered from the own camera and compared with what was photographed there: agreement inside the
 silhouette and around it (``agreement.py``). On a plane, and for the paper's novel-view test from a second known camera
-over its plate, also by DSSIM sharp, and with both images behind a 9x9 Gaussian filter, which leaves out much of what no
-renderer knows of a camera. The empty plate is the measure there: a prediction that is no nearer to the photograph than
-a scene without parts has found nothing.
+over its background image, also by DSSIM sharp, and with both images behind a 9x9 Gaussian filter, which leaves out much
+of what no renderer knows of a camera. The empty background image is the measure there: a prediction that is no nearer
+to the photograph than a scene without parts has found nothing.
 
-In free space a photograph agrees where the overlap is 0.75 or more, or where no plate is known, 0.4 or more of it is
-explained. Of the 250 photographs of ``agreement.py`` 93 % of the right poses had such an overlap (were so explained:
-95 %), and 21 % (43 %) of those turned by more than 30 degrees: a model that is right everywhere agrees with over nine
-photographs in ten. Of what agreed 41 % were right to a tenth of the diameter and 80 % to a fifth, of the rest 13 % and
-42 %; without a plate nearly the same.
+In free space a photograph agrees where the overlap is 0.75 or more, or where no background image is known, 0.4 or more
+of it is explained. Of the 250 photographs of ``agreement.py`` 93 % of the right poses had such an overlap (were so
+explained: 95 %), and 21 % (43 %) of those turned by more than 30 degrees: a model that is right everywhere agrees with
+over nine photographs in ten. Of what agreed 41 % were right to a tenth of the diameter and 80 % to a fifth, of the rest
+13 % and 42 %; without a background image nearly the same.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from curio_train.evaluation.agreement import differing, draw, explained, inside, overlap
+from curio_train.evaluation.agreement import differing, draw, inlier_ratio, inside, overlap
 from curio_train.evaluation.subject import Predict
 from curio_train.metrics.images import blurred, dssim
 from curio_train.scene_code import CONFIDENCE, SceneCode
@@ -36,22 +36,19 @@ _DRAWN_AT_ONCE = 8  # frames of a camera are larger than images of a plane
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """How far re-renderings are from photographs.
-
-    Attributes:
-        metrics: Means ``own_view_inside`` and ``own_view_overlap`` (without a plate ``own_view_explained``). In free
-            space ``own_view_agreeing``, the share of photographs. On a plane of each view ``…_dssim`` and
-            ``…_dssim_blurred``, the same of the empty plate as ``…_plate_…``, and ``better_than_plate``, the share of
-            scenes in which the last view is nearer than its plate.
-        verdict: Whether to trust the model, and what to do if not.
-        columns: Photograph and re-rendering of each view by heading, [num, 3, height, width] in [0, 1], worst first.
-        captions: The figures of each row.
-    """
+    """How far re-renderings are from photographs."""
 
     metrics: Mapping[str, float]
+    """Means ``own_view_inside`` and ``own_view_overlap`` (without a background image ``own_view_explained``). In free
+    space ``own_view_agreeing``, the share of photographs. On a plane of each view ``…_dssim`` and ``…_dssim_blurred``,
+    the same of the empty background image as ``…_plate_…``, and ``better_than_plate``, the share of scenes in which the
+    last view is nearer than its background image."""
     verdict: str
+    """Whether to trust the model, and what to do if not."""
     columns: Mapping[str, Tensor]
+    """Photograph and re-rendering of each view by heading, [num, 3, height, width] in [0, 1], worst first."""
     captions: Sequence[str]
+    """The figures of each row."""
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -68,7 +65,7 @@ def judge(world: World, predict: Predict) -> Judgement | None:
         predict: Reads the own camera's photographs.
 
     Raises:
-        DataError: A photograph or the plate cannot be read, or is not of the camera's size.
+        DataError: A photograph or the background image cannot be read, or is not of the camera's size.
     """
     if views := world.views():
         return _on_plane(world, predict, views)
@@ -82,18 +79,18 @@ def _on_plane(world: World, predict: Predict, views: Sequence[View]) -> Judgemen
     agreed, _ = _agreement(world, _certain(code), views[0].photographs.float() / 255, views[0].plate.float() / 255)
     metrics = _means(agreed)
     for name, view, images in zip(_NAMES, views, drawn, strict=False):
-        error, of_plate = _errors(view, images)
+        error, of_background_image = _errors(view, images)
         metrics |= {f"{name}_{kind}": float(values.mean()) for kind, values in error.items()}
-        metrics |= {f"{name}_plate_{kind}": float(values.mean()) for kind, values in of_plate.items()}
+        metrics |= {f"{name}_plate_{kind}": float(values.mean()) for kind, values in of_background_image.items()}
     worst = error["dssim_blurred"]
-    metrics["better_than_plate"] = float((worst < of_plate["dssim_blurred"]).double().mean())
+    metrics["better_than_plate"] = float((worst < of_background_image["dssim_blurred"]).double().mean())
     order = worst.argsort(descending=True)
     columns = {}
     for heading, view, images in zip(("", ", second camera"), views, drawn, strict=False):
         columns["photograph" + heading] = view.photographs[order].float() / 255
         columns["prediction" + heading] = images[order]
     verdict = _verdict(metrics["better_than_plate"], len(worst), len(views) > 1)
-    verdict += f" Drawn parts and what differs from the plate overlap by {metrics['own_view_overlap']:.2f} (1: all)."
+    verdict += f" Drawn parts and what differs from the background image overlap by {metrics['own_view_overlap']:.2f} (1: all)."
     return Judgement(metrics, verdict, columns, _captions(agreed | {"blurred DSSIM": worst}, order))
 
 
@@ -115,7 +112,9 @@ def _in_space(world: World, predict: Predict, photographs: Tensor, plate: Tensor
 def _agreement(
     world: World, code: SceneCode, photographs: Tensor, plate: Tensor | None
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Numbers of each photograph by name, and what was found drawn over the plate, or else over the photographs."""
+    """Numbers of each photograph by name, and what was found drawn over the background image, or else over the
+    photographs.
+    """
     found: dict[str, list[Tensor]] = {"inside": [], "explained" if plate is None else "overlap": []}
     images = []
     for start in range(0, len(photographs), _DRAWN_AT_ONCE):
@@ -124,7 +123,7 @@ def _agreement(
         behind = seen if plate is None else plate.expand_as(seen)
         found["inside"].append(inside(seen, drawing, behind))
         if plate is None:
-            found["explained"].append(explained(seen, drawing))
+            found["explained"].append(inlier_ratio(seen, drawing))
         else:
             found["overlap"].append(overlap(drawing.silhouette, differing(seen, plate)))
         images.append(drawing.over(behind))
@@ -155,7 +154,7 @@ def _drawn(world: World, view: int, code: SceneCode) -> Tensor:
 
 
 def _errors(view: View, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Of re-renderings, and of the plate in place of them."""
+    """Of re-renderings, and of the background image in place of them."""
     photographs, plate = view.photographs.float() / 255, view.plate.float() / 255
     of_both = []
     for shown in (images, plate.expand_as(photographs)):
@@ -166,7 +165,7 @@ def _errors(view: View, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Te
 
 def _verdict(share: float, num: int, second: bool) -> str:
     where = "from the second camera" if second else "from the own camera, which cannot tell depth,"
-    found = f"in {share:.0%} of {num} scenes what was found, seen {where} is nearer to the photograph than the plate is"
+    found = f"in {share:.0%} of {num} scenes what was found, seen {where} is nearer to the photograph than the background image is"
     if share >= _TRUSTED:
         return f"Trust it: {found}."
     if share >= _DOUBTFUL:
@@ -178,11 +177,13 @@ def _verdict(share: float, num: int, second: bool) -> str:
     )
 
 
-def _verdict_in_space(share: float, num: int, has_plate: bool, num_empty: int) -> str:
-    measure = "covers what differs from the plate" if has_plate else "explains what stands out there"
+def _verdict_in_space(share: float, num: int, has_background_image: bool, num_empty: int) -> str:
+    measure = (
+        "covers what differs from the background image" if has_background_image else "explains what stands out there"
+    )
     found = f"in {share:.0%} of {num} photographs what was found {measure}"
     limits = "a tenth of a diameter cannot be told from a fifth"
-    if not has_plate:
+    if not has_background_image:
         limits += "; --background tells right from wrong better"
     advice = "train longer (--images), or tell the network more (--upright, narrower --near-m and --far-m)"
     if share >= _TRUSTED:
@@ -194,4 +195,4 @@ def _verdict_in_space(share: float, num: int, has_plate: bool, num_empty: int) -
             f"Do not trust it: {found}. {advice.capitalize()}; if that does not help, look whether --mesh-unit, the "
             "camera file and --background fit (curio-doctor)."
         )
-    return text + (f" {num_empty} of them show nothing but the plate: leave those out." if num_empty else "")
+    return text + (f" {num_empty} of them show nothing but the background image: leave those out." if num_empty else "")

@@ -45,19 +45,16 @@ _MSPD_THRESHOLDS = [5.0 * step for step in range(1, 11)]  # pixels in an image 6
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What was found in a frame.
-
-    Attributes:
-        frame: The frame.
-        pose: cam_from_obj, metres.
-        confidence: 1 where the model has none.
-        seconds: Spent on the frame, reading included; mean of those read together.
-    """
+    """What was found in a frame."""
 
     frame: Frame
+    """The frame."""
     pose: Pose
+    """Cam_from_obj, metres."""
     confidence: float
+    """1 where the model has none."""
     seconds: float
+    """Spent on the frame, reading included; mean of those read together."""
 
 
 Pairs = Sequence[tuple[Estimate, Annotation]]

@@ -127,7 +127,7 @@ def _facts(subject: Subject, made: list[RunSession]) -> dict[str, str]:
         "images seen": f"{subject.images_seen:,}",
         "training time": f"{minutes:.1f} minutes, {rate:.0f} images/s",
         "started": made[0].started,
-        "last sitting": made[-1].started,
+        "last session": made[-1].started,
         "machine": made[-1].machine,
         "system": f"{platform.system()} {platform.release()}, Python {platform.python_version()}",
         "libraries": ", ".join(f"{name} {number}" for name, number in versions.items()),

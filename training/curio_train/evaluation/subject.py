@@ -26,23 +26,20 @@ Predict = Callable[[Tensor], dict[str, Tensor]]
 
 @dataclass(frozen=True)
 class Subject:
-    """Something that reads poses from images.
-
-    Attributes:
-        config: What it was trained with.
-        world: In which it was trained.
-        predict: Reads images.
-        images_seen: In training, those of the networks that it began as included.
-        training_seconds: Spent, likewise.
-        commit: Of the code that trained it.
-    """
+    """Something that reads poses from images."""
 
     config: RunConfig
+    """What it was trained with."""
     world: World
+    """In which it was trained."""
     predict: Predict
+    """Reads images."""
     images_seen: int
+    """In training, those of the networks that it began as included."""
     training_seconds: float
+    """Spent, likewise."""
     commit: str
+    """Of the code that trained it."""
 
     def untrained(self) -> Predict:
         """The network as it was before the first step, from the same seed."""
@@ -73,13 +70,13 @@ def _from_run(path: Path) -> Subject:
     run = RunFolder.open(path)
     world = build(run.config.world)
     state = run.trained(world)
-    course = state.progress
+    progress = state.progress
     return Subject(
         run.config,
         world,
         _reader(state.pose.network),
-        course.all_images,
-        course.all_seconds,
+        progress.all_images,
+        progress.all_seconds,
         run_sessions(path)[0].commit,
     )
 

@@ -31,13 +31,10 @@ _MAX_BATCH_SIZE = 64
 
 @dataclass(frozen=True)
 class ModelFolder:
-    """The folder of one model, which need not exist yet.
-
-    Attributes:
-        path: OUT/NAME.
-    """
+    """The folder of one model, which need not exist yet."""
 
     path: Path
+    """OUT/NAME."""
 
     @staticmethod
     def named(out: Path, name: str) -> "ModelFolder":

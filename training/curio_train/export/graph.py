@@ -40,24 +40,21 @@ _CHECK_SEED = (20_210,)
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
 _NUM_JITTERED = 16  # a tie is missed once in 2 to the power of this
-_LEAST_SETTLED = 0.25  # of the check images
+_LEAST_STABLE = 0.25  # of the check images
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What became of an export.
-
-    Attributes:
-        path: The version's folder.
-        parity_error: Largest absolute difference between the network, its weights rounded as stored, and onnxruntime.
-        rounding_error: Largest absolute difference between that network and the one that was trained; 0 in float32.
-        num_bytes: Of model.onnx.
-    """
+    """What became of an export."""
 
     path: Path
+    """The version's folder."""
     parity_error: float
+    """Largest absolute difference between the network, its weights rounded as stored, and onnxruntime."""
     rounding_error: float
+    """Largest absolute difference between that network and the one that was trained; 0 in float32."""
     num_bytes: int
+    """Of model.onnx."""
 
 
 class Graph(nn.Module):
@@ -124,7 +121,7 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     put_spec(model, spec)
 
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
-    known = settled(deployed if half else trained, images)
+    known = numerically_stable(deployed if half else trained, images)
     answers, found = ({name: v[known] for name, v in of.items()} for of in (expected if half else learned, found))
     spec.parity_max_abs_error = refuse_disparity(answers, found)
     put_spec(model, spec)
@@ -179,8 +176,9 @@ def _fold(layers: nn.Sequential) -> None:
 def check_images(world: World) -> Tensor:
     """Images that torch and onnxruntime have to agree on, uint8 [batch, height, width, 3]: over black, then over noise.
 
-    The noise is smooth and never without objects: a gaze that moves by the last digit sees something else between white
-    pixels, and where nothing is to be found the last digit decides between places that are equally unlikely.
+    The noise is smooth and never without objects: a two-stage network that moves by the last digit sees something else
+    between white pixels, and where nothing is to be found the last digit decides between places that are equally
+    unlikely.
     """
     code = world.sample(_NUM_CHECK_IMAGES, _CHECK_SEED)
     size = (world.camera.height, world.camera.width)
@@ -191,7 +189,7 @@ def check_images(world: World) -> Tensor:
 
 
 @torch.no_grad()
-def settled(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
+def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
     """Which images can tell whether a runtime computes the same: their last digits do not move the answer.
 
     Where the answer is a choice among equals (the likeliest cell, say, of a network that has learned next to nothing),
@@ -208,12 +206,12 @@ def settled(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
     answers, generator = graph.outputs(images), torch.Generator().manual_seed(*_CHECK_SEED)
     pixels = images.permute(0, 3, 1, 2).float() / 255
     known = torch.ones(len(images), dtype=torch.bool)
-    with _unsteady(graph.network, generator):
+    with _jittered_layers(graph.network, generator):
         for _ in range(_NUM_JITTERED):
             jittered = graph.read(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
             for name, values in answers.items():
                 known &= (values - jittered[name]).abs().flatten(1).amax(dim=1) <= LARGEST_PARITY_ERROR
-    if known.float().mean() < _LEAST_SETTLED:
+    if known.float().mean() < _LEAST_STABLE:
         raise ExportError(
             f"the network's answers to {int((~known).sum())} of {len(images)} check images change with their last "
             "digits or are not finite; nothing was written. Has the training diverged, or hardly begun?"
@@ -222,7 +220,7 @@ def settled(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
 
 
 @contextmanager
-def _unsteady(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
+def _jittered_layers(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
     """Within this, every layer is off by about as much as rounding in some other order can make it."""
 
     def off(_layer: nn.Module, _given: object, said: Tensor) -> Tensor:

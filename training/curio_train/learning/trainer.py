@@ -67,7 +67,7 @@ class Trainer:
         if len(world.stages) > 1 and config.terms.reads_images:
             raise UsageError(
                 f"--method {config.method} needs whole-scene images, and this model trains on crops: "
-                "use --method sleep (or, with linemod, --no-gaze)"
+                "use --method sleep (or, with linemod, --no-two-stage network)"
             )
         self.config, self.world, self.ranks = config, world, ranks
         self.state = TrainState(config, world, ranks.device)

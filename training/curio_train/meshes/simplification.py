@@ -22,7 +22,7 @@ _TORN = 1 / 6
 
 There the mean lies a third of the seam's jump away from either side; elsewhere both agree.
 """
-_NUM_CHECKED, _LOST_SHARE = 4096, 0.01
+_NUM_CHECKED, _LOST_FRACTION = 4096, 0.01
 
 
 def simplified(mesh: Mesh, max_faces: int) -> Mesh:
@@ -107,7 +107,7 @@ def _even(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
 def _loses_parts(mesh: Mesh, simpler: Mesh, tolerance_m: float) -> bool:
     points_m, _ = _even(mesh, _NUM_CHECKED)
     surface = _Surface(simpler, _SAMPLES_A_FACE * len(simpler.faces))
-    return bool((surface.nearest(points_m).distance_m > tolerance_m).mean() > _LOST_SHARE)
+    return bool((surface.nearest(points_m).distance_m > tolerance_m).mean() > _LOST_FRACTION)
 
 
 def _dressed(simpler: Mesh, mesh: Mesh) -> Mesh:

@@ -181,7 +181,7 @@ class SingleObjectWorld(World):
             light=code[LIGHT].float(),
             color=code[COLOR].float() if COLOR in code else code.get(EXPOSURE),
             confidence=code[CONFIDENCE][..., 0].float() if CONFIDENCE in code else None,
-            finish=code.get(FINISH),
+            appearance=code.get(FINISH),
             seed=jitter_seed(code),
         )
 
