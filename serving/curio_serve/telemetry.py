@@ -1,13 +1,15 @@
-"""Numbers for Prometheus and structured logs.
+"""Keeps the numbers for Prometheus and writes structured logs.
 
 A log line is one JSON object on stderr. Lines pass through a bounded queue, so a full disk or a stuck pipe costs lines,
 never requests. Tokens and image bytes are never handed to the logger.
 """
 
+import contextlib
 import json
 import logging
-import logging.handlers
+import os
 import queue
+import threading
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
 
 LOGGER = logging.getLogger("curio_serve")
+_STDERR = 2
 _MAX_WAITING_LINES = 10_000
 _BUCKETS_S = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512, 1, 2, 5)
 
@@ -44,27 +47,45 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(line, ensure_ascii=False, default=str)
 
 
-class _DropWhenFull(logging.handlers.QueueHandler):
-    def enqueue(self, record: logging.LogRecord) -> None:
-        try:
-            self.queue.put_nowait(record)
-        except queue.Full:
-            return
+class LogWriter(logging.Handler):
+    """Writes log lines to stderr on a thread of its own.
+
+    It writes past Python's buffers: a thread that is stuck in writing to a full pipe would hold their lock, and the
+    process could not end.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setFormatter(JsonFormatter())
+        self._lines: queue.Queue[str | None] = queue.Queue(_MAX_WAITING_LINES)
+        self._thread = threading.Thread(target=self._write, name="curio-log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue a line, or drop it if the queue is full."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(self.format(record))
+
+    def stop(self, limit_s: float = 2.0) -> None:
+        """Write the lines that wait, unless that takes too long."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(None)
+        self._thread.join(limit_s)
+
+    def _write(self) -> None:
+        while (line := self._lines.get()) is not None:
+            with contextlib.suppress(OSError):  # a line that cannot be written is lost, not the request
+                os.write(_STDERR, f"{line}\n".encode(errors="replace"))
 
 
-def start_logging(level: str) -> logging.handlers.QueueListener:
-    """Send this package's log, and gRPC's, to stderr. ``stop()`` of what is returned writes what still waits."""
-    logging.raiseExceptions = False  # a line that cannot be written is lost, not the request
-    output = logging.StreamHandler()
-    output.setFormatter(JsonFormatter())
-    lines: queue.Queue[logging.LogRecord] = queue.Queue(_MAX_WAITING_LINES)
-    listener = logging.handlers.QueueListener(lines, output)
+def start_logging(level: str) -> LogWriter:
+    """Send this package's log, and gRPC's, to stderr. ``stop()`` of the result writes the lines that wait."""
+    writer = LogWriter()
     for logger in (LOGGER, logging.getLogger("grpc")):
-        logger.handlers = [_DropWhenFull(lines)]
+        logger.handlers = [writer]
         logger.propagate = False
     LOGGER.setLevel(level.upper())
-    listener.start()
-    return listener
+    return writer
 
 
 class Metrics:
@@ -76,9 +97,10 @@ class Metrics:
         self.requests = Counter(
             "curio_requests_total", "Calls answered, by method and gRPC status.", ["method", "code"], registry=registry
         )
-        self.phases = Histogram(
+        phases = Histogram(
             "curio_phase_seconds", "Time of a frame in each phase.", ["phase"], registry=registry, buckets=_BUCKETS_S
         )
+        self.queue_s, self.decode_s, self.inference_s = map(phases.labels, ("queue", "decode", "inference"))
         self.waiting = Gauge("curio_queue_length", "Requests waiting for a worker.", registry=registry)
         self.working = Gauge("curio_working", "Frames being worked on.", registry=registry)
         self.streams = Gauge("curio_open_streams", "Open DetectStream calls.", registry=registry)

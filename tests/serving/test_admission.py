@@ -1,7 +1,7 @@
 """The bounded queue: refusals, deadlines, calls that hang up, order."""
 
+import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -24,6 +24,9 @@ class Caller:
 
     def time_remaining(self) -> float | None:
         return self._remaining_s
+
+    def is_active(self) -> bool:
+        return not self._has_ended
 
     def add_callback(self, callback: Callable[[], None]) -> bool:
         self._callbacks.append(callback)
@@ -153,29 +156,90 @@ def test_a_call_that_ended_before_it_waits_never_works(gate: threading.Event, ma
     assert first.result(30) == "done"
 
 
-def test_a_call_that_would_come_too_late_is_refused_at_once(gate: threading.Event, make_bench: MakeBench) -> None:
-    bench = make_bench(1, 9)
-    for _ in range(20):  # the queue learns that work takes some 20 ms
-        with bench.queue.slot(Caller()):
-            time.sleep(0.02)
-    accepted = [bench.hold(gate), bench.hold(gate, Caller(0.001 + 1e9))]
-    with pytest.raises(Overloaded, match="1 are waiting, which takes longer than the call's deadline") as caught:
-        bench.hold(gate, Caller(0.001)).result(30)
-    assert caught.value.retry_after_s > 0
-    accepted.append(bench.hold(gate, Caller()))
-    gate.set()
-    assert [future.result(30) for future in accepted] == ["done"] * 3
+def _queue(num_slots: int, max_waiting: int) -> WorkQueue:
+    return WorkQueue(num_slots, max_waiting, Metrics(CollectorRegistry()))
+
+
+def _work(monkeypatch: pytest.MonkeyPatch, queue: WorkQueue, seconds: float) -> None:
+    """Have a call take this long, on a clock that is ours."""
+    now = 0.0
+    monkeypatch.setattr("curio_serve.api.admission.time.monotonic", lambda: now)
+    for _ in range(200):
+        with queue.slot(Caller()):
+            now += seconds
+
+
+def test_a_reservation_keeps_a_place(gate: threading.Event, make_bench: MakeBench) -> None:
+    bench = make_bench(1, 1)
+    with bench.queue.reserve(Caller()), bench.queue.reserve(Caller()) as second:
+        with pytest.raises(Overloaded), bench.queue.reserve(Caller()):
+            pass
+        working = bench.hold(gate)
+        waiting = bench.hold(gate, place=second)
+        with pytest.raises(Overloaded):
+            bench.hold(gate).result(30)
+        gate.set()
+        assert [working.result(30), waiting.result(30)] == ["done", "done"]
+
+
+def test_a_reservation_given_up_is_free_again() -> None:
+    queue = _queue(1, 0)
+    for _ in range(3):
+        with queue.reserve(Caller()):
+            pass
+    with queue.slot(Caller()):
+        pass
+
+
+def test_reservations_end(gate: threading.Event, make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Callers who never send their message do not keep others out."""
+    bench = make_bench(1, 1)
+    with bench.queue.reserve(Caller()) as slow, bench.queue.reserve(Caller()) as slower:
+        monkeypatch.setattr("curio_serve.api.admission._RESERVATION_S", 0.0)
+        with bench.queue.reserve(Caller()) as quick:
+            held = [bench.hold(gate, place=quick)]
+            # Their messages come late; they wait if there is room.
+            held.append(bench.hold(gate, place=slow))
+            with pytest.raises(Overloaded):
+                bench.hold(gate, place=slower).result(30)
+            gate.set()
+            assert [future.result(30) for future in held] == ["done", "done"]
+
+
+def test_who_would_come_too_late_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    queue = _queue(1, 9)
+    _work(monkeypatch, queue, 0.1)
+    # The slot is free, so nothing says that it cannot be done.
+    with queue.reserve(Caller(0.001)), queue.reserve(Caller(math.inf)):
+        with (
+            pytest.raises(Overloaded, match="2 are waiting, which takes longer than the call's deadline") as caught,
+            queue.reserve(Caller(0.3)),
+        ):
+            pass
+        assert caught.value.retry_after_s == pytest.approx(0.3, rel=0.05)
+        with queue.reserve(Caller(0.4)), queue.reserve(Caller(None)):
+            pass
+
+
+def test_calls_without_work_do_not_pass_for_quick_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    queue = _queue(1, 9)
+    _work(monkeypatch, queue, 0.1)
+    for _ in range(200):
+        with pytest.raises(DeadlineError), queue.slot(Caller(0.0)):
+            pass
+    with queue.reserve(Caller()), queue.reserve(Caller()), pytest.raises(Overloaded), queue.reserve(Caller(0.3)):
+        pass
 
 
 def test_errors_of_the_work_give_the_slot_back() -> None:
-    queue = WorkQueue(1, 0, Metrics(CollectorRegistry()))
+    queue = _queue(1, 0)
     for _ in range(5):
         with pytest.raises(ValueError, match="mine"), queue.slot(Caller()):
             raise ValueError("mine")
 
 
 def test_many_threads_leave_nothing_behind() -> None:
-    queue, busy, most = WorkQueue(2, 1000, Metrics(CollectorRegistry())), [], []
+    queue, busy, most = _queue(2, 1000), [], []
 
     def work(number: int) -> None:
         caller = Caller(None if number % 3 else 0.005)

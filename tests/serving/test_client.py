@@ -15,7 +15,7 @@ import pytest
 from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer, add_PoseDetectorServicer_to_server
 from curio_serve import errors
-from curio_serve.api.messages import status_from_error
+from curio_serve.api.status import status_from_error
 from curio_serve.client import AsyncPoseClient, PoseClient, Tls, detect_request, error_from_answer
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector

@@ -1,8 +1,8 @@
 """Admission control: a fixed number of slots behind a bounded queue.
 
-Cores are scarce, so a call takes a slot before it decodes or runs a network (work that releases the interpreter's
-lock) and gives it back afterwards; the call that has waited longest gets it next. A call that finds the queue full, or
-whose deadline would pass before its turn, is refused at once: an answer that comes too late costs everyone.
+Cores are scarce, so a call takes one of a few slots before it decodes or infers (work that releases the interpreter's
+lock) and frees it afterwards; the call that has waited longest gets it next. A call beyond the queue is refused at
+once, before its message is read: an answer that comes too late costs everyone.
 """
 
 import queue
@@ -11,38 +11,44 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import NoReturn, Protocol
 
 from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
 from curio_serve.telemetry import Metrics
 
-# The estimated wait is multiplied by this. Without it, a fifth or more of the answered calls are late.
-_WAIT_MARGIN = 1.5
-_FULL = "which is the limit (--workers, --queue)"
-_TOO_LATE = "which takes longer than the call's deadline leaves"
+_RESERVATION_S = 1.0
+# How much longer a call is assumed to wait than the mean says. Without it a fifth or more of the answered calls come
+# late; a larger factor only shortens a queue that need not be long to be never empty (docs/experiments.md).
+_MARGIN = 1.5
+_IS_FULL = "which is the limit (--workers, --queue)"
+_COMES_TOO_LATE = "which takes longer than the call's deadline leaves"
 
 
 class Call(Protocol):
-    """The part of gRPC's servicer context that admission needs."""
+    """The part of gRPC's servicer context that admission uses."""
 
     def time_remaining(self) -> float | None:
         """Seconds until the caller's deadline; None without one."""
+
+    def is_active(self) -> bool:
+        """Whether the call has not ended."""
 
     def add_callback(self, callback: Callable[[], None]) -> bool:
         """Have a function called when the call ends; False if it has ended already."""
 
 
-class _Waiter:
-    """A thread that waits until it gets a slot or its call ends."""
+class Place:
+    """A call's place in the queue, on which its thread sleeps until it gets a slot or the call ends."""
 
     def __init__(self) -> None:
         self._wakes: queue.SimpleQueue[None] = queue.SimpleQueue()  # a quarter of an Event's cost
 
     def wake(self) -> None:
+        """Wake the thread that sleeps here."""
         self._wakes.put(None)
 
     def sleep(self, limit_s: float | None) -> bool:
-        """Wait to be woken; False if the limit passed first."""
+        """Sleep until woken; False if the limit passed first."""
         try:
             self._wakes.get(timeout=limit_s)
         except queue.Empty:
@@ -51,109 +57,158 @@ class _Waiter:
 
 
 class WorkQueue:
-    """Slots and the queue in front of them, first come, first served."""
+    """A fixed number of slots behind a bounded queue, first come, first served."""
 
     def __init__(self, num_slots: int, max_waiting: int, metrics: Metrics) -> None:
-        """Begin with all slots free.
-
-        Args:
-            num_slots: Calls that may work at the same time.
-            max_waiting: Calls that may wait.
-            metrics: Shows both numbers.
-        """
         self.num_slots = num_slots
         self._max_waiting = max_waiting
         self._lock = threading.Lock()
         self._num_free = num_slots
-        self._waiting: deque[_Waiter] = deque()
+        self._waiting: deque[Place] = deque()
+        self._reserved: dict[Place, float] = {}  # since when, oldest first
         self._mean_work_s = 0.005
         metrics.waiting.set_function(lambda: len(self._waiting))
         metrics.working.set_function(lambda: num_slots - self._num_free)
 
     @contextmanager
-    def slot(self, call: Call, *, always: bool = False) -> Iterator[float]:
-        """Hold a slot while working on this thread; yields the seconds the call waited for it.
+    def reserve(self, call: Call) -> Iterator[Place]:
+        """Reserve a place for a call before its message is read: refusing it later would waste the reading.
+
+        A reservation lasts one second, so callers who never send their message do not fill the queue.
 
         Args:
-            call: Its deadline bounds the wait; if it ends, it leaves the queue.
-            always: Wait even behind a full queue, for calls whose number is bounded otherwise.
+            call: Its deadline decides whether its turn would come in time.
+
+        Yields:
+            The place, for :meth:`slot`.
 
         Raises:
             Overloaded: The queue is full, or the deadline would pass before the call is answered.
+        """
+        remaining_s = call.time_remaining()
+        with self._lock:
+            if self._why_not(remaining_s):
+                self._drop_old_reservations()
+                if reason := self._why_not(remaining_s):
+                    self._refuse(reason)
+            place = Place()
+            self._reserved[place] = time.monotonic()
+        try:
+            yield place
+        finally:
+            self._reserved.pop(place, None)
+
+    @contextmanager
+    def slot(self, call: Call, place: Place | None = None, *, always: bool = False) -> Iterator[float]:
+        """Hold a slot while this thread works.
+
+        Args:
+            call: Its deadline bounds the wait, and its end takes it out of the queue.
+            place: The one that was reserved for it, if any.
+            always: Wait even behind a full queue, for callers that are bounded otherwise.
+
+        Yields:
+            Seconds that the call waited for the slot.
+
+        Raises:
+            Overloaded: The queue is full.
             DeadlineError: The deadline passed before there was a slot.
             CallCancelled: The client hung up before there was a slot.
         """
-        remaining_s, begun = call.time_remaining(), time.monotonic()
-        waiter = self._enter(remaining_s, always=always)
-        if waiter is not None:
-            self._wait(waiter, call, remaining_s)
+        remaining_s = call.time_remaining()
+        begun = time.monotonic()
+        place = place or Place()
+        if not self._enter(place, always):
+            self._wait(place, call, remaining_s)
         granted = time.monotonic()
+        has_worked = False
         try:
             if remaining_s is not None and granted - begun >= remaining_s:
                 raise _deadline_passed(granted - begun)
+            has_worked = True
             yield granted - begun
         finally:
-            self._leave(time.monotonic() - granted)
+            self._leave(time.monotonic() - granted if has_worked else None)
 
-    def refusal(self) -> Overloaded | None:
-        """Why another call would be refused whatever its deadline; None if it may wait."""
+    def _enter(self, place: Place, always: bool) -> bool:
+        """Take a free slot (True) or a place in the queue (False)."""
         with self._lock:
-            is_full = not self._num_free and len(self._waiting) >= self._max_waiting
-            return self._overloaded(_FULL) if is_full else None
-
-    def _enter(self, remaining_s: float | None, *, always: bool) -> _Waiter | None:
-        """Take a free slot (None) or a place in the queue."""
-        with self._lock:
+            is_reserved = self._reserved.pop(place, None) is not None
             if self._num_free:
                 self._num_free -= 1
-                return None
-            if not always and (reason := self._why_refused(remaining_s)):
-                raise self._overloaded(reason)
-            self._waiting.append(waiter := _Waiter())
-            return waiter
+                return True
+            if len(self._waiting) >= self._max_waiting and not (is_reserved or always):
+                self._refuse(_IS_FULL)
+            self._waiting.append(place)
+            return False
 
-    def _wait(self, waiter: _Waiter, call: Call, remaining_s: float | None) -> None:
+    def _wait(self, place: Place, call: Call, remaining_s: float | None) -> None:
         """Return with a slot, or raise without one."""
-        if not call.add_callback(waiter.wake):
-            waiter.wake()
-        was_woken = waiter.sleep(remaining_s)
+        if not call.add_callback(place.wake):
+            place.wake()
+        is_woken = place.sleep(remaining_s)
         with self._lock:
-            if waiter not in self._waiting:
-                return  # woken by the slot
-            self._waiting.remove(waiter)
-        if was_woken:
+            if place not in self._waiting:
+                return  # it was given a slot
+            self._waiting.remove(place)
+        if is_woken:
             raise CallCancelled("the client hung up while the call was in the queue; nothing was done")
         raise _deadline_passed(remaining_s or 0.0)
 
-    def _leave(self, worked_s: float) -> None:
-        """Pass the slot to the first in the queue, or free it."""
+    def _leave(self, worked_s: float | None) -> None:
+        """Pass a slot to the first in the queue, or free it.
+
+        Args:
+            worked_s: How long the slot was used; None if no work was done.
+        """
         with self._lock:
-            self._mean_work_s += 0.05 * (worked_s - self._mean_work_s)
+            # A smoothed estimate is enough to judge who would come too late, and when to come back.
+            if worked_s is not None:
+                self._mean_work_s += 0.05 * (worked_s - self._mean_work_s)
             if self._waiting:
                 self._waiting.popleft().wake()
             else:
                 self._num_free += 1
 
-    def _why_refused(self, remaining_s: float | None) -> str:
-        """Why another call cannot be answered in time; empty if it can, as far as can be estimated."""
-        num_ahead = len(self._waiting)
+    def _why_not(self, remaining_s: float | None) -> str:
+        """Why a further call cannot be answered in time; empty if it can, as far as is known."""
+        num_ahead = len(self._reserved) + len(self._waiting) - self._num_free
         if num_ahead >= self._max_waiting:
-            return _FULL
-        if not num_ahead or remaining_s is None:
+            return _IS_FULL
+        if num_ahead <= 0 or remaining_s is None:
             return ""
-        # Twice the mean: one call in a slot has to end, and this call's own work has to be done.
-        needed_s = self._mean_work_s * (_WAIT_MARGIN * num_ahead / self.num_slots + 2)
-        return _TOO_LATE if needed_s > remaining_s else ""
+        # Twice the work: a running call has to end, and this call's own work has to be done.
+        needed_s = self._mean_work_s * (_MARGIN * num_ahead / self.num_slots + 2)
+        return _COMES_TOO_LATE if needed_s > remaining_s else ""
 
-    def _overloaded(self, reason: str) -> Overloaded:
-        num_waiting = len(self._waiting)
-        # Two digits are enough, and let one answer be made for many refused calls.
-        retry_s = float(f"{self._mean_work_s * (num_waiting + 1) / self.num_slots:.2g}")
-        return Overloaded(
-            f"{self.num_slots} requests are being worked on and {num_waiting} are waiting, {reason}; "
+    def _drop_old_reservations(self) -> None:
+        end = time.monotonic() - _RESERVATION_S
+        while self._reserved and self._reserved[first := next(iter(self._reserved))] < end:
+            del self._reserved[first]
+
+    def _refuse(self, reason: str) -> NoReturn:
+        waiting = len(self._waiting) + len(self._reserved)
+        # Two digits are enough, and let the status of a flood's refusals be built once for many.
+        retry_s = float(f"{self._mean_work_s * (waiting + 1) / self.num_slots:.2g}")
+        raise Overloaded(
+            f"{self.num_slots} requests are being worked on and {waiting} are waiting, {reason}; "
             f"try again in {retry_s:g} s",
             retry_s,
         )
+
+
+def check_is_wanted(call: Call) -> None:
+    """Check that somebody still waits for a call's answer.
+
+    Raises:
+        DeadlineError: Its deadline has passed.
+        CallCancelled: The client hung up, or the server's grace time is over.
+    """
+    remaining_s = call.time_remaining()
+    if remaining_s is not None and remaining_s <= 0:
+        raise DeadlineError("the deadline passed before the work was done; the rest of it was not begun")
+    if not call.is_active():
+        raise CallCancelled("the call was ended before the work was done; the rest of it was not begun")
 
 
 def _deadline_passed(waited_s: float) -> DeadlineError:

@@ -1,4 +1,4 @@
-"""The server's settings, and where they may come from: flags, environment, TOML file, defaults, in this order."""
+"""Reads the server's settings from flags, environment, TOML file and defaults, in this order."""
 
 import json
 from collections.abc import Mapping
@@ -13,6 +13,7 @@ from curio_serve.settings import environment_settings, read_toml, to_arguments
 
 ENV_PREFIX = "CURIO_SERVE_"
 _NOT_STORED = {"config", "dump_config"}
+_MAX_WORKERS = 1024
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,16 @@ class ServeConfig:
     """Open calls of any kind, also those whose message has not come yet."""
     max_message_mb: int = 32
     """Largest request, in MiB."""
+    message_memory_mb: int = 256
+    """Memory for requests that arrive or wait, in MiB; each counts as the largest until it has arrived."""
+    message_s: float = 10.0
+    """Seconds in which the first message of a call has to arrive."""
+    idle_s: float = 60.0
+    """Seconds in which each further message of a stream has to arrive."""
     max_pixels: int = 1 << 25
     """Most pixels of an image; checked before it is decoded."""
     max_regions: int = 64
-    """Most regions of interest in a request."""
+    """Most regions of interest in a request, and, with --max-models, most runs of a network: models times regions."""
     max_models: int = 16
     """Most models named in a request."""
     min_confidence: float = 0.0
@@ -85,7 +92,7 @@ class ServeConfig:
         least = {
             "port": 0, "workers": 0, "queue": 0, "max_streams": 0, "max_calls": 1, "max_message_mb": 1,
             "max_pixels": 256, "max_regions": 1, "max_models": 1, "versions": 1, "refresh_s": 0, "batch": 0,
-            "grace_s": 0,
+            "message_memory_mb": 1, "message_s": 0.1, "idle_s": 0.1, "grace_s": 0,
         }  # fmt: skip
         for name, smallest in least.items():
             if not getattr(self, name) >= smallest:
@@ -97,6 +104,10 @@ class ServeConfig:
             raise UsageError(f"--min-confidence is {self.min_confidence}; expected 0 to 1")
         if self.max_message_mb > 1024:
             raise UsageError(f"--max-message-mb is {self.max_message_mb}; expected at most 1024")
+        if self.workers > _MAX_WORKERS:
+            raise UsageError(f"--workers is {self.workers}; expected at most {_MAX_WORKERS}")
+        if not self.host:
+            raise UsageError("--host is empty; expected an address such as 127.0.0.1, or 0.0.0.0 for all interfaces")
         if self.log_level not in ("debug", "info", "warning", "error"):
             raise UsageError(f"--log-level is {self.log_level!r}; expected debug, info, warning or error")
         if (self.tls_certificate is None) != (self.tls_key is None):

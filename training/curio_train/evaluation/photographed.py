@@ -98,9 +98,7 @@ def _on_plane(world: TabletopWorld, predict: Predict) -> Judgement:
         columns["photograph" + heading] = view.photographs[order].float() / 255
         columns["prediction" + heading] = images[order]
     verdict = _verdict(metrics["better_than_plate"], len(worst), len(views) > 1)
-    verdict += (
-        f" Drawn parts and the difference from the background image overlap by {metrics['own_view_overlap']:.2f}."
-    )
+    verdict += f" Drawn parts and the difference from the background overlap by {metrics['own_view_overlap']:.2f}."
     return Judgement(metrics, verdict, columns, _captions(agreed | {"blurred DSSIM": worst}, order))
 
 
@@ -175,7 +173,7 @@ def _errors(view: PhotographSet, images: Tensor) -> tuple[dict[str, Tensor], dic
 
 def _verdict(share: float, num: int, second: bool) -> str:
     where = "from the second camera" if second else "from the own camera, which cannot tell depth,"
-    found = f"in {share:.0%} of {num} scenes what was found, seen {where} is nearer to the photograph than the background image is"
+    found = f"in {share:.0%} of {num} scenes what was found, seen {where} is nearer to the photograph than an empty scene"
     if share >= _TRUSTED:
         return f"Trust it: {found}."
     if share >= _DOUBTFUL:
