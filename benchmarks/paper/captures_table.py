@@ -41,7 +41,7 @@ def markdown(table: Table, command: str) -> str:
         f"Written by `{command}` from [captures.json](captures.json). DSSIM between the second camera's photograph and"
         " what was read in the first camera's, drawn from there over its background image; *blurred*: both behind a 9x9"
         " Gaussian filter. Smaller is better. Photographs are synthetic captures ([recipe](../recipes/capture.md)), so"
-        " the paper's figures, in brackets, are of other photographs: what compares is the order of methods. `sleep` and"
+        " the paper's figures, in brackets, are of other photographs: only the order of methods compares. `sleep` and"
         " `sleep_cells` go beyond the paper: they learn from renderings of codes that the world draws itself, synthetic"
         " labels in the sense of the paper's LineMOD table; the latter with another network, which reads images cell by"
         " cell (`--reading cells`, usual on a plane). Nobody labels anything in any row.",

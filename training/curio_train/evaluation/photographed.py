@@ -173,7 +173,7 @@ def _errors(view: PhotographSet, images: Tensor) -> tuple[dict[str, Tensor], dic
 
 def _verdict(share: float, num: int, second: bool) -> str:
     where = "from the second camera" if second else "from the own camera, which cannot tell depth,"
-    found = f"in {share:.0%} of {num} scenes what was found, seen {where} is nearer to the photograph than an empty scene"
+    found = f"in {share:.0%} of {num} scenes what was found, seen {where} is nearer to the photograph than no part"
     if share >= _TRUSTED:
         return f"Trust it: {found}."
     if share >= _DOUBTFUL:
