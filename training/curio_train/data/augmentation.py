@@ -22,7 +22,7 @@ class AugmentationStrength:
     """How much pictures are augmented: each by amounts drawn evenly from these ranges."""
 
     occluded: float
-    """Share of the images with something in front."""
+    """Fraction of the images with something in front."""
     shade: float
     """Largest standard deviation of the logarithm of uneven light."""
     gamma: float
@@ -32,7 +32,7 @@ class AugmentationStrength:
     exposure: tuple[float, float]
     """Least and largest factor on values."""
     tint: float
-    """Largest share by which a channel is lighter or darker than that."""
+    """Largest fraction by which a channel is lighter or darker than that."""
     contrast: tuple[float, float]
     """Least and largest factor on values' difference from their mean."""
     offset: float
@@ -184,10 +184,10 @@ def _noise_line(num_values: int, device: torch.device) -> Tensor:
     return torch.from_numpy(values).to(device)
 
 
-def _occlude(images: Tensor, random: np.random.Generator, share: float) -> Tensor:
+def _occlude(images: Tensor, random: np.random.Generator, fraction: float) -> Tensor:
     """A copy, in which some images have a piece of another image of the batch in front: a rotated rectangle."""
     images, before = images.clone(), images
-    chosen = np.flatnonzero(random.random(len(images)) < share)
+    chosen = np.flatnonzero(random.random(len(images)) < fraction)
     for image, mask in zip(
         chosen.tolist(), _rectangles(len(chosen), images.shape[2], images.shape[3], random), strict=True
     ):

@@ -42,7 +42,7 @@ class Backgrounds(ABC):
         """Four fifths of the sources for training, or the others for tests."""
 
     def of_crops(self, least: float, largest: float) -> "Backgrounds":
-        """Views behind crops that span these shares of a frame's width; the same where views are of any scale."""
+        """Views behind crops that span these fractions of a frame's width; the same where views are of any scale."""
         return self
 
     @abstractmethod

@@ -25,7 +25,7 @@ _CLEARLY = 0.5  # of the strongest difference: a shadow beside a part is weaker
 _LEAST_AREA, _LARGEST_AREA = 0.001, 0.4  # of the frame
 _LEAST_UNSHADED = 0.2  # of all that differs; below it the part itself is a grey like a shadow
 _WELL_LIT = 0.9  # quantile of the photographs' values: shadows darken some, nothing makes paint lighter
-_LARGEST_SPREAD = 0.12  # of the photographs' tints, as shares of the largest channel
+_LARGEST_SPREAD = 0.12  # of the photographs' tints, as fractions of the largest channel
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def examine_mesh(path: Path, unit: Unit | None) -> tuple[Mesh | None, list[Findi
     findings = [Finding("mesh", "good", text), *_size(mesh, unit), *_origin(mesh), *_colours(mesh)]
     surface = list(examine_surface(mesh))
     if any(finding.fault == "stray parts" for finding in surface):
-        return mesh, [*findings, *surface]  # its diameter is not the object's, and every tolerance is a share of it
+        return mesh, [*findings, *surface]  # its diameter is not the object's, and every tolerance is a fraction of it
     return mesh, [*findings, *surface, _symmetries(find_symmetries(mesh))]
 
 

@@ -20,7 +20,7 @@ _BLACK, _WHITE = 3, 252
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A photograph's vital signs."""
+    """A photograph's measurements, by which whole folders are judged."""
 
     path: Path
     """Its file."""
@@ -37,7 +37,7 @@ class Photograph:
     blur: float
     """0 sharp to 1 blurred (Crété-Roffet et al. 2007), at no more than 640 pixels a side."""
     lost: float
-    """Share of the pixels that are black or white, and say nothing."""
+    """Fraction of the pixels that are black or white, and say nothing."""
 
 
 def measure(path: Path) -> Photograph:
@@ -81,7 +81,7 @@ def _exif(path: Path) -> tuple[int, float]:
 
 
 _BLURRED = 0.6  # sharp photographs of clutter: up to 0.45; blurred with a sigma of 2.5 pixels: 0.65 and more
-_TOLERATED = 0.1  # share of photographs
+_TOLERATED = 0.1  # fraction of photographs
 _EQUAL_LEVELS = 4.0  # two frames of one static scene differ by more somewhere, if anything moved
 _COMPARED = 60  # neighbours in brightness that each is compared with
 _MOSTLY_LOST = 0.6
@@ -156,7 +156,7 @@ def has_swapped_channels(picture: np.ndarray, reference: np.ndarray) -> bool:
 
 
 _SAME_LEVEL = 20.0  # of 255: noise, shadows and reflections of the object stay below
-_OTHER_SCENE = 0.25  # share of the background image that may differ from most photographs
+_OTHER_SCENE = 0.25  # fraction of the background image that may differ from most photographs
 _UNLIKE_WHEN_SHIFTED_BACK = 0.6
 _MOST_COMPARED = 100
 
@@ -184,41 +184,41 @@ def examine_background(path: Path, photographs: Sequence[Photograph]) -> Iterato
         yield from _compare(thumbnail(pixels), photographs)
 
 
-def _compare(plate: np.ndarray, photographs: Sequence[Photograph]) -> Iterator[Finding]:
+def _compare(background: np.ndarray, photographs: Sequence[Photograph]) -> Iterator[Finding]:
     """Objects move from photograph to photograph, so that the median of many shows the scene behind them."""
     seen = np.stack([photo.thumbnail for photo in photographs[:: 1 + len(photographs) // _MOST_COMPARED]])
     scene = np.median(seen, axis=0)
-    if _unlike(scene, plate) <= _OTHER_SCENE:
+    if _unlike(scene, background) <= _OTHER_SCENE:
         return
-    if has_swapped_channels(plate, scene):
+    if has_swapped_channels(background, scene):
         text = "the background image fits to the photographs with red and blue exchanged"
         remedy = "One of them was saved as BGR (OpenCV's order): save both as RGB"
         yield Finding("background colours", "bad", text, remedy, "likely", fault="swapped colours")
         return
-    gain = np.median(scene + 1, axis=(0, 1)) / np.median(plate + 1, axis=(0, 1))
-    if _unlike(scene, plate * gain) <= _OTHER_SCENE:
+    gain = np.median(scene + 1, axis=(0, 1)) / np.median(background + 1, axis=(0, 1))
+    if _unlike(scene, background * gain) <= _OTHER_SCENE:
         text = f"the photographs are {gain.mean():.2f} times as bright as the background image, which otherwise fits"
         remedy = "Fix exposure and white balance, then take the background image again"
         yield Finding("background exposure", "warning", text, remedy, "likely", fault="background exposure")
         return
-    yield _shifted_or_other(scene, plate)
+    yield _shifted_or_other(scene, background)
 
 
-def _shifted_or_other(scene: np.ndarray, plate: np.ndarray) -> Finding:
-    grey = [cv2.cvtColor(picture.astype(np.float32), cv2.COLOR_RGB2GRAY) for picture in (plate, scene)]
+def _shifted_or_other(scene: np.ndarray, background: np.ndarray) -> Finding:
+    grey = [cv2.cvtColor(picture.astype(np.float32), cv2.COLOR_RGB2GRAY) for picture in (background, scene)]
     window = cv2.createHanningWindow((THUMBNAIL_PX, THUMBNAIL_PX), cv2.CV_32F)
     (right, down), _ = cv2.phaseCorrelate(grey[0], grey[1], window)
-    carried = np.roll(plate, (round(down), round(right)), axis=(0, 1))
-    if _unlike(scene, carried) < _UNLIKE_WHEN_SHIFTED_BACK * _unlike(scene, plate):
+    carried = np.roll(background, (round(down), round(right)), axis=(0, 1))
+    if _unlike(scene, carried) < _UNLIKE_WHEN_SHIFTED_BACK * _unlike(scene, background):
         across, along = (f"{step / THUMBNAIL_PX:.0%}" for step in (right, down))
         text = f"the background image seems shifted by {across} of the width and {along} of the height"
         remedy = "The camera was moved: take background image and photographs from one tripod position"
         return Finding("background", "bad", text, remedy, "likely", fault="background shifted")
-    text = f"{_unlike(scene, plate):.0%} of the background image differs from what most photographs show there"
+    text = f"{_unlike(scene, background):.0%} of the background image differs from what most photographs show there"
     remedy = "It is of another scene, light or camera position: take it again, or use --backgrounds"
     return Finding("background", "bad", text, remedy, "likely", fault="other background")
 
 
-def _unlike(scene: np.ndarray, plate: np.ndarray) -> float:
-    """Share of the thumbnail's pixels that differ in a channel."""
-    return float((np.abs(scene - plate).max(axis=2) > _SAME_LEVEL).mean())
+def _unlike(scene: np.ndarray, background: np.ndarray) -> float:
+    """Fraction of the thumbnail's pixels that differ in a channel."""
+    return float((np.abs(scene - background).max(axis=2) > _SAME_LEVEL).mean())

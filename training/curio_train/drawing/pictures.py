@@ -140,8 +140,8 @@ def _photograph(scene: Scene) -> np.ndarray:
 
 def _carried(scene: Scene, around: SceneContext, turn_deg: float) -> tuple[Scene, SceneContext]:
     """Everything as the camera sees it that was carried round the middle, still looking at it."""
-    places = [item.pose.translation_m for item in scene.objects]
-    center = np.mean(places, axis=0) if around.center_m is None and places else around.center_m
+    positions = [item.pose.translation_m for item in scene.objects]
+    center = np.mean(positions, axis=0) if around.center_m is None and positions else around.center_m
     if turn_deg == 0 or center is None:
         return scene, around
     turn = Rotation.from_rotvec(-np.radians(turn_deg) * np.array(around.up)).as_matrix()

@@ -68,7 +68,7 @@ def draw(world: World, code: SceneCode) -> Drawing:
 
 
 def inside(photographs: Tensor, drawing: Drawing, backgrounds: Tensor) -> Float[Tensor, " num"]:
-    """Share of the silhouette that looks as drawn; 0 where there is none.
+    """Fraction of the silhouette that looks as drawn; 0 where there is none.
 
     Args:
         photographs: [num, 3, height, width], sRGB in [0, 1].
@@ -81,7 +81,7 @@ def inside(photographs: Tensor, drawing: Drawing, backgrounds: Tensor) -> Float[
 
 
 def inlier_ratio(photographs: Tensor, drawing: Drawing) -> Float[Tensor, " num"]:
-    """Share of what the surroundings, continued, do not explain of photographs and the drawing does; 0 at worst.
+    """Fraction of what the surroundings, continued, do not explain of photographs and the drawing does; 0 at worst.
 
     Differences are robust (Geman and McClure 1987), as in :mod:`~curio_train.refinement.render_and_compare`.
 

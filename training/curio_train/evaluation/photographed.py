@@ -42,10 +42,12 @@ class Judgement:
     """How far re-renderings are from photographs."""
 
     metrics: Mapping[str, float]
-    """Means ``own_view_inside`` and ``own_view_overlap`` (without a background image ``own_view_explained``). In free
-    space ``own_view_agreeing``, the share of photographs. On a plane of each view ``…_dssim`` and ``…_dssim_blurred``,
-    the same of the empty background image as ``…_plate_…``, and ``better_than_plate``, the share of scenes in which the
-    last view is nearer than its background image."""
+    """Means ``own_view_inside`` and ``own_view_overlap`` (without a background image ``own_view_explained``).
+
+    In free space also ``own_view_agreeing``, the fraction of photographs that agree. On a plane, of each view,
+    ``…_dssim`` and ``…_dssim_blurred``, the same of the empty background image as ``…_plate_…``, and
+    ``better_than_plate``, the fraction of scenes in which the last view is nearer than its background image.
+    """
     verdict: str
     """Whether to trust the model, and what to do if not."""
     columns: Mapping[str, Tensor]
@@ -171,12 +173,12 @@ def _errors(view: PhotographSet, images: Tensor) -> tuple[dict[str, Tensor], dic
     return of_both[0], of_both[1]
 
 
-def _verdict(share: float, num: int, second: bool) -> str:
+def _verdict(fraction: float, num: int, second: bool) -> str:
     where = "from the second camera" if second else "from the own camera, which cannot tell depth,"
-    found = f"in {share:.0%} of {num} scenes what was found, seen {where} is nearer to the photograph than no part"
-    if share >= _TRUSTED:
+    found = f"in {fraction:.0%} of {num} scenes what was found, seen {where} is nearer to the photograph than no part"
+    if fraction >= _TRUSTED:
         return f"Trust it: {found}."
-    if share >= _DOUBTFUL:
+    if fraction >= _DOUBTFUL:
         return f"Trust it with care: {found}; look at the worst scenes, and train longer (--images) or --method sleep."
     return (
         f"Do not trust it: {found}. Train longer (--images) or with --method sleep; if that does not help, look "
@@ -185,18 +187,18 @@ def _verdict(share: float, num: int, second: bool) -> str:
     )
 
 
-def _verdict_in_space(share: float, num: int, has_background_image: bool, num_empty: int) -> str:
+def _verdict_in_space(fraction: float, num: int, has_background_image: bool, num_empty: int) -> str:
     measure = (
         "covers what differs from the background image" if has_background_image else "explains what stands out there"
     )
-    found = f"in {share:.0%} of {num} photographs what was found {measure}"
+    found = f"in {fraction:.0%} of {num} photographs what was found {measure}"
     limits = "a tenth of a diameter cannot be told from a fifth"
     if not has_background_image:
         limits += "; --background tells right from wrong better"
     advice = "train longer (--images), or tell the network more (--upright, narrower --near-m and --far-m)"
-    if share >= _TRUSTED:
+    if fraction >= _TRUSTED:
         text = f"Trust it: {found}; {limits}."
-    elif share >= _DOUBTFUL:
+    elif fraction >= _DOUBTFUL:
         text = f"Trust it with care: {found}; look at the worst ones, and {advice}; {limits}."
     else:
         text = (

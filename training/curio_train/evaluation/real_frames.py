@@ -166,7 +166,7 @@ def _metrics(pairs: Pairs, points: np.ndarray, info: ModelInfo) -> dict[str, flo
 
 
 def _recall(name: str, pairs: Pairs, points: np.ndarray, info: ModelInfo) -> dict[str, float]:
-    """Share of poses found, with its interval under the same name."""
+    """Fraction of poses found, with its interval under the same name."""
     errors = add_errors([e.pose for e, _ in pairs], [target.pose for _, target in pairs], points, info)
     low, high = bootstrap_interval([float(error < ADD_THRESHOLD) for error in errors])
     return {name: recall(errors, ADD_THRESHOLD), f"{name}_low": low, f"{name}_high": high}

@@ -63,7 +63,7 @@ def novel_view_dssim(world: World, predicted: SceneCode, true: SceneCode) -> Flo
 
 
 def add_errors(estimates: Sequence[Pose], truths: Sequence[Pose], points: np.ndarray, info: ModelInfo) -> list[float]:
-    """ADD, or ADD-S of symmetric objects, as shares of the diameter."""
+    """ADD, or ADD-S of symmetric objects, as fractions of the diameter."""
     pairs = zip(estimates, truths, strict=True)
     return [add_or_add_s_m(estimate, truth, points, info) / info.diameter_m for estimate, truth in pairs]
 
@@ -78,7 +78,7 @@ def rotation_errors_deg(estimates: Sequence[Pose], truths: Sequence[Pose], info:
 def pose_scores(
     estimates: Sequence[Pose], truths: Sequence[Pose], points: np.ndarray, info: ModelInfo
 ) -> dict[str, float]:
-    """Share of poses found, with rotation and position errors beside.
+    """Fraction of poses found, with rotation and position errors beside.
 
     Of symmetric objects the rotation error is to the closest of the poses that look alike.
 

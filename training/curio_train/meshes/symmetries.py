@@ -1,9 +1,10 @@
 """Rotations that carry a shape onto itself, found from the mesh and written as BOP's ``models_info.json`` has them.
 
-A rotation counts when, of points spread evenly over the turned surface, 95 % lie within :data:`TOLERANCE` of the
-surface and all within :data:`LARGEST_MISS`, both as shares of the diameter, after the turn was fitted. BOP's annotation
-of scanned objects allows such deviations, too: the two symmetric objects of LM-O miss by 1.7 % and 4.9 %, the closest
-of the others by 4.4 % and 11 %. Only geometry is looked at: paint may tell sides apart that this calls the same.
+A rotation counts as a symmetry when, of points spread evenly over the rotated surface, 95 % lie within
+:data:`TOLERANCE` of the surface and all within :data:`LARGEST_MISS`; both are fractions of the diameter, and the
+rotation is fitted first. BOP's annotation of scanned objects allows such deviations, too: the two symmetric objects of
+LM-O deviate by 1.7 % and 4.9 %, the closest of the others by 4.4 % and 11 %. Only geometry is compared: paint may tell
+sides apart that this module calls the same.
 """
 
 from collections.abc import Iterator
@@ -110,13 +111,13 @@ class _Surface:
             directions = np.cos(angles) * first + np.sin(angles) * second
         else:
             return
-        promise, looked_at = np.array([self._promise(axis) for axis in directions]), unique
-        for axis in directions[np.argsort(promise)][: int((promise < _COARSE * TOLERANCE).sum())]:
+        least_miss, looked_at = np.array([self._least_miss(axis) for axis in directions]), unique
+        for axis in directions[np.argsort(least_miss)][: int((least_miss < _COARSE * TOLERANCE).sum())]:
             if not any(_same_line(axis, other, _SAME_DEG) for other in looked_at):
                 looked_at.append(axis)
                 yield axis
 
-    def _promise(self, axis: np.ndarray) -> float:
+    def _least_miss(self, axis: np.ndarray) -> float:
         """Smallest miss of a turn of prime order about an axis: turns of every other order contain such turns."""
         distances = [self._tree.query(self._few @ _turn(axis, 2 * np.pi / order).T)[0] for order in (2, 3, 5, 7, 11)]
         return float(min(np.percentile(distance, 95) for distance in distances))

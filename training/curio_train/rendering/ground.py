@@ -29,7 +29,7 @@ class Ground:
         Args:
             ambient: Radiance from everywhere; it knows no shadows.
             light: Camera frame, towards the light; its length is the strength.
-            shadow: Share of each pixel that no light reaches.
+            shadow: Fraction of each pixel that no light reaches.
         """
         albedo = linear_from_srgb(light.new_tensor(self.albedo_srgb))
         sun = (light @ torch.as_tensor(self.up).to(light)).clamp(min=0)
