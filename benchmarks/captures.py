@@ -1,4 +1,4 @@
-"""The paper's Table 4 on stand-ins for its captures: make photographs, learn from them, judge from a second camera.
+"""The paper's Table 4 on synthetic captures: make photographs, learn from them, judge from a second camera.
 
     python benchmarks/captures.py [--only sphere_real] [--methods noncur our] [--images 16000] [--jobs 2] [--dry-run]
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from curio_train.commands.cli import answer
+from curio_train.commands.running import answer
 from paper.captures_table import METHODS, Table, markdown, row
 from paper.results import load_rows, save_results
 from paper.run_queue import QueuedRun, carry_out

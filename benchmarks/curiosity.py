@@ -4,10 +4,10 @@
 
 Runs of image loss alone with each of these changed, beside the paper's method with batch and with instance norm in the
 critic, without the critic's gradient penalty, with learning rates that stay as they are, and full supervision, in one
-world. By default that is Chairs, read by cells: there image loss alone stays where it is, and the paper's method does
-not. Each run is trained and scored in a folder of its own under ``runs/curiosity``; after each, the world's part of
-docs/results/curiosity.json and curiosity.md is written anew. Stop it at any time: the same command goes on where it
-stopped.
+world. By default that is Chairs, read by the dense decoder: there image loss alone stays where it is, and the paper's
+method does not. Each run is trained and scored in a folder of its own under ``runs/curiosity``; after each, the world's
+part of docs/results/curiosity.json and curiosity.md is written anew. Stop it at any time: the same command goes on
+where it stopped.
 
 para, img   Eq. 1 and DSSIM from the novel view
 """
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
-from curio_train.commands.cli import answer
+from curio_train.commands.running import answer
 from curio_train.config import PRESETS
 from curio_train.errors import UsageError
 from paper.run_queue import QueuedRun, carry_out
@@ -95,7 +95,7 @@ def write(settings: Settings, runs: list[QueuedRun]) -> None:
     if not rows:
         return
     results = json.loads(settings.results.read_text(encoding="utf-8")) if settings.results.exists() else {}
-    title = settings.world + (", read by cells" if settings.reading == "cells" else "")
+    title = settings.world + (", read by the dense decoder" if settings.reading == "cells" else "")
     found = results.get(title, {}) | rows
     results[title] = {name: found[name] for name in VARIANTS if name in found}
     settings.results.parent.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,7 @@
 
     python benchmarks/endurance.py [--json] [--out FILE]
                                    [--requests 50000] [--replacements 50] [--connections 10000] [--fuzz 100000]
+                                   [--attacks 20]
 
 rss_growth            memory after all requests over memory after a tenth of them, after the same pause; at most 1.05
 failed_calls          calls of clients with retries that failed while a model was replaced so many times; none may
@@ -10,6 +11,9 @@ connections_survived  so many connections opened with no, half and wrong beginni
 fuzzed                so many strange requests by ``tests/serving/test_fuzz.py``, each with a defined status and a good
                       answer after it; found failures stay in ``.hypothesis`` and belong into ``tests/serving/corpus``
 
+attacked_mb           largest resident memory of a server under each of the attacks of ``load/attacks.py``, for so many
+                      seconds each; ``answered`` the part of the calls of an honest client beside them that is answered
+                      within 5 s, and ``attacked_stop_s`` how long SIGTERM takes in the middle of the work
 A part is left out with 0. Exit status 1: one of them does not hold. What has been reached is said on stderr. With
 ``--out`` the figures are written to a file after each part and each 10,000 strange requests, and a run that was cut off
 goes on after the last of them; for another version of the server, take another file.
@@ -34,6 +38,7 @@ from typing import Any
 import tyro
 from curio_serve.client import PoseClient
 from curio_serve.errors import CurioError
+from load.attacks import much_work, raw_frames, unfinished, unfolding
 from load.generator import MODEL, WIDTH, K, closed_loop_of, make_frames, pose_target
 from load.network import write_model
 
@@ -44,6 +49,8 @@ _OPENINGS = (b"", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n"
 _NUM_FUZZ_TESTS = 4
 _FUZZ_ROUND, _FUZZ_LIMIT_S = 10_000, 3600.0
 _LARGEST_GROWTH = 1.05
+# Of deploy/compose.yaml and deploy/kubernetes/deployment.yaml.
+_LARGEST_MB, _LEAST_ANSWERED, _HONEST_S = 1024, 0.9, 5.0
 
 
 @dataclass(frozen=True)
@@ -62,6 +69,8 @@ class Arguments:
     """Connections opened and dropped."""
     fuzz: int = 100_000
     """Strange requests."""
+    attacks: float = 20.0
+    """Seconds of each attack."""
 
 
 def main() -> None:
@@ -77,6 +86,7 @@ def main() -> None:
             ("rss_growth", memory, arguments.requests),
             ("connections_survived", connections, arguments.connections),
             ("failed_calls", replacements, arguments.replacements),
+            ("attacked_mb", attacked, arguments.attacks),
         )
         for figure, part, number in parts:
             if number and figure not in figures:
@@ -92,6 +102,9 @@ def main() -> None:
         figures.get("rss_growth", 1.0) <= _LARGEST_GROWTH
         and not figures.get("failed_calls")
         and figures.get("fuzz_status", 0) == 0
+        and max(figures.get("attacked_mb", {"": 0}).values()) <= _LARGEST_MB
+        # Raw frames are honest, and more than a small server can do: who comes beside them may be refused, too.
+        and all(part >= _LEAST_ANSWERED for name, part in figures.get("answered", {}).items() if name != "raw_frames")
     )
     sys.exit(0 if holds else 1)
 
@@ -181,6 +194,47 @@ def replacements(models: Path, frames: list[bytes], num_replacements: int) -> di
     if num_replacements + 2 in seen:
         failures.append("a broken version answered")
     return {"failed_calls": len(failures), "replaced_answers": num_answers, "versions_seen": len(seen)}
+
+
+def attacked(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any]:
+    """Each attack on a server of its own, beside an honest client; SIGTERM while the attack goes on."""
+    peaks_mb, parts, stops_s = {}, {}, {}
+    cores = sorted(os.sched_getaffinity(0))
+    for attack in (unfolding, raw_frames, much_work, unfinished):
+        with (
+            running_server(models, cores, "--grace-s", "3") as (address, pid),
+            worker(cores) as attacker,
+            ThreadPoolExecutor(1) as pool,
+        ):
+            running = pool.submit(attacker, attack, address, seconds)
+            parts[attack.__name__] = _honest_part(address, frames[0], seconds - 2)
+            peaks_mb[attack.__name__] = memory_mb(pid)[1]
+            begun = time.monotonic()
+            os.kill(pid, signal.SIGTERM)
+            _wait_until(lambda pid=pid: _has_ended(pid))
+            stops_s[attack.__name__] = round(time.monotonic() - begun, 2)
+            _say(f"{attack.__name__}: {running.result()} calls, {peaks_mb}, {parts}, {stops_s}")
+    return {"attacked_mb": peaks_mb, "answered": parts, "attacked_stop_s": stops_s}
+
+
+def _has_ended(pid: int) -> bool:
+    """Whether a child has ended, which its parent has not yet asked about."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+def _honest_part(address: str, frame: bytes, seconds: float) -> float:
+    """The part of a client's calls, five a second, that are answered within 5 s."""
+    codes: Counter[bool] = Counter()
+    end = time.monotonic() + seconds
+    with PoseClient(address, timeout_s=_HONEST_S) as client:
+        while time.monotonic() < end:
+            try:
+                codes[bool(client.detect(MODEL, frame, K).results)] += 1
+            except CurioError as exc:
+                _say(f"an honest call failed: {exc}")
+                codes[False] += 1
+            time.sleep(0.2)
+    return round(codes[True] / codes.total(), 3)
 
 
 def _put(folder: Path, data: bytes) -> None:

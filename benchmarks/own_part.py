@@ -2,10 +2,10 @@
 
     python benchmarks/own_part.py [--minutes 26.5] [--photos 200] [--tests 50] [--out runs/own_part] [--json]
 
-An unpainted STL, 200 path traced photographs of it on a table, a plate and a camera file, calibrated from photographs
-of a chessboard, are made first (see ``benchmarks/make_captures.py``); what is there already is kept. Then the installed
-commands look at the files, train and export, and detect in 50 photographs that nothing has seen. The last line is the
-result, also in OUT/own_part.json:
+An unpainted STL, 200 path traced photographs of it on a table, a background image and a camera file, calibrated from
+photographs of a chessboard, are made first (see ``benchmarks/make_captures.py``); what is there already is kept. Then
+the installed commands look at the files, train and export, and detect in 50 photographs that nothing has seen. The last
+line is the result, also in OUT/own_part.json:
 
 right       share of the unseen photographs in which ADD(-S) is below a tenth of the diameter
 add_median  of ADD(-S), in diameters
@@ -96,8 +96,7 @@ def _score(files: Path, poses: Path) -> dict[str, Any]:
     add, turned, confidence = [], [], []
     for answer in found:
         (label,) = labels[f"test/a/{Path(answer['image']).name}"]
-        truth = np.array(label["cam_from_obj"])
-        true, best = Pose(truth[:3, :3], truth[:3, 3]), answer["detections"][0]
+        true, best = Pose.from_matrix(np.array(label["cam_from_obj"])), answer["detections"][0]
         pose = Pose(np.array(best["rotation"]), np.array(best["translation_m"]))
         add.append(add_or_add_s_m(pose, true, mesh.vertices_m, info) / mesh.diameter_m)
         turned.append(rotation_error_deg(pose, true))

@@ -14,13 +14,14 @@ import json
 import statistics
 import time
 from collections import defaultdict
+from dataclasses import replace
 from typing import Any
 
 import torch
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import SceneCode
 from curio_train.worlds import WORLDS, build
-from curio_train.worlds.generated.mesh_world import MeshWorld
+from curio_train.worlds.generated.generated_world import GeneratedWorld
 from renderer import AMBIENT, BATCH, SAMPLES, SIZE, draw_poses, log, our_step, root_mesh, seconds
 
 NUM_STEPS, NUM_KERNELS = 9, 12
@@ -78,11 +79,12 @@ def shadows() -> dict[str, dict[str, float]]:
     found = {}
     for name in ("chairs", "light"):
         world = build(WORLDS[name]())
-        assert isinstance(world, MeshWorld)
+        assert isinstance(world, GeneratedWorld)
         code = world.sample(BATCH, (0,))
         with torch.no_grad():
             behind = world.render({**code, "translation_m": code["translation_m"] + 1000})
-        plain = type(name, (type(world),), {"object_shadows": False})()
+        setup, (position, _, *fields) = replace(world.setup, object_shadows=False), world.layout.fields
+        plain = GeneratedWorld(name, world.kinds, setup, position, world.orientation, fields)
         times = {"with": _cpu_ms(world, code, None), "without": _cpu_ms(plain, code, behind)}
         log(f"{name}: {times}")
         found[name] = {f"{key}_shadows_cpu_ms": round(value, 1) for key, value in times.items()}
@@ -90,7 +92,7 @@ def shadows() -> dict[str, dict[str, float]]:
     return found
 
 
-def _cpu_ms(world: MeshWorld, code: SceneCode, backgrounds: torch.Tensor | None) -> float:
+def _cpu_ms(world: GeneratedWorld, code: SceneCode, backgrounds: torch.Tensor | None) -> float:
     def step() -> float:
         attached = {name: value.clone().requires_grad_() for name, value in code.items()}
         start = time.process_time()

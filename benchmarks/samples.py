@@ -13,12 +13,17 @@ import cv2
 import numpy as np
 import torch
 import tyro
-from curio_train.commands.cli import answer
+from curio_train.commands.running import answer
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.data.bop import BopDataset
 from curio_train.geometry import Pose
 from curio_train.rendering.renderer import Renderer
-from curio_train.worlds.single_object.viewpoints import AMBIENT, lights, turned_towards, upper_views
+from curio_train.worlds.single_object.viewpoints import (
+    AMBIENT,
+    allocentric_to_egocentric,
+    random_lights,
+    upper_hemisphere_rotations,
+)
 from torch import Tensor
 
 SEED = 20_211
@@ -55,14 +60,14 @@ def draw(settings: Settings) -> int:
     poses: dict[str, list[dict[str, object]]] = {}
     for number in range(settings.num_frames):
         place = _places(len(names), random)
-        rotation = turned_towards(place, upper_views(len(names), random))
+        rotation = allocentric_to_egocentric(place, upper_hemisphere_rotations(len(names), random))
         with torch.no_grad():
             image = renderer(
                 rotation[None],
                 place[None],
                 camera_matrix=camera.matrix,
                 backgrounds=behind.draw(1, camera.width, camera.height, (SEED, number)),
-                light=lights(1, random),
+                light=random_lights(1, random),
                 seed=number,
             )[0]
         name = f"{number:02d}.jpg"

@@ -51,7 +51,7 @@ def bare_loop(model_folder: Path) -> Callable[[bytes], None]:
         header = open_header(data)
         reduction = detector.reduction(camera, header.width, header.height)
         frame = decode(data, header=header, max_reduction=reduction)
-        view = PinholeFrame(frame.pixels, camera, model.camera, frame.reduction).look(region)
+        view = PinholeFrame(frame.pixels, camera, model.camera, frame.reduction).crop(region)
         model.run(view.image[None])
 
     return one

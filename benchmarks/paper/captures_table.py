@@ -39,16 +39,16 @@ def markdown(table: Table, command: str) -> str:
     parts = [
         "# Captures: learned from photographs, judged from a second camera",
         f"Written by `{command}` from [captures.json](captures.json). DSSIM between the second camera's photograph and"
-        " what was read in the first camera's, drawn from there over its plate; *blurred*: both behind a 9x9 Gaussian"
-        " filter. Smaller is better. Photographs are stand-ins ([recipe](../recipes/capture.md)), so the paper's"
-        " figures, in brackets, are of other photographs: what compares is the order of methods. `sleep` and"
+        " what was read in the first camera's, drawn from there over its background image; *blurred*: both behind a 9x9"
+        " Gaussian filter. Smaller is better. Photographs are synthetic captures ([recipe](../recipes/capture.md)), so"
+        " the paper's figures, in brackets, are of other photographs: only the order of methods compares. `sleep` and"
         " `sleep_cells` go beyond the paper: they learn from renderings of codes that the world draws itself, synthetic"
         " labels in the sense of the paper's LineMOD table; the latter with another network, which reads images cell by"
         " cell (`--reading cells`, usual on a plane). Nobody labels anything in any row.",
         _errors(table),
-        "*Empty plate*: the error of finding nothing at all.",
+        "*Empty background image*: the error of finding nothing at all.",
         "## How they were made",
-        _making(table),
+        _provenance(table),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -64,13 +64,22 @@ def _errors(table: Table) -> str:
                 beside = "" if theirs is None else f" ({theirs[place]:.2f})"
                 cells.append(f"{rows[method][kind]:.4f}{beside}" if method in rows else "–")
         lines.append(cells)
-    plates = [next(iter(rows.values()))["plate"] for rows in table.values()]
-    lines.append(["empty plate", *(f"{value:.4f}" for plate in plates for value in plate)])
+    backgrounds = [next(iter(rows.values()))["plate"] for rows in table.values()]
+    lines.append(["empty background image", *(f"{value:.4f}" for plate in backgrounds for value in plate)])
     return _grid(headings, lines)
 
 
-def _making(table: Table) -> str:
-    headings = ["scene", "method", "nearer than the plate", "own view", "images seen", "seed", "minutes", "machine"]
+def _provenance(table: Table) -> str:
+    headings = [
+        "scene",
+        "method",
+        "nearer than the background image",
+        "own view",
+        "images seen",
+        "seed",
+        "minutes",
+        "machine",
+    ]
     lines = [
         [
             scene,

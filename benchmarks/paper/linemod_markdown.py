@@ -110,7 +110,7 @@ def _means(rows: Sequence[tuple[str, Row]]) -> list[str]:
     metrics = [row["real"]["metrics"] for _, row in rows]
     visible = [found[_VISIBLE] for found in metrics if _VISIBLE in found]
     rendered = _percent(mean(row["rendered"]["add_recall"] for _, row in rows))
-    certainty = [_mean_of(rows, name) for name in ("confidence_ece", "present_auroc")]
+    calibration = [_mean_of(rows, name) for name in ("confidence_ece", "present_auroc")]
     real = [_percent(mean(found["add_recall"] for found in metrics)), "", _number(every, 1)]
     return [
         "",
@@ -118,7 +118,7 @@ def _means(rows: Sequence[tuple[str, Row]]) -> list[str]:
         rendered,
         "",
         "",
-        *certainty,
+        *calibration,
         *real,
         _percent(mean(visible)) if visible else _NOTHING,
         "",

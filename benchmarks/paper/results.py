@@ -45,7 +45,7 @@ _M_PER_MM = 1e-3
 
 
 def method_name(method: str, labels: float, reading: str) -> str:
-    """The name of a row: of supervision with its share of labels, of images read by cells with those."""
+    """The name of a row: of supervision with its share of labels, of images read by the dense decoder with those."""
     of_method = f"super_{labels:g}" if labels not in (0, 1) else REFERENCE if method == "super" else method
     return of_method if reading == "whole" else f"{of_method}_{reading}"
 
@@ -85,8 +85,8 @@ def _row(world: str, runs: Sequence[Mapping[str, Any]]) -> Row:
         "seconds": round(mean(run["training_seconds"] for run in runs), 1),
         "machine": runs[0]["machine"],
         "commit": runs[-1]["commit"],
-        "label_free": "label" not in terms,
-        "synthetic_labels": "sleep" in terms,
+        "label_free": not terms.label,
+        "synthetic_labels": terms.sleep,
     }
 
 

@@ -3,8 +3,12 @@
 Runs in the peers' environments, so it imports what those have: numpy, OpenCV, onnxruntime.
 """
 
+import os
+
 import cv2
 import numpy as np
+
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read when onnxruntime is imported
 import onnxruntime
 
 INPUT = "image"

@@ -1,4 +1,4 @@
-"""A stand-in's camera, calibrated as a user's is: from photographs of a chessboard held before it.
+"""A synthetic capture's camera, calibrated as a user's is: from photographs of a chessboard held before it.
 
 So what the camera file gets wrong is what :mod:`~curio_train.capture.calibration` gets wrong at this many pixels.
 """

@@ -1,14 +1,12 @@
-"""Make a stand-in capture: a folder as somebody with a camera, a table and a CAD file would bring it.
+"""Make a synthetic capture capture: a folder as somebody with a camera, a table and a CAD file would bring it.
 
 ::
 
-    OUT/NAME/calibration/*.png  a chessboard held before the camera
-             camera.json        as calibrated from them: all of it a little off
-             meshes/*.stl       metres, no colours
-             photos/*.png       for training, from the first camera
-             plates/a-*.png     the empty table from each place of the first camera; plates/b.png from the second
-             test/a/ test/b/    one scene from both cameras, about 90° apart
-             views.json         of every photograph its plate and cam_from_world (a little off, as after calibration)
+    OUT/NAME/calibration/*.png  a chessboard held before the camera camera.json        as calibrated from them: all of
+             it a little off meshes/*.stl       metres, no colours photos/*.png       for training, from the first
+             camera background images/a-*.png     the empty table from each place of the first camera; background
+             images/b.png from the second test/a/ test/b/    one scene from both cameras, about 90° apart views.json
+             of every photograph its background image and cam_from_world (a little off, as after calibration)
              labels/*.json      what is where: for scoring alone, never for training
 
 Every picture is a function of the scene's name and its number, and is written whole or not at all: an interrupted
@@ -26,13 +24,13 @@ from typing import Any
 import cv2
 import numpy as np
 import trimesh
-from curio_train.capture.camera_json import save_intrinsics
+from curio_train.camera import save_intrinsics
 from curio_train.errors import DataError, UsageError
 from scipy.spatial.transform import Rotation
 
 from synthetic_captures import scenes
 from synthetic_captures.boards import calibrated, photograph_boards
-from synthetic_captures.path_traced import PathTracedScene, Thing
+from synthetic_captures.path_traced import PathTracedScene, SyntheticObject
 from synthetic_captures.sensor import Sensor
 
 _TABLE_M = 2.4
@@ -58,7 +56,7 @@ class Amount:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shot:
+class _Photograph:
     """One picture to be taken: its file, its camera's azimuth, and the scene (None: empty)."""
 
     file: str
@@ -67,7 +65,7 @@ class _Shot:
 
 
 def make(name: str, folder: Path, amount: Amount, progress: Callable[[str], None]) -> int:
-    """Make a stand-in, or what is missing of it.
+    """Make a synthetic capture, or what is missing of it.
 
     Args:
         name: sphere_real, bunny, shapes or part.
@@ -84,36 +82,36 @@ def make(name: str, folder: Path, amount: Amount, progress: Callable[[str], None
         RendererError: The renderer cannot start.
     """
     if name not in scenes.NAMES:
-        raise UsageError(f"found no stand-in {name!r}, expected one of {', '.join(scenes.NAMES)}")
+        raise UsageError(f"found no synthetic capture {name!r}, expected one of {', '.join(scenes.NAMES)}")
     root = folder / name
-    shots = list(_shots(name, amount))
+    photographs = list(_photographs(name, amount))
     try:
-        _describe(name, root, shots)
-        missing = [shot for shot in shots if not (root / shot.file).exists()]
+        _describe(name, root, photographs)
+        missing = [photograph for photograph in photographs if not (root / photograph.file).exists()]
         taker = _Taker(name, amount.samples_per_pixel) if missing else None
-        for number, shot in enumerate(missing):
+        for number, photograph in enumerate(missing):
             if taker is not None:
-                _save(root / shot.file, taker.take(shot))
-            progress(f"{name}: {len(shots) - len(missing) + number + 1} of {len(shots)} pictures")
+                _save(root / photograph.file, taker.take(photograph))
+            progress(f"{name}: {len(photographs) - len(missing) + number + 1} of {len(photographs)} pictures")
     except OSError as exc:
         raise DataError(f"{root}: cannot be written ({exc.strerror}); name another folder") from exc
     return len(missing)
 
 
-def _shots(name: str, amount: Amount) -> Iterator[_Shot]:
+def _photographs(name: str, amount: Amount) -> Iterator[_Photograph]:
     world = scenes.NAMES.index(name)
     stations = scenes.NUM_STATIONS if name == "bunny" else 1
     for station in range(stations):
-        yield _Shot(f"plates/a-{station}.png", scenes.azimuth_deg(name, station), None)
-    yield _Shot("plates/b.png", SECOND_CAMERA_DEG, None)
+        yield _Photograph(f"plates/a-{station}.png", scenes.azimuth_deg(name, station), None)
+    yield _Photograph("plates/b.png", SECOND_CAMERA_DEG, None)
     for number in range(amount.num_photos):
         # The moving camera's object lies still while the camera goes once along its arc.
         seed = (world, 0, number // stations)
-        yield _Shot(f"photos/{number:04}.png", scenes.azimuth_deg(name, number), seed)
+        yield _Photograph(f"photos/{number:04}.png", scenes.azimuth_deg(name, number), seed)
     for number in range(amount.num_tests):
         seed = (world, 1, number)
-        yield _Shot(f"test/a/{number:04}.png", 0.0, seed)
-        yield _Shot(f"test/b/{number:04}.png", SECOND_CAMERA_DEG, seed)
+        yield _Photograph(f"test/a/{number:04}.png", 0.0, seed)
+        yield _Photograph(f"test/b/{number:04}.png", SECOND_CAMERA_DEG, seed)
 
 
 class _Taker:
@@ -123,7 +121,7 @@ class _Taker:
         meshes = [kind.mesh for kind in scenes.kinds(name) for _ in range(kind.count)]
         self._name, self._count = name, len(meshes)
         self._scene = PathTracedScene(
-            [Thing(mesh, scenes.colour(slot)) for slot, mesh in enumerate(meshes)],
+            [SyntheticObject(mesh, scenes.colour(slot)) for slot, mesh in enumerate(meshes)],
             scenes.table_look(),
             _TABLE_M,
             scenes.camera_matrix(name),
@@ -133,18 +131,18 @@ class _Taker:
             samples_per_pixel=samples_per_pixel,
         )
 
-    def take(self, shot: _Shot) -> np.ndarray:
+    def take(self, photograph: _Photograph) -> np.ndarray:
         """The photograph [height, width, 3] uint8."""
         poses: list[np.ndarray | None] = [None] * self._count
-        if shot.scene_seed is not None:
-            for placed in scenes.draw(self._name, np.random.default_rng(shot.scene_seed)):
+        if photograph.scene_seed is not None:
+            for placed in scenes.draw(self._name, np.random.default_rng(photograph.scene_seed)):
                 poses[placed.slot] = placed.world_from_obj
-        seed = zlib.crc32(shot.file.encode()) % 2**31
-        radiance = self._scene.photograph(scenes.cam_from_world(shot.azimuth_deg), poses, seed)
+        seed = zlib.crc32(photograph.file.encode()) % 2**31
+        radiance = self._scene.photograph(scenes.cam_from_world(photograph.azimuth_deg), poses, seed)
         return Sensor(_EXPOSURE).develop(radiance, np.random.default_rng(seed))
 
 
-def _describe(name: str, root: Path, shots: list[_Shot]) -> None:
+def _describe(name: str, root: Path, photographs: list[_Photograph]) -> None:
     """Everything but the pictures; cheap enough to be written each time."""
     for folder in ("calibration", "meshes", "photos", "plates", "test/a", "test/b", "labels"):
         (root / folder).mkdir(parents=True, exist_ok=True)
@@ -155,15 +153,25 @@ def _describe(name: str, root: Path, shots: list[_Shot]) -> None:
     photograph_boards(root / "calibration", scenes.camera_matrix(name), scenes.frame_size(name), seed)
     save_intrinsics(root / "camera.json", calibrated(root / "calibration"))
     random = np.random.default_rng(seed)
-    measured = {azimuth: _measured(azimuth, random) for azimuth in dict.fromkeys(shot.azimuth_deg for shot in shots)}
-    plates = {shot.azimuth_deg: shot.file for shot in shots if shot.scene_seed is None}
+    measured = {
+        azimuth: _measured(azimuth, random)
+        for azimuth in dict.fromkeys(photograph.azimuth_deg for photograph in photographs)
+    }
+    backgrounds = {
+        photograph.azimuth_deg: photograph.file for photograph in photographs if photograph.scene_seed is None
+    }
     views = {
-        shot.file: {"plate": plates[shot.azimuth_deg], "cam_from_world": measured[shot.azimuth_deg]} for shot in shots
+        photograph.file: {
+            "plate": backgrounds[photograph.azimuth_deg],
+            "cam_from_world": measured[photograph.azimuth_deg],
+        }
+        for photograph in photographs
     }
     _write_json(root / "views.json", views)
     for part in ("photos", "test"):
         _write_json(
-            root / "labels" / f"{part}.json", _labels(name, [shot for shot in shots if shot.file.startswith(part)])
+            root / "labels" / f"{part}.json",
+            _labels(name, [photograph for photograph in photographs if photograph.file.startswith(part)]),
         )
 
 
@@ -177,19 +185,19 @@ def _measured(azimuth_deg: float, random: np.random.Generator) -> list[list[floa
     return matrix
 
 
-def _labels(name: str, shots: list[_Shot]) -> dict[str, Any]:
+def _labels(name: str, photographs: list[_Photograph]) -> dict[str, Any]:
     """The true camera, and of each photograph the things in it with their poses cam_from_obj [4, 4], metres."""
     names = [kind.name for kind in scenes.kinds(name) for _ in range(kind.count)]
     labels: dict[str, Any] = {"camera_matrix": scenes.camera_matrix(name).tolist(), "photographs": {}}
-    for shot in shots:
-        camera = scenes.cam_from_world(shot.azimuth_deg)
-        labels["photographs"][shot.file] = [
+    for photograph in photographs:
+        camera = scenes.cam_from_world(photograph.azimuth_deg)
+        labels["photographs"][photograph.file] = [
             {
                 "mesh": names[placed.slot],
                 "color_srgb": scenes.colour(placed.slot),
                 "cam_from_obj": (camera @ placed.world_from_obj).tolist(),
             }
-            for placed in scenes.draw(name, np.random.default_rng(shot.scene_seed))
+            for placed in scenes.draw(name, np.random.default_rng(photograph.scene_seed))
         ]
     return labels
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from curio_train.geometry import Pose
 from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.parts import linear_from_srgb
 from curio_train.rendering.stock import OPENCV_AXES, sensor
@@ -22,7 +23,7 @@ _LAMP_RADIANCE, _SKY_RADIANCE = (60.0, 56.0, 49.0), (0.5, 0.53, 0.6)
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
+class SyntheticObject:
     """An object of a scene.
 
     Attributes:
@@ -39,7 +40,7 @@ class PathTracedScene:
 
     def __init__(
         self,
-        things: Sequence[Thing],
+        objects: Sequence[SyntheticObject],
         table_srgb: np.ndarray,
         table_side_m: float,
         camera_matrix: np.ndarray,
@@ -52,7 +53,7 @@ class PathTracedScene:
         """Build the scene once; later only positions change, so that kernels are compiled once.
 
         Args:
-            things: What may stand on the table.
+            objects: What may stand on the table.
             table_srgb: [height, width, 3] uint8, the table's look.
             table_side_m: Of the square table.
             camera_matrix: K [3, 3] with the principal point in the middle, as Mitsuba's lens wants it.
@@ -67,7 +68,7 @@ class PathTracedScene:
         self._mitsuba = load_mitsuba()
         self._vertices = []
         shapes = {}
-        for number, thing in enumerate(things):
+        for number, thing in enumerate(objects):
             shapes[f"thing_{number}"], vertices = self._shape(f"thing_{number}", thing)
             self._vertices.append(vertices)
         pinhole = sensor(self._mitsuba, camera_matrix, *size, samples_per_pixel)
@@ -95,8 +96,7 @@ class PathTracedScene:
         """
         mitsuba = self._mitsuba
         for number, (vertices, pose) in enumerate(zip(self._vertices, poses, strict=True)):
-            turn, shift = (np.eye(3), _OUT_OF_SIGHT_M) if pose is None else (pose[:3, :3], pose[:3, 3])
-            placed = vertices @ turn.T + shift
+            placed = vertices + _OUT_OF_SIGHT_M if pose is None else Pose.from_matrix(pose).apply(vertices)
             key = f"thing_{number}.vertex_positions"
             self._parameters[key] = np.ascontiguousarray(placed, dtype=np.float32).ravel()
         world_from_sensor = np.linalg.inv(cam_from_world) @ OPENCV_AXES
@@ -105,7 +105,7 @@ class PathTracedScene:
         image = np.array(mitsuba.render(self._scene, seed=seed), dtype=np.float32)
         return image[..., :3]
 
-    def _shape(self, name: str, thing: Thing) -> tuple[Any, np.ndarray]:
+    def _shape(self, name: str, thing: SyntheticObject) -> tuple[Any, np.ndarray]:
         """A glossy ``mitsuba.Mesh`` and its vertices [v, 3], doubled along folds. Normals follow the vertices."""
         mesh, mitsuba = thing.mesh, self._mitsuba
         source, faces, _ = smooth_normals(mesh.vertices_m, adjacency(mesh.vertices_m / mesh.diameter_m, mesh.faces))
@@ -135,7 +135,7 @@ class PathTracedScene:
 
     def _lamp(self, side_m: float) -> dict[str, Any]:
         """A square lamp to one side above the table, a fifth of its side wide."""
-        look = self._mitsuba.ScalarTransform4f().look_at(
+        look = self._mitsuba.ScalarTransform4f().measure(
             origin=[-0.35 * side_m, 0.6 * side_m, 0.25 * side_m], target=[0, 0, 0], up=[0, 0, 1]
         )
         radiance = {"type": "area", "radiance": {"type": "rgb", "value": list(_LAMP_RADIANCE)}}

@@ -50,7 +50,7 @@ class Kind:
 
 
 def bunny_like() -> Mesh:
-    """A sitting figure with a head, two ears, feet and a tail; no two sides are alike. About 11 cm, centred."""
+    """A session figure with a head, two ears, feet and a tail; no two sides are alike. About 11 cm, centred."""
     balls = [
         ((0.0, 0.0, 0.0), (0.035, 0.036, 0.04), 0.0),
         ((0.004, 0.04, 0.03), (0.022, 0.021, 0.025), 0.0),
@@ -73,7 +73,7 @@ def bunny_like() -> Mesh:
 
 
 def bracket() -> Mesh:
-    """A machined part: a plate with an upright, a rib on one side and a pin. No two sides are alike. About 10 cm."""
+    """A machined part of about 10 cm: a base with an upright, a rib on one side and a pin. No two sides are alike."""
     blocks = [
         ((0.08, 0.012, 0.05), (0.0, 0.0, 0.0)),
         ((0.014, 0.05, 0.05), (-0.033, 0.031, 0.0)),

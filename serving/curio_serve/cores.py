@@ -1,11 +1,12 @@
-"""How many cores this process may use."""
+"""How many cores and how much memory this process may use."""
 
 import os
 from pathlib import Path
 
 _CGROUP = Path("/sys/fs/cgroup")
-# Quota and period in microseconds, as cgroup v2 and v1 tell a container of its own.
+# Quota and period in microseconds, as cgroup v2 and v1 give a container its own.
 _QUOTA_FILES = (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"))
+_MEMORY_FILES = ("memory.max", "memory/memory.limit_in_bytes")
 _UNLIMITED = ("max", "-1")
 
 
@@ -26,6 +27,21 @@ def _quota(cgroup: Path) -> float | None:
         try:
             quota, period = " ".join((cgroup / name).read_text() for name in names).split()
             return None if quota in _UNLIMITED else int(quota) / int(period)
+        except (OSError, ValueError):
+            continue
+    return None
+
+
+def memory_limit(cgroup: Path = _CGROUP) -> int | None:
+    """Bytes that the container may use; None without a limit.
+
+    Args:
+        cgroup: Where control groups are mounted.
+    """
+    for name in _MEMORY_FILES:
+        try:
+            text = (cgroup / name).read_text().strip()
+            return None if text in _UNLIMITED else int(text)
         except (OSError, ValueError):
             continue
     return None

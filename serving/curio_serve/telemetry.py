@@ -1,25 +1,23 @@
-"""Numbers for Prometheus and structured logs.
+"""Keeps the numbers for Prometheus and writes structured logs.
 
 A log line is one JSON object on stderr. Lines pass through a bounded queue, so a full disk or a stuck pipe costs lines,
 never requests. Tokens and image bytes are never handed to the logger.
 """
 
+import contextlib
 import json
 import logging
-import logging.handlers
+import os
 import queue
 import threading
 import time
-from bisect import bisect_left
-from collections.abc import Iterator, Sequence
-from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
-    from prometheus_client.core import HistogramMetricFamily
 
 LOGGER = logging.getLogger("curio_serve")
+_STDERR = 2
 _MAX_WAITING_LINES = 10_000
 _BUCKETS_S = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512, 1, 2, 5)
 
@@ -49,74 +47,60 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(line, ensure_ascii=False, default=str)
 
 
-class _DropWhenFull(logging.handlers.QueueHandler):
-    def enqueue(self, record: logging.LogRecord) -> None:
-        try:
-            self.queue.put_nowait(record)
-        except queue.Full:
-            return
+class LogWriter(logging.Handler):
+    """Writes log lines to stderr on a thread of its own.
 
-
-def start_logging(level: str) -> logging.handlers.QueueListener:
-    """Send this package's log, and gRPC's, to stderr. ``stop()`` of what is returned writes what still waits."""
-    logging.raiseExceptions = False  # a line that cannot be written is lost, not the request
-    output = logging.StreamHandler()
-    output.setFormatter(JsonFormatter())
-    lines: queue.Queue[logging.LogRecord] = queue.Queue(_MAX_WAITING_LINES)
-    listener = logging.handlers.QueueListener(lines, output)
-    for logger in (LOGGER, logging.getLogger("grpc")):
-        logger.handlers = [_DropWhenFull(lines)]
-        logger.propagate = False
-    LOGGER.setLevel(level.upper())
-    listener.start()
-    return listener
-
-
-class PhaseTimes:
-    """A histogram of each phase's seconds, as a collector of Prometheus.
-
-    Its own, because a frame brings a time for each phase: one lock and one search each cost a quarter of what
-    ``Histogram.observe`` costs, and this is done for every frame.
+    It writes past Python's buffers: a thread that is stuck in writing to a full pipe would hold their lock, and the
+    process could not end.
     """
 
-    def __init__(self, name: str, documentation: str, phases: Sequence[str]) -> None:
-        self._name, self._documentation, self._phases = name, documentation, phases
-        self._lock = threading.Lock()
-        self._counts = [[0] * (len(_BUCKETS_S) + 1) for _ in phases]
-        self._sums = [0.0 for _ in phases]
+    def __init__(self) -> None:
+        super().__init__()
+        self.setFormatter(JsonFormatter())
+        self._lines: queue.Queue[str | None] = queue.Queue(_MAX_WAITING_LINES)
+        self._thread = threading.Thread(target=self._write, name="curio-log", daemon=True)
+        self._thread.start()
 
-    def observe(self, *seconds: float) -> None:
-        """One frame's time in each phase."""
-        with self._lock:
-            for index, value in enumerate(seconds):
-                self._counts[index][bisect_left(_BUCKETS_S, value)] += 1
-                self._sums[index] += value
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue a line, or drop it if the queue is full."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(self.format(record))
 
-    def collect(self) -> "Iterator[HistogramMetricFamily]":
-        """What Prometheus asks for."""
-        from prometheus_client.core import HistogramMetricFamily
+    def stop(self, limit_s: float = 2.0) -> None:
+        """Write the lines that wait, unless that takes too long."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(None)
+        self._thread.join(limit_s)
 
-        family = HistogramMetricFamily(self._name, self._documentation, labels=["phase"])
-        bounds = [*(str(float(bound)) for bound in _BUCKETS_S), "+Inf"]
-        with self._lock:
-            for phase, counts, total in zip(self._phases, self._counts, self._sums, strict=True):
-                family.add_metric([phase], list(zip(bounds, accumulate(counts), strict=True)), total)
-        yield family
+    def _write(self) -> None:
+        while (line := self._lines.get()) is not None:
+            with contextlib.suppress(OSError):  # a line that cannot be written is lost, not the request
+                os.write(_STDERR, f"{line}\n".encode(errors="replace"))
+
+
+def start_logging(level: str) -> LogWriter:
+    """Send this package's log, and gRPC's, to stderr. ``stop()`` of the result writes the lines that wait."""
+    writer = LogWriter()
+    for logger in (LOGGER, logging.getLogger("grpc")):
+        logger.handlers = [writer]
+        logger.propagate = False
+    LOGGER.setLevel(level.upper())
+    return writer
 
 
 class Metrics:
     """What the server counts. Names are part of the operator's interface: dashboards and alerts use them."""
 
     def __init__(self, registry: "CollectorRegistry") -> None:
-        from prometheus_client import Counter, Gauge
+        from prometheus_client import Counter, Gauge, Histogram
 
         self.requests = Counter(
             "curio_requests_total", "Calls answered, by method and gRPC status.", ["method", "code"], registry=registry
         )
-        self.phases = PhaseTimes(
-            "curio_phase_seconds", "Time of a frame in each phase.", ("queue", "decode", "inference")
+        phases = Histogram(
+            "curio_phase_seconds", "Time of a frame in each phase.", ["phase"], registry=registry, buckets=_BUCKETS_S
         )
-        registry.register(self.phases)
+        self.queue_s, self.decode_s, self.inference_s = map(phases.labels, ("queue", "decode", "inference"))
         self.waiting = Gauge("curio_queue_length", "Requests waiting for a worker.", registry=registry)
         self.working = Gauge("curio_working", "Frames being worked on.", registry=registry)
         self.streams = Gauge("curio_open_streams", "Open DetectStream calls.", registry=registry)

@@ -7,8 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import pytest
+from curio_serve.api.admission import WorkQueue
 from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
-from curio_serve.server.admission import WorkQueue
 from curio_serve.telemetry import Metrics
 from prometheus_client import CollectorRegistry
 
@@ -24,6 +24,9 @@ class Caller:
 
     def time_remaining(self) -> float | None:
         return self._remaining_s
+
+    def is_active(self) -> bool:
+        return not self._has_ended
 
     def add_callback(self, callback: Callable[[], None]) -> bool:
         self._callbacks.append(callback)
@@ -153,93 +156,90 @@ def test_a_call_that_ended_before_it_waits_never_works(gate: threading.Event, ma
     assert first.result(30) == "done"
 
 
-class Place:
-    """A waiter that is never told anything."""
-
-    def tell(self) -> None:
-        raise AssertionError("nobody left")
+def _queue(num_slots: int, max_waiting: int) -> WorkQueue:
+    return WorkQueue(num_slots, max_waiting, Metrics(CollectorRegistry()))
 
 
-def test_a_promise_keeps_a_place() -> None:
-    queue = WorkQueue(1, 1, Metrics(CollectorRegistry()))
-    first, second, third = Place(), Place(), Place()
-    queue.promise(first, math.inf)
-    queue.promise(second, math.inf)
-    with pytest.raises(Overloaded):
-        queue.promise(third, math.inf)
-    assert queue.enter(first)
-    assert not queue.enter(second)
-    with pytest.raises(Overloaded):
-        queue.enter(third)
-    assert queue.withdraw(second)
-    assert not queue.withdraw(second)
-    assert not queue.enter(third)
-    assert queue.leave(0.001) is third
-    assert queue.leave(0.001) is None
-
-
-def test_a_promise_given_up_is_free_again() -> None:
-    queue, place = WorkQueue(1, 0, Metrics(CollectorRegistry())), Place()
-    for _ in range(3):
-        queue.promise(place, math.inf)
-        assert queue.withdraw(place)
-    assert queue.enter(Place())
-
-
-def test_promises_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Callers who never send their message do not keep others out."""
-    queue = WorkQueue(1, 1, Metrics(CollectorRegistry()))
-    slow = [Place(), Place()]
-    for place in slow:
-        queue.promise(place, math.inf)
-    monkeypatch.setattr("curio_serve.server.admission._PROMISE_S", 0.0)
-    queue.promise(quick := Place(), math.inf)
-    assert queue.enter(quick)
-    # Their messages come late; they find a place where there is one.
-    assert not queue.enter(slow[0])
-    with pytest.raises(Overloaded):
-        queue.enter(slow[1])
-
-
-def test_who_would_come_too_late_is_refused_at_once() -> None:
-    queue = WorkQueue(1, 9, Metrics(CollectorRegistry()))
+def _work(monkeypatch: pytest.MonkeyPatch, queue: WorkQueue, seconds: float) -> None:
+    """Have a call take this long, on a clock that is ours."""
+    now = 0.0
+    monkeypatch.setattr("curio_serve.api.admission.time.monotonic", lambda: now)
     for _ in range(200):
-        assert queue.enter(Place())
-        assert queue.leave(0.1) is None
-    # Nobody is ahead, so there is no telling that it cannot be done.
-    queue.promise(first := Place(), 0.001)
-    assert queue.enter(first)
-    queue.promise(second := Place(), 0.001)
-    assert not queue.enter(second)
-    with pytest.raises(Overloaded, match="1 are waiting, which takes longer than the call's deadline") as caught:
-        queue.promise(Place(), 0.3)
-    assert caught.value.retry_after_s == pytest.approx(0.2, rel=0.05)
-    queue.promise(Place(), 0.4)
-    with pytest.raises(Overloaded, match="2 are waiting"):
-        queue.promise(Place(), 0.4)
-    queue.promise(Place(), math.inf)
+        with queue.slot(Caller()):
+            now += seconds
 
 
-def test_calls_without_work_do_not_pass_for_quick_ones() -> None:
-    queue = WorkQueue(1, 9, Metrics(CollectorRegistry()))
-    for worked_s in [0.1] * 200 + [None] * 200:
-        assert queue.enter(Place())
-        assert queue.leave(worked_s) is None
-    assert queue.enter(Place())
-    assert not queue.enter(Place())
-    with pytest.raises(Overloaded):
-        queue.promise(Place(), 0.3)
+def test_a_reservation_keeps_a_place(gate: threading.Event, make_bench: MakeBench) -> None:
+    bench = make_bench(1, 1)
+    with bench.queue.reserve(Caller()), bench.queue.reserve(Caller()) as second:
+        with pytest.raises(Overloaded), bench.queue.reserve(Caller()):
+            pass
+        working = bench.hold(gate)
+        waiting = bench.hold(gate, place=second)
+        with pytest.raises(Overloaded):
+            bench.hold(gate).result(30)
+        gate.set()
+        assert [working.result(30), waiting.result(30)] == ["done", "done"]
+
+
+def test_a_reservation_given_up_is_free_again() -> None:
+    queue = _queue(1, 0)
+    for _ in range(3):
+        with queue.reserve(Caller()):
+            pass
+    with queue.slot(Caller()):
+        pass
+
+
+def test_reservations_end(gate: threading.Event, make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Callers who never send their message do not keep others out."""
+    bench = make_bench(1, 1)
+    with bench.queue.reserve(Caller()) as slow, bench.queue.reserve(Caller()) as slower:
+        monkeypatch.setattr("curio_serve.api.admission._RESERVATION_S", 0.0)
+        with bench.queue.reserve(Caller()) as quick:
+            held = [bench.hold(gate, place=quick)]
+            # Their messages come late; they wait if there is room.
+            held.append(bench.hold(gate, place=slow))
+            with pytest.raises(Overloaded):
+                bench.hold(gate, place=slower).result(30)
+            gate.set()
+            assert [future.result(30) for future in held] == ["done", "done"]
+
+
+def test_who_would_come_too_late_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    queue = _queue(1, 9)
+    _work(monkeypatch, queue, 0.1)
+    # The slot is free, so nothing says that it cannot be done.
+    with queue.reserve(Caller(0.001)), queue.reserve(Caller(math.inf)):
+        with (
+            pytest.raises(Overloaded, match="2 are waiting, which takes longer than the call's deadline") as caught,
+            queue.reserve(Caller(0.3)),
+        ):
+            pass
+        assert caught.value.retry_after_s == pytest.approx(0.3, rel=0.05)
+        with queue.reserve(Caller(0.4)), queue.reserve(Caller(None)):
+            pass
+
+
+def test_calls_without_work_do_not_pass_for_quick_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    queue = _queue(1, 9)
+    _work(monkeypatch, queue, 0.1)
+    for _ in range(200):
+        with pytest.raises(DeadlineError), queue.slot(Caller(0.0)):
+            pass
+    with queue.reserve(Caller()), queue.reserve(Caller()), pytest.raises(Overloaded), queue.reserve(Caller(0.3)):
+        pass
 
 
 def test_errors_of_the_work_give_the_slot_back() -> None:
-    queue = WorkQueue(1, 0, Metrics(CollectorRegistry()))
+    queue = _queue(1, 0)
     for _ in range(5):
         with pytest.raises(ValueError, match="mine"), queue.slot(Caller()):
             raise ValueError("mine")
 
 
 def test_many_threads_leave_nothing_behind() -> None:
-    queue, busy, most = WorkQueue(2, 1000, Metrics(CollectorRegistry())), [], []
+    queue, busy, most = _queue(2, 1000), [], []
 
     def work(number: int) -> None:
         caller = Caller(None if number % 3 else 0.005)

@@ -1,6 +1,7 @@
 """Intrinsics: what is refused, how they turn with the pixels, and the files they come from."""
 
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -28,7 +29,7 @@ def _changed(row: int, column: int, value: float) -> np.ndarray:
         (_changed(0, 0, np.nan), "not finite"),
         (_changed(0, 2, np.inf), "not finite"),
         (_changed(0, 1, 3), "skew of 3 px"),
-        (K.T, "last row has to be"),
+        (K.T, "transposed"),
         (K[:2], r"shape \[2, 3\]"),
     ],
 )
@@ -41,6 +42,17 @@ def test_impossible_matrices(matrix: np.ndarray, words: str) -> None:
 def test_impossible_distortion(distortion: tuple[float, ...]) -> None:
     with pytest.raises(CameraError, match="distortion has"):
         PinholeCamera(K, distortion)
+
+
+@pytest.mark.parametrize("distortion", [(0, 0, 1e12, 0), (1e6, 0, 0, 0), (0, 0, 0, 0, 1e300), (0,) * 5 + (-9.0, 0, 0)])
+def test_implausible_distortion(distortion: tuple[float, ...]) -> None:
+    with pytest.raises(CameraError, match=r"moves pixels of a frame of 640x480 by up to .* px"):
+        PinholeCamera(K, distortion).check_frame(640, 480)
+
+
+@pytest.mark.parametrize("distortion", [(-0.45, 0.3, 0.01, -0.01), (0.5, -2.6, 0.001, 0, 1.5, 0.4, -2.4, 1.4)])
+def test_distortion_of_wide_lenses(distortion: tuple[float, ...]) -> None:
+    PinholeCamera(np.array([[400.0, 0, 320], [0, 400.0, 240], [0, 0, 1]]), distortion).check_frame(640, 480)
 
 
 @pytest.mark.parametrize(
@@ -179,3 +191,17 @@ def test_bad_files_are_named(tmp_path: Path, name: str, text: str, words: str) -
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(CameraError, match=r"none\.json cannot be read"):
         read_camera_file(tmp_path / "none.json")
+
+
+def test_files_that_are_none_are_named(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    (tmp_path / "nested.json").write_text("[" * 100_000)
+    with open(tmp_path / "sparse.json", "wb") as sparse:
+        sparse.truncate(20 << 30)
+    for name, words in (
+        ("pipe", "not a regular file"),
+        ("nested", "cannot be understood"),
+        ("sparse", "at most 67108864"),
+    ):
+        with pytest.raises(CameraError, match=words):
+            read_camera_file(tmp_path / f"{name}.json")

@@ -15,7 +15,7 @@ import pytest
 from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer, add_PoseDetectorServicer_to_server
 from curio_serve import errors
-from curio_serve.api.messages import status_from_error
+from curio_serve.api.status import status_from_error
 from curio_serve.client import AsyncPoseClient, PoseClient, Tls, detect_request, error_from_answer
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
@@ -71,8 +71,10 @@ def test_a_file_a_camera_and_a_matrix_are_the_same_k(client: PoseClient, png: Pa
 
 
 def test_regions_models_and_thresholds(client: PoseClient, png: Path) -> None:
-    answer = client.detect(["flat", "flat/1"], png, regions=[(0, 0, 320, 240), (100, 60, 96, 64)], request_id="seven")
-    assert [(r.model_version, r.region) for r in answer.results] == [(1, 0), (1, 1), (1, 0), (1, 1)]
+    answer = client.detect("flat/1", png, regions=[(0, 0, 320, 240), (100, 60, 96, 64)], request_id="seven")
+    assert [(r.model_version, r.region) for r in answer.results] == [(1, 0), (1, 1)]
+    with pytest.raises(errors.ArgumentError, match="more than once"):
+        client.detect(["flat", "flat/1"], png)
     assert answer.request_id == "seven"
     black = np.zeros((240, 320, 3), np.uint8)
     assert len(client.detect("flat", black).results[0].detections) == 1

@@ -11,9 +11,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 from curio_serve.batch.detect_cli import DetectArguments, run
-from curio_serve.errors import CurioError, UsageError
+from curio_serve.errors import CurioError, ModelError, UsageError
+from onnx import helper, numpy_helper
 
 SIZE = (320, 240)
 K = [[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]]
@@ -242,6 +244,25 @@ def test_exif_rotation_is_ignored_unless_asked_for_and_then_turns_k(
     x, y, z = answers[False]["detections"][0]["translation_m"]
     # a quarter turn clockwise takes (x, y) to (-y, x)
     np.testing.assert_allclose(answers[True]["detections"][0]["translation_m"], [-y, x, z], rtol=0.03, atol=0.01)
+
+
+def test_a_model_that_exhausts_memory_is_refused(frames: Path, tmp_path: Path, spot_onnx: Callable[..., Any]) -> None:
+    """Its graph fills 6 GiB before the first image; a check in another process with limits finds that out."""
+    model = spot_onnx(False)
+    constants = (("huge", [3 << 29]), ("all", [0]))
+    model.graph.initializer.extend(numpy_helper.from_array(np.array(value), name) for name, value in constants)
+    (last,) = [node for node in model.graph.node if "confidence" in node.output]
+    last.output[list(last.output).index("confidence")] = "confidence_alone"
+    model.graph.node.extend(
+        [
+            helper.make_node("ConstantOfShape", ["huge"], ["zeros"]),
+            helper.make_node("ReduceMax", ["zeros", "all"], ["zero"], keepdims=1),
+            helper.make_node("Add", ["confidence_alone", "zero"], ["confidence"]),
+        ]
+    )
+    onnx.save(model, tmp_path / "huge.onnx")
+    with pytest.raises(ModelError, match=r"huge\.onnx"):
+        detect(tmp_path / "huge.onnx", frames)
 
 
 def test_videos_give_a_line_a_frame(models_dir: Path, tmp_path: Path, spot_image: Callable[..., np.ndarray]) -> None:

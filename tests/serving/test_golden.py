@@ -1,6 +1,8 @@
 """The golden image of a version: what it stores has to come out of the network here, or the version does not serve."""
 
+import io
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +60,34 @@ def test_golden_files_that_do_not_fit(folder: Path, change: dict[str, Any], word
         load_version(folder, 1)
 
 
-@pytest.mark.parametrize("data", [b"", b"PK\x03\x04 half", b"no archive"])
+def _packed(method: int = zipfile.ZIP_DEFLATED, start: int = 0, change: bytes = b"") -> bytes:
+    """An archive with one member, some of whose bytes are replaced."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", method) as archive:
+        archive.writestr("image.npy", bytes(5000))
+    data = bytearray(stream.getvalue())
+    data[start : start + len(change)] = change
+    return bytes(data)
+
+
+def _bare_array() -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, np.zeros(3))
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"PK\x03\x04 half",
+        b"no archive",
+        _packed(start=39, change=b"\xff\xff\xff\xff"),  # broken deflate
+        _packed(start=_packed().index(b"PK\x01\x02") + 8, change=b"\1"),  # encrypted, as its directory says
+        _packed(start=_packed().index(b"PK\x01\x02") + 10, change=b"\x63"),  # of an unknown method
+        _bare_array(),
+    ],
+)
 def test_golden_files_that_are_none(folder: Path, data: bytes) -> None:
     (folder / "1" / "golden.npz").write_bytes(data)
     with pytest.raises(ModelError, match=r"golden\.npz is not an archive of arrays"):

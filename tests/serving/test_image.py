@@ -10,6 +10,7 @@ import pytest
 from curio_serve.errors import ImageError
 from curio_serve.imaging.image import decode, from_raw
 from curio_serve.imaging.image_header import read_header
+from curio_serve.imaging.png import pixels_only
 
 FORMATS = {".jpg": "jpeg", ".png": "png", ".webp": "webp"}
 
@@ -237,3 +238,36 @@ def test_raw_sizes_that_do_not_fit_are_refused(
 ) -> None:
     with pytest.raises(ImageError, match=words):
         from_raw(bytes(num_bytes), "RGB8", width, height, stride)
+
+
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def _zeros(num_mebibytes: int) -> bytes:
+    packer = zlib.compressobj(9)
+    return b"".join(packer.compress(bytes(1 << 20)) for _ in range(num_mebibytes)) + packer.flush()
+
+
+def test_text_in_a_png_is_dropped_before_decoding() -> None:
+    plain = _encode(_scene(), ".png")
+    text = b"".join(_chunk(b"zTXt", b"a\0\0" + _zeros(16)) for _ in range(3))
+    loaded = plain[:33] + text + plain[33:]
+    kept = pixels_only(loaded)
+    assert text not in kept
+    np.testing.assert_array_equal(decode(loaded).pixels, decode(plain).pixels)
+    assert pixels_only(plain) is plain
+
+
+def test_image_data_beyond_the_last_row_is_refused() -> None:
+    head = b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", struct.pack(">IIBBBBB", 64, 48, 8, 2, 0, 0, 0))
+    packed = _zeros(128)
+    halves = _chunk(b"IDAT", packed[:50_000]) + _chunk(b"IDAT", packed[50_000:])
+    with pytest.raises(ImageError, match=r"goes on beyond its last row: .* takes 9264; save it again"):
+        decode(head + halves + _chunk(b"IEND", b""))
+
+
+@pytest.mark.parametrize("depth", [np.uint8, np.uint16])
+def test_large_pngs_of_noise_are_read(depth: type) -> None:
+    noise = np.random.default_rng(0).integers(0, np.iinfo(depth).max, (300, 400, 3)).astype(depth)
+    assert decode(_encode(noise, ".png")).pixels.shape == (300, 400, 3)

@@ -1,5 +1,6 @@
-"""What a model file and its folder promise, and what happens when they break it."""
+"""What a model file and its folder have to be, and how others are refused."""
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -136,6 +137,10 @@ def _no_slots(spec: ModelSpec) -> None:
     spec.num_slots = 2
 
 
+def _countless_slots(spec: ModelSpec) -> None:
+    spec.num_slots = 2**32 - 1
+
+
 def _two_owners(spec: ModelSpec) -> None:
     spec.objects.append(ObjectModel(name="other", slots=[0]))
 
@@ -172,9 +177,10 @@ def _short_box(spec: ModelSpec) -> None:
     ("spoil", "words"),
     [
         (_no_slots, r"2 slots, but its objects name the slots \[0\]"),
+        (_countless_slots, r"4294967295 slots, but its objects name the slots \[0\]"),
         (_two_owners, "slot 0 belongs to both spot and other"),
-        (_more_fields, r"promises \['light'\]"),
-        (_unknown_field, r"promises \['colour'\]"),
+        (_more_fields, r"spec has \['light'\]"),
+        (_unknown_field, r"spec has \['colour'\]"),
         (_wrong_size, "translation_m has size 2"),
         (_other_input, "its inputs are"),
         (_half_a_matrix, "3 values of K"),
@@ -255,3 +261,12 @@ def test_config_is_compared_with_the_graph(folder: Path, old: str, new: str, wor
     config.write_text(text.replace(old, new))
     with pytest.raises(ModelError, match=words):
         open_model(folder)
+
+
+def test_model_files_that_are_none(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.onnx")
+    with open(tmp_path / "sparse.onnx", "wb") as sparse:
+        sparse.truncate(20 << 30)
+    for name, words in (("pipe", "not a regular file"), ("sparse", "at most 1073741824 are accepted")):
+        with pytest.raises(ModelError, match=words):
+            load(tmp_path / f"{name}.onnx")

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from curio_serve.batch.parallel import sources
+from curio_serve.batch import sources
 from curio_serve.batch.sources import check_arguments, common_folder, images
 from curio_serve.errors import ImageError, UsageError
 

@@ -37,7 +37,7 @@ def test_frames_of_the_training_camera_are_merely_resized(size: tuple[int, int])
     assert CANONICAL.matrix is not None
     scale = scaling(size[0] / CANONICAL.width, size[1] / CANONICAL.height)
     pixels = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3)).astype(np.uint8)
-    view = PinholeFrame(pixels, PinholeCamera(scale @ CANONICAL.matrix), CANONICAL).look(Region(0, 0, *size))
+    view = PinholeFrame(pixels, PinholeCamera(scale @ CANONICAL.matrix), CANONICAL).crop(Region(0, 0, *size))
     np.testing.assert_allclose(view.canonical_from_cam, np.eye(3), atol=1e-12)
     if size == (128, 96):
         np.testing.assert_array_equal(view.image, pixels)
@@ -62,7 +62,7 @@ def test_a_scene_looks_the_same_through_both_cameras(
     drawn = scaling(1 / reduction, 1 / reduction)
     pixels = camera.project(points) @ drawn[:2, :2].T + drawn[:2, 2]
     picture = _dot_picture(640 // reduction, 480 // reduction, pixels, 6 / reduction)
-    view = PinholeFrame(picture, camera, CANONICAL, reduction).look(region)
+    view = PinholeFrame(picture, camera, CANONICAL, reduction).crop(region)
     seen = points @ view.canonical_from_cam.T @ CANONICAL.matrix.T
     seen = seen[:, :2] / seen[:, 2:]
     inside = np.all((seen > 8) & (seen < [119, 87]), axis=1) & np.all(
@@ -75,26 +75,26 @@ def test_a_scene_looks_the_same_through_both_cameras(
 
 @pytest.mark.parametrize("region", [Region(0, 0, 640, 480), Region(400, 100, 150, 120)])
 def test_poses_come_back(region: Region) -> None:
-    view = PinholeFrame(np.zeros((480, 640, 3), np.uint8), PinholeCamera(K), CANONICAL).look(region)
+    view = PinholeFrame(np.zeros((480, 640, 3), np.uint8), PinholeCamera(K), CANONICAL).crop(region)
     turn = view.canonical_from_cam
     truth = np.array([[0.1, -0.2, 1.3], [0.0, 0.3, 0.8]])
     for position in truth:
         np.testing.assert_allclose(view.translation((turn @ position).tolist()), position, atol=1e-12)
     rotations = np.stack([np.eye(3), smallest_rotation(np.array([0, 0, 1.0]), np.array([0.6, 0, 0.8]))])
     for rotation in rotations:
-        np.testing.assert_allclose(view.turn((turn @ rotation).tolist()), rotation.ravel(), atol=1e-12)
+        np.testing.assert_allclose(view.rotate((turn @ rotation).tolist()), rotation.ravel(), atol=1e-12)
 
 
 @pytest.mark.parametrize("distortion", [(), DISTORTION])
-def test_one_camera_looks_as_a_new_one_does(distortion: tuple[float, ...]) -> None:
+def test_a_cached_warp_equals_a_new_one(distortion: tuple[float, ...]) -> None:
     """What is kept of a camera belongs to that size, region and model alone."""
     camera, random = PinholeCamera(K, distortion), np.random.default_rng(2)
     large = CanonicalCamera(160, 120, scaling(1.25, 1.25) @ np.asarray(CANONICAL.matrix))
     frames = [(random.integers(0, 255, (480 // r, 640 // r, 3)).astype(np.uint8), r) for r in (1, 2, 1)]
     regions = [Region(0, 0, 640, 480), Region(400, 100, 150, 120)]
     for (pixels, reduction), region, canonical in product(frames, regions, (CANONICAL, large)):
-        kept = PinholeFrame(pixels, camera, canonical, reduction).look(region)
-        new = PinholeFrame(pixels, PinholeCamera(K, distortion), canonical, reduction).look(region)
+        kept = PinholeFrame(pixels, camera, canonical, reduction).crop(region)
+        new = PinholeFrame(pixels, PinholeCamera(K, distortion), canonical, reduction).crop(region)
         np.testing.assert_array_equal(kept.image, new.image)
         np.testing.assert_array_equal(kept.canonical_from_cam, new.canonical_from_cam)
 
@@ -102,7 +102,7 @@ def test_one_camera_looks_as_a_new_one_does(distortion: tuple[float, ...]) -> No
 def test_a_region_brings_its_centre_to_the_middle() -> None:
     assert CANONICAL.matrix is not None
     region = Region(400, 100, 150, 120)
-    view = PinholeFrame(np.zeros((480, 640, 3), np.uint8), PinholeCamera(K, DISTORTION), CANONICAL).look(region)
+    view = PinholeFrame(np.zeros((480, 640, 3), np.uint8), PinholeCamera(K, DISTORTION), CANONICAL).crop(region)
     ray = PinholeCamera(K, DISTORTION).ray(400 + 75 - 0.5, 100 + 60 - 0.5)
     pixel = CANONICAL.matrix @ view.canonical_from_cam @ ray
     np.testing.assert_allclose(pixel[:2] / pixel[2], [63.5, 47.5], atol=1e-6)
@@ -143,14 +143,14 @@ def test_half_turns_have_quaternions(axis: tuple[float, ...]) -> None:
 def test_views_behind_the_camera_are_refused() -> None:
     wide = PinholeCamera(np.array([[70.0, 0, 320], [0, 70.0, 240], [0, 0, 1]]))
     frame = PinholeFrame(np.zeros((480, 640, 3), np.uint8), wide, CANONICAL)
-    frame.look(Region(0, 0, 640, 480))
+    frame.crop(Region(0, 0, 640, 480))
     with pytest.raises(CameraError, match="87 degrees"):
-        frame.look(Region(0, 0, 20, 20))
+        frame.crop(Region(0, 0, 20, 20))
 
 
 def test_flat_frames_are_averaged_to_size() -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (480, 640, 3)).astype(np.uint8)
-    image = FlatFrame(pixels, CanonicalCamera(64, 48)).look(Region(0, 0, 640, 480)).image
+    image = FlatFrame(pixels, CanonicalCamera(64, 48)).crop(Region(0, 0, 640, 480)).image
     blocks = pixels.reshape(48, 10, 64, 10, 3).mean(axis=(1, 3))
     assert np.abs(image - blocks).max() <= 1
 
@@ -159,7 +159,7 @@ def test_flat_frames_are_averaged_to_size() -> None:
 def test_flat_positions_come_back(region: Region) -> None:
     truth = np.array([200.0, 170.0])
     picture = _dot_picture(640, 480, truth[None], 8)
-    view = FlatFrame(picture, CanonicalCamera(96, 64)).look(region)
+    view = FlatFrame(picture, CanonicalCamera(96, 64)).crop(region)
     columns, rows = np.meshgrid(np.arange(96), np.arange(64))
     weight = view.image[..., 0].astype(float)
     found = [((weight * axis).sum() / weight.sum() - (side - 1) / 2) / 96 for axis, side in ((columns, 96), (rows, 64))]

@@ -1,4 +1,4 @@
-"""Run folders for what comes after training, and a gaze at a brick."""
+"""Run folders for what comes after training, and a two-stage network at a brick."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -38,7 +38,7 @@ def write_run() -> Callable[..., Path]:
                 module.weight.data.uniform_(0.5, 2.0, generator=generator)
         for branch in state.pose.network.heads.branches.values():
             branch[-1].weight.data *= spread
-        state.course = TrainingProgress(step=2, images=64, seconds=1.5)
+        state.progress = TrainingProgress(step=2, images=64, seconds=1.5)
         run.save(state)
         return path
 
@@ -58,5 +58,5 @@ def brick() -> Object:
 
 @pytest.fixture(scope="session")
 def brick_world(brick: Object) -> TwoStageWorld:
-    """The two looks at it."""
+    """The two stages at it."""
     return TwoStageWorld("linemod", brick)

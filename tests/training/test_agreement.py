@@ -1,4 +1,4 @@
-"""Photographs of a part in free space judge what was found in them: no label, a plate or none."""
+"""Photographs of a part in free space judge what was found in them: no label, a background image or none."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -33,7 +33,7 @@ def truth(world: World) -> dict[str, Tensor]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Photographs that the world itself draws over a mottled grey plate, with noise and less exposure."""
+    """Photographs that the world itself draws over a mottled grey background image, with noise and less exposure."""
     root = tmp_path_factory.mktemp("agreement")
     base, tower = trimesh.creation.box((80, 40, 20)), trimesh.creation.box((20, 20, 50))
     tower.apply_translation((25, 0, 30))
@@ -120,7 +120,7 @@ def test_photographs_with_nothing_in_them_are_counted(folder: Path, tmp_path: Pa
     found = judged(world, truth(world))
     assert found.metrics["own_view_overlap"] == 0
     assert found.verdict.startswith("Do not trust it")
-    assert "5 of them show nothing but the plate" in found.verdict
+    assert "5 of them show nothing but the background image" in found.verdict
 
 
 def test_the_worst_come_first_with_their_figures(folder: Path) -> None:
@@ -151,5 +151,7 @@ def test_exposure_and_shadows_are_no_parts() -> None:
 
 def test_figures_stand_beside_their_rows() -> None:
     rows = torch.full((2, 3, 12, 16), 0.5)
-    bare, told, other = (samples([rows], ("photograph",), captions) for captions in ((), ("0.10", "0.9"), ("0.2", "1")))
-    assert len({bare, told, other}) == 3
+    bare, scales, other = (
+        samples([rows], ("photograph",), captions) for captions in ((), ("0.10", "0.9"), ("0.2", "1"))
+    )
+    assert len({bare, scales, other}) == 3

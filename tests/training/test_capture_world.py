@@ -1,4 +1,4 @@
-"""A part of one's own: an STL, a camera file, photographs and a plate become a world that can be learned."""
+"""A part of one's own: an STL, a camera file, photographs and a background image become a world that can be learned."""
 
 import json
 import shutil
@@ -11,11 +11,11 @@ import pytest
 import torch
 import trimesh
 from curio_train.camera import Intrinsics
-from curio_train.commands import cli
+from curio_train.commands import train as train_command
 from curio_train.config import NetworkConfig
 from curio_train.data import backgrounds
 from curio_train.data.background_image import BackgroundImages, MixedBackgrounds
-from curio_train.doctor.before_training import refuse_unfit
+from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, MeshError, UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.subject import load_subject
@@ -25,8 +25,10 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
+from curio_train.worlds.base import World
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object.capture import NUM_JUDGED, Capture
+from curio_train.worlds.single_object.capture import NUM_JUDGED, CapturePhotographs
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from torch import Tensor
 
 WIDTH, HEIGHT = 160, 120
@@ -34,7 +36,7 @@ WIDTH, HEIGHT = 160, 120
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An unpainted bracket in millimetres, symmetric under half a turn; twelve photographs, a plate, clutter."""
+    """An unpainted bracket in millimetres, symmetric under half a turn; 12 photographs, background image, clutter."""
     root = tmp_path_factory.mktemp("part")
     base = trimesh.creation.box((80, 40, 20))
     tower = trimesh.creation.box((20, 20, 50))
@@ -67,13 +69,13 @@ def options(folder: Path, **changes: object) -> CaptureOptions:
 
 
 @pytest.fixture(scope="module")
-def world(folder: Path) -> Capture:
+def world(folder: Path) -> TwoStageWorld:
     found = build(options(folder))
-    assert isinstance(found, Capture)
+    assert isinstance(found, TwoStageWorld)
     return found
 
 
-def test_the_part_is_what_its_file_says(world: Capture) -> None:
+def test_the_part_is_what_its_file_says(world: TwoStageWorld) -> None:
     kind = world.object.kind
     assert (kind.name, world.model_name, world.name) == ("bracket", "bracket", "capture")
     assert kind.diameter_m == pytest.approx(np.linalg.norm([0.08, 0.04, 0.02]) * 1.0, rel=0.1)
@@ -81,7 +83,7 @@ def test_the_part_is_what_its_file_says(world: Capture) -> None:
     assert np.allclose(half_turn[:3, :3], np.diag([-1, -1, 1]), atol=0.02)
 
 
-def test_an_unpainted_part_has_any_colour_and_says_which(world: Capture) -> None:
+def test_an_unpainted_part_has_any_colour_and_says_which(world: TwoStageWorld) -> None:
     code = world.sample(400, (1,))
     world.layout.check(code)
     colors = code[COLOR][:, 0]
@@ -101,10 +103,10 @@ def test_an_unpainted_part_has_any_colour_and_says_which(world: Capture) -> None
     assert second.code_loss(wrong, scenes) > second.code_loss(right, scenes)
 
 
-def test_before_a_plate_crops_have_more_turns(folder: Path, world: Capture) -> None:
+def test_before_a_plate_crops_have_more_turns(folder: Path, world: TwoStageWorld) -> None:
     elsewhere = build(options(folder, background=None))
-    assert world.turns.count(0) == elsewhere.turns.count(0) == 1
-    assert len(world.turns) > len(elsewhere.turns)
+    assert world.stage_schedule.count(0) == elsewhere.stage_schedule.count(0) == 1
+    assert len(world.stage_schedule) > len(elsewhere.stage_schedule)
 
 
 def test_a_painted_part_keeps_its_colours(folder: Path, tmp_path: Path) -> None:
@@ -116,8 +118,8 @@ def test_a_painted_part_keeps_its_colours(folder: Path, tmp_path: Path) -> None:
     assert COLOR not in painted.sample(2, (0,))
 
 
-def test_it_is_seen_from_all_sides_or_from_above(folder: Path, world: Capture) -> None:
-    def lowest_camera(seen: Capture) -> float:
+def test_it_is_seen_from_all_sides_or_from_above(folder: Path, world: TwoStageWorld) -> None:
+    def lowest_camera(seen: TwoStageWorld) -> float:
         code = seen.sample(300, (2,))
         turn = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
         camera = -(turn.transpose(1, 2) @ code[TRANSLATION][:, 0, :, None])
@@ -125,11 +127,11 @@ def test_it_is_seen_from_all_sides_or_from_above(folder: Path, world: Capture) -
 
     assert lowest_camera(world) < -0.3
     upright = build(options(folder, upright=True))
-    assert isinstance(upright, Capture)
+    assert isinstance(upright, TwoStageWorld)
     assert lowest_camera(upright) > -1e-4
 
 
-def test_backgrounds_are_the_plate_and_clutter(folder: Path, world: Capture, cache: Path) -> None:
+def test_backgrounds_are_the_plate_and_clutter(folder: Path, world: TwoStageWorld, cache: Path) -> None:
     source = world.stages[0].source("train", 0, with_code=False, cache=cache)
     frames = source.backgrounds(0, 60)
     assert frames.shape == (60, 3, HEIGHT // 4, WIDTH // 4)
@@ -138,7 +140,7 @@ def test_backgrounds_are_the_plate_and_clutter(folder: Path, world: Capture, cac
     small = torch.from_numpy(cv2.resize(plate, (WIDTH // 4, HEIGHT // 4), interpolation=cv2.INTER_AREA) / 255)
     flat = torch.cat([frames.flatten(1), small.permute(2, 0, 1).float().flatten()[None]])
     alike = torch.corrcoef(flat)[-1, :-1] > 0.7
-    assert 42 <= alike.sum() <= 58, "seventeen of twenty are the plate"
+    assert 42 <= alike.sum() <= 58, "seventeen of twenty are the background image"
     crops = world.stages[1].source("train", 0, with_code=False, cache=cache).backgrounds(0, 8)
     assert crops.shape == (8, 3, 64, 64)
 
@@ -171,15 +173,21 @@ def test_a_mixture_draws_from_both() -> None:
     assert torch.equal(mixed.draw(40, 8, 6, (3,)), mixed.draw(40, 8, 6, (3,)))
 
 
-def test_photographs_come_in_the_canonical_size_without_distortion(world: Capture) -> None:
-    found = world.photographs(5)
+def photographs(world: World) -> CapturePhotographs:
+    assert isinstance(world, TwoStageWorld)
+    assert isinstance(world.photographs, CapturePhotographs)
+    return world.photographs
+
+
+def test_photographs_come_in_the_canonical_size_without_distortion(folder: Path, world: TwoStageWorld) -> None:
+    found = photographs(world).judged(5)
     assert found.shape == (5, 3, world.camera.height, world.camera.width)
-    assert world.photographs(100).shape[0] == 12
-    plate = world.plate()
+    assert photographs(world).judged(100).shape[0] == 12
+    plate = photographs(world).background_image()
     assert plate is not None
     assert (found[0] == plate).all(dim=0).float().mean() > 0.9, "but for a square that differs"
     lens = world.object.camera.matrix, np.array(world.object.camera.distortion)
-    straight = cv2.undistort(cv2.cvtColor(cv2.imread(str(world._images / "00.png")), cv2.COLOR_BGR2RGB), *lens)
+    straight = cv2.undistort(cv2.cvtColor(cv2.imread(str(folder / "photos" / "00.png")), cv2.COLOR_BGR2RGB), *lens)
     within = cv2.undistort(np.full_like(straight, 255), *lens) == 255  # elsewhere OpenCV's is black, and ours goes on
     seen = (found[0] * 255).round().permute(1, 2, 0).numpy()
     assert np.abs(seen - straight)[within].max() <= 255 / 32  # its maps are rounded to 1/32 pixel
@@ -201,8 +209,7 @@ def test_a_model_is_not_judged_by_what_it_learned_from(folder: Path, tmp_path: P
     def greys(images: Tensor) -> set[int]:
         return set((images[:, 0, HEIGHT // 2, WIDTH // 2] * 85).round().int().tolist())
 
-    judged = many.photographs(1000)
-    assert judged is not None
+    judged = photographs(many).judged(1000)
     assert len(greys(judged)) == NUM_JUDGED
     assert PseudoLabels.from_photographs(many, predict) is None
     assert greys(torch.cat(read)) == set(range(2 * NUM_JUDGED)) - greys(judged)
@@ -249,7 +256,7 @@ def test_files_that_do_not_belong_together_are_refused_all_at_once(folder: Path,
 
 def call(*words: object) -> int:
     with pytest.raises(SystemExit) as exit_:
-        cli.train(["capture", *map(str, words)])
+        train_command.train(["capture", *map(str, words)])
     return int(exit_.value.code or 0)
 
 
@@ -278,7 +285,7 @@ def test_from_files_to_a_model_by_a_project_file(
     assert (config.images, config.recipe.batch_size) == (12, 4)
     report = (run / "report.html").read_text()
     assert 'id="photographs"' in report
-    assert "what was found covers what differs from the plate" in report
+    assert "what was found covers what differs from the background image" in report
     assert str(folder) not in (run / "models" / "bracket" / "CARD.md").read_text()
     with pytest.raises(UsageError, match="run folder"):
         load_subject(run / "models" / "bracket" / "1")

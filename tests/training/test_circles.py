@@ -128,7 +128,7 @@ def test_a_share_of_the_images_is_always_the_same_images(cache: Path) -> None:
     source = Circles().source("train", 0, with_code=True, cache=cache).subset(0.05)
     seen = torch.cat([source.batch(step, 50).code[TRANSLATION] for step in range(4)]).flatten(1)
     assert len(seen.unique(dim=0)) == len(source) == 100
-    with pytest.raises(UsageError, match="share of 0 of 100 images"):
+    with pytest.raises(UsageError, match="fraction of 0 of 100 images"):
         source.subset(0)
 
 

@@ -49,11 +49,11 @@ def test_two_processes_go_where_one_does(runs: dict[str, Path], step: int, toler
 
 def test_losses_are_those_of_the_whole_batch(runs: dict[str, Path]) -> None:
     one, two = ([json.loads(line) for line in (run / "history.jsonl").open()] for run in runs.values())
-    assert [row["step"] for row in two] == [1, 2]  # a line a sitting, not one a process
+    assert [row["step"] for row in two] == [1, 2]  # a line a session, not one a process
     for name in ("image", "curiosity", "critic", "sleep"):
         assert (two[0][name] + two[1][name]) / 2 == pytest.approx(one[0][name], rel=1e-2)
 
 
 def test_one_process_writes_for_both(runs: dict[str, Path]) -> None:
-    assert len(list(runs["two"].glob("tensorboard/*"))) == 2  # one a sitting
+    assert len(list(runs["two"].glob("tensorboard/*"))) == 2  # one a session
     assert len((runs["two"] / "sittings.jsonl").read_text().splitlines()) == 2

@@ -17,7 +17,7 @@ from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
 from curio_train.worlds.options import LinemodOptions
 from curio_train.worlds.single_object.linemod import FAR_M, NEAR_M, read_camera_poses
-from curio_train.worlds.single_object.viewpoints import STRONGEST_LIGHT, WEAKEST_LIGHT
+from curio_train.worlds.single_object.viewpoints import MAX_LIGHT, MIN_LIGHT
 from curio_train.worlds.single_object.world import EXPOSURE
 
 
@@ -63,8 +63,8 @@ def test_poses_come_from_the_published_range(world):
     assert pixels.min() > -1
     assert pixels.max() < 128
     strength = code[LIGHT].norm(dim=1)
-    assert strength.min() >= WEAKEST_LIGHT - 1e-5
-    assert strength.max() <= STRONGEST_LIGHT + 1e-5
+    assert strength.min() >= MIN_LIGHT - 1e-5
+    assert strength.max() <= MAX_LIGHT + 1e-5
     rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
     camera_in_object = -(rotation.transpose(1, 2) @ position[..., None])[..., 0]
     assert camera_in_object[:, 2].min() > -1e-4, "a camera below the table"
@@ -132,7 +132,7 @@ def test_unknown_class_and_missing_data_are_named(data, tmp_path):
 
 
 def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
-    with pytest.raises(UsageError, match=r"--photos .*leave out --no-gaze"):
+    with pytest.raises(UsageError, match=r"--photos .*leave out --one-stage"):
         build(LinemodOptions("ape", data, photographs, photos=photographs, gaze=False))
     read = []
 

@@ -1,4 +1,4 @@
-"""The colour of an unpainted part: found in photographs over a plate, or not; and what is drawn about it."""
+"""The colour of an unpainted part: found in photographs over a background image, or not; and what is drawn about it."""
 
 import json
 from dataclasses import replace
@@ -17,8 +17,7 @@ from curio_train.errors import UsageError
 from curio_train.scene_code import COLOR, CONFIDENCE
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object.base_colors import base_colors_near
-from curio_train.worlds.single_object.world import any_base_color
+from curio_train.worlds.single_object.base_colors import any_base_color, base_colors_near
 
 WIDTH, HEIGHT = 160, 120
 SRGB = {"red": (0.78, 0.2, 0.16), "pale": (0.8, 0.78, 0.7), "black": (0.08, 0.08, 0.1), "teal": (0.1, 0.5, 0.5)}
@@ -26,7 +25,7 @@ SRGB = {"red": (0.78, 0.2, 0.16), "pale": (0.8, 0.78, 0.7), "black": (0.08, 0.08
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An unpainted part, a camera and a grey plate."""
+    """An unpainted part, a camera and a grey background image."""
     root = tmp_path_factory.mktemp("part")
     trimesh.creation.box((0.09, 0.05, 0.03)).export(root / "block.stl")
     camera = {"camera_matrix": [[180, 0, 79.5], [0, 180, 59.5], [0, 0, 1]], "width": WIDTH, "height": HEIGHT}
@@ -81,13 +80,13 @@ def test_a_colour_is_found_in_photographs_that_differ_in_light(folder: Path, nam
 
 
 def test_where_photographs_do_not_tell_a_colour_none_is_found(folder: Path) -> None:
-    assert found_in(take(folder, [SRGB["red"]] * 8, confidence=0.0)) is None, "nothing but the plate"
+    assert found_in(take(folder, [SRGB["red"]] * 8, confidence=0.0)) is None, "nothing but the background image"
     several = [SRGB["red"], SRGB["teal"], (0.2, 0.2, 0.9), (0.8, 0.8, 0.1)]
     assert found_in(take(folder, several * 3)) is None, "parts of several colours"
     options = take(folder, [SRGB["red"]] * 4)
     random = np.random.default_rng(4)
     save(folder / "other.png", cv2.resize(random.random((6, 8, 3)), (WIDTH, HEIGHT)))
-    assert found_in(replace(options, background=folder / "other.png")) is None, "the plate of another scene"
+    assert found_in(replace(options, background=folder / "other.png")) is None, "the background image of another scene"
     assert found_in(take(folder, [SRGB["red"]] * 2)) is None, "too few to believe"
 
 

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from curio_train.capture.plane import CameraPoseFile, ever_changed, seen_points
+from curio_train.capture.plane import CameraPoseFile, changed_pixels, points_on_plane
 from curio_train.errors import CameraError, DataError
+from curio_train.geometry import Pose
 
 WIDTH, HEIGHT = 96, 72
 MATRIX = np.array([[110.0, 0, 47.5], [0, 110, 35.5], [0, 0, 1]])
@@ -24,12 +25,12 @@ def camera(tilt_deg: float) -> np.ndarray:
 
 def test_pixels_look_at_the_plane_and_nothing_above_the_horizon() -> None:
     level = camera(5)
-    points = seen_points(MATRIX, level, WIDTH, HEIGHT)
+    points = points_on_plane(MATRIX, level, WIDTH, HEIGHT)
     assert np.isnan(points[0]).all()
     seen = points[np.isfinite(points).all(axis=2)]
     assert len(seen) > 1000
     assert np.allclose(seen[:, 1], 0)
-    back = seen @ level[:3, :3].T + level[:3, 3]
+    back = Pose.from_matrix(level).apply(seen)
     pixels = (back @ MATRIX.T)[:, :2] / back[:, 2:]
     rows, columns = np.nonzero(np.isfinite(points).all(axis=2))
     assert np.allclose(pixels, np.stack([columns, rows], axis=1), atol=1e-6)
@@ -39,11 +40,11 @@ def test_where_things_ever_were_is_told_from_noise_and_exposure() -> None:
     random = np.random.default_rng(0)
     plate = random.integers(100, 140, (3, 64, 64)).astype(np.uint8)
     photographs = [(plate * random.uniform(0.95, 1.05)).clip(0, 255).astype(np.uint8) for _ in range(20)]
-    with pytest.raises(DataError, match="nothing but the plate"):
-        ever_changed(photographs, [plate] * 20)
+    with pytest.raises(DataError, match="nothing but the background image"):
+        changed_pixels(photographs, [plate] * 20)
     for number, photograph in enumerate(photographs):
         photograph[:, 20:30, 2 * number : 2 * number + 8] = 20
-    mask = ever_changed(photographs, [plate] * 20)
+    mask = changed_pixels(photographs, [plate] * 20)
     assert mask[22:28, 4:40].all()
     assert not mask[:15].any()
     assert not mask[35:].any()
@@ -55,7 +56,7 @@ def test_where_things_ever_were_is_told_from_noise_and_exposure() -> None:
         (None, "cannot be read"),
         ("{", "not JSON"),
         ("[1]", "expected an object"),
-        ("{}", r"says nothing of plate\.png"),
+        ("{}", r"says nothing of background image\.png"),
         (json.dumps({"plate.png": {"cam_from_world": [[1, 2], [3, 4]]}}), r"shape \(2, 2\)"),
         (json.dumps({"plate.png": {"cam_from_world": "here"}}), "no matrix"),
         (json.dumps({"plate.png": {"cam_from_world": np.diag([2, 2, 2, 1]).tolist()}}), "not rigid"),

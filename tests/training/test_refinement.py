@@ -15,7 +15,7 @@ from curio_train.evaluation.scores import add_errors
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.meshes.shapes import chair
 from curio_train.refinement.crops import rotation_from_vector
-from curio_train.refinement.inpainting import filled_in
+from curio_train.refinement.inpainting import inpainted
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, poses
 from curio_train.worlds.base import ObjectKind
@@ -77,7 +77,7 @@ def test_most_estimates_come_most_of_the_way_to_the_truth(
     """One of six may end in another pose that explains as much: the search is a local one."""
     images, _, true = scenes
     estimate = off(true)
-    found = refinement(images, estimate)
+    found = refinement.refine(images, estimate)[0]
     before, after = errors(estimate, true), errors(found, true)
     assert before.min() > 0.1
     assert np.median(after) < 0.15 * np.median(before), (before, after)
@@ -97,7 +97,7 @@ def test_objects_half_hidden_are_not_lost(
     for number, column in enumerate((K[0, 0] * place[:, 0] / place[:, 2] + K[0, 2] + 8).int().tolist()):
         hidden[number, :, :, column:] = behind[number].flip(1)[:, :, column:]
     estimate = off(true)
-    before, after = errors(estimate, true), errors(refinement(hidden, estimate), true)
+    before, after = errors(estimate, true), errors(refinement.refine(hidden, estimate)[0], true)
     assert (after < before + 0.02).sum() >= NUM - 1, (before, after)
 
 
@@ -108,7 +108,7 @@ def test_where_there_is_nothing_estimates_stand(
     estimate = off(true)
     flat = torch.full_like(behind, 128)
     for images in (behind, flat):
-        found = refinement(images, estimate)
+        found = refinement.refine(images, estimate)[0]
         assert all(torch.equal(found[name], estimate[name]) for name in estimate)
 
 
@@ -118,7 +118,7 @@ def test_objects_out_of_the_picture_give_numbers(
     images, _, true = scenes
     lost = dict(true) | {TRANSLATION: true[TRANSLATION] + torch.tensor([3.0, 0.0, 0.0])}
     lost[TRANSLATION][0] = torch.tensor([0.0, 0.0, 1e-3])
-    found = refinement(images, lost)
+    found = refinement.refine(images, lost)[0]
     assert all(value.isfinite().all() for value in found.values())
 
 
@@ -126,7 +126,7 @@ def test_hidden_pixels_continue_their_surroundings() -> None:
     ramp = torch.linspace(0, 1, 32).expand(1, 3, 32, 32).clone()
     hidden = torch.zeros(1, 1, 32, 32, dtype=torch.bool)
     hidden[..., 10:20, 12:22] = True
-    filled = filled_in(torch.where(hidden, torch.full_like(ramp, 7.0), ramp), hidden)
+    filled = inpainted(torch.where(hidden, torch.full_like(ramp, 7.0), ramp), hidden)
     assert torch.equal(filled[..., :10, :], ramp[..., :10, :])
     assert (filled - ramp).abs().max() < 0.15
 

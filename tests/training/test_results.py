@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from curio_train.commands.cli import _parse
+from curio_train.commands.train import _parse
 from curio_train.errors import DataError
 from curio_train.learning.runs.configuration import to_json
 from curio_train.worlds.options import CaptureOptions
@@ -178,9 +178,9 @@ def test_the_sweep_keeps_what_other_worlds_and_earlier_calls_found(
     results = json.loads((tmp_path / "curiosity.json").read_text())
     assert {world: {name: row["para"] for name, row in rows.items()} for world, rows in results.items()} == {
         "circles": {"our": 1.5, "noncur": 3.5},
-        "spheres, read by cells": {"noncur": 2.5},
+        "spheres, read by the dense decoder": {"noncur": 2.5},
     }
-    assert "## Spheres, read by cells" in (tmp_path / "curiosity.md").read_text()
+    assert "## Spheres, read by the dense decoder" in (tmp_path / "curiosity.md").read_text()
 
 
 def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,5 +216,5 @@ def test_the_benchmark_asks_for_worlds_that_there_are(monkeypatch: pytest.Monkey
         command = _parse([run.world, "--images", str(run.images), *run.flags])
         world = command.config.world
         assert isinstance(world, CaptureOptions)
-        assert (world.lying, len(world.amounts)) == (scene == "bunny", len(world.mesh))
+        assert (world.lying, len(world.count_ranges)) == (scene == "bunny", len(world.mesh))
         assert command.config.method + "_cells" * (command.config.network.reading == "cells") == method

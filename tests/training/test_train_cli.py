@@ -90,7 +90,7 @@ def test_a_polite_signal_leaves_a_checkpoint_and_says_how_to_go_on(
 
 def test_help_names_worlds_flags_and_defaults_without_torch() -> None:
     script = (
-        "import sys; from curio_train.commands.cli import train\n"
+        "import sys; from curio_train.commands.train import train\n"
         "try: train(sys.argv[1:])\n"
         "finally: print(sorted({'torch', 'mitsuba', 'cv2', 'scipy'} & set(sys.modules)), file=sys.stderr)"
     )
@@ -98,7 +98,7 @@ def test_help_names_worlds_flags_and_defaults_without_torch() -> None:
         (["--help"], ["circles", "linemod"]),
         (["circles", "--help"], ["--method", "(default: our)", "--minutes", "--learning-rate", "(default: laptop)"]),
         (["circles", "--preset", "paper", "--help"], ["--learning-rate FLOAT", "(default: 0.0001)", "(default: 128)"]),
-        (["linemod", "--help"], ["--no-gaze ", "--download ", "--photos ", "--backgrounds "]),
+        (["linemod", "--help"], ["--no-two-stage network ", "--download ", "--photos ", "--backgrounds "]),
     ):
         done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False)
         assert done.returncode == 0

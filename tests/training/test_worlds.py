@@ -9,11 +9,11 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
-from curio_train.config import ConvStack, Method, NetworkConfig, Recipe, RunConfig
+from curio_train.config import ConvStack, MethodName, NetworkConfig, Recipe, RunConfig
 from curio_train.errors import DataError
 from curio_train.geometry import matrix_from_yaw
-from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
+from curio_train.learning.trainer import Trainer
 from curio_train.metrics.assignment import scene_error
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW, index
 from curio_train.worlds import WORLDS, build
@@ -57,7 +57,7 @@ def footprint_radii(world: MeshWorld) -> np.ndarray:
 
 def pixels_of(world: MeshWorld, code: dict[str, Tensor], novel: bool) -> np.ndarray:
     """Where all vertices of all objects project to, [num, 2]."""
-    pose = world.stage.novel if novel else world.stage.cam_from_world
+    pose = world.setup.novel_cam_from_world if novel else world.setup.cam_from_world
     found = []
     meshes = np.repeat(np.array(world.kinds, dtype=object), [kind.num_slots for kind in world.kinds])
     turns = (
@@ -65,7 +65,7 @@ def pixels_of(world: MeshWorld, code: dict[str, Tensor], novel: bool) -> np.ndar
     )
     for slot, kind in enumerate(meshes):
         own = np.einsum("bij,nj->bni", turns[:, slot], kind.mesh.vertices_m) + code[TRANSLATION][:, slot, None].numpy()
-        projected = (own @ pose.rotation.T + pose.translation_m) @ world.camera.matrix.T
+        projected = (pose.apply(own)) @ world.camera.matrix.T
         found.append((projected[..., :2] / projected[..., 2:]).reshape(-1, 2))
     return np.concatenate(found)
 
@@ -126,7 +126,7 @@ def test_every_number_of_objects_is_as_likely(worlds: dict[str, MeshWorld], name
 
 def test_suns_stand_between_30_and_80_degrees_on_all_sides(worlds: dict[str, MeshWorld]) -> None:
     world = worlds["light"]
-    sun = world.light(world.sample(4000, (2,)))
+    sun = world.setup.light(world.sample(4000, (2,)))
     length = sun.norm(dim=1)
     assert length.numpy() == pytest.approx(0.7, abs=1e-5)
     height = (sun[:, 1] / length).numpy()
@@ -174,7 +174,7 @@ def test_novel_view_is_from_the_side(worlds: dict[str, MeshWorld]) -> None:
         rows, columns = torch.nonzero(view[0].amax(0) > 0.02, as_tuple=True)
         assert columns.float().mean().item() == pytest.approx(63.5 + 148 * column / 3, abs=1)
         assert rows.float().mean().item() < 63.5
-    turned = world.stage.novel.rotation @ world.stage.cam_from_world.rotation.T
+    turned = world.setup.novel_cam_from_world.rotation @ world.setup.cam_from_world.rotation.T
     assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) == pytest.approx(90)
 
 
@@ -182,12 +182,14 @@ def test_novel_view_is_from_the_side(worlds: dict[str, MeshWorld]) -> None:
 def test_novel_camera_stands_as_high_and_as_far_and_looks_at_the_same_place(
     worlds: dict[str, MeshWorld], name: str
 ) -> None:
-    stage = worlds[name].stage
-    eyes = [-pose.rotation.T @ pose.translation_m for pose in (stage.cam_from_world, stage.novel)]
+    stage = worlds[name].setup
+    eyes = [-pose.rotation.T @ pose.translation_m for pose in (stage.cam_from_world, stage.novel_cam_from_world)]
     assert eyes[0][1] == pytest.approx(eyes[1][1])
     assert eyes[0][[0, 2]] @ eyes[1][[0, 2]] == pytest.approx(0, abs=1e-9)
     assert np.linalg.norm(eyes[0]) == pytest.approx(np.linalg.norm(eyes[1]))
-    axis = [pose.rotation @ [0, 0.15, 0] + pose.translation_m for pose in (stage.cam_from_world, stage.novel)]
+    axis = [
+        pose.rotation @ [0, 0.15, 0] + pose.translation_m for pose in (stage.cam_from_world, stage.novel_cam_from_world)
+    ]
     assert axis == [pytest.approx([0, 0, 4], abs=1e-9)] * 2
 
 
@@ -204,12 +206,12 @@ def test_image_gradients_reach_every_field(world: MeshWorld) -> None:
 def test_export_and_back(worlds: dict[str, MeshWorld], name: str) -> None:
     world = worlds[name]
     code = world.sample(5, (6,))
-    outputs = world.exported(code)
-    back = world.from_exported(outputs)
+    outputs = world.outputs.from_code(code)
+    back = world.outputs.to_code(outputs)
     for field in world.layout.fields:
         assert torch.allclose(back[field.name], code[field.name], atol=1e-5), field.name
-    assert set(outputs) - {"rotation"} == {field.name for field in world.exported_fields}
-    for field in world.exported_fields:
+    assert set(outputs) - {"rotation"} == {field.name for field in world.outputs.fields}
+    for field in world.outputs.fields:
         if field.lower:
             values = outputs[field.name].reshape(-1, field.size)
             assert (values >= torch.tensor(field.lower) - 1e-5).all()
@@ -220,7 +222,7 @@ def test_export_and_back(worlds: dict[str, MeshWorld], name: str) -> None:
 def test_exported_poses_are_what_the_camera_sees(worlds: dict[str, MeshWorld], name: str) -> None:
     world = worlds[name]
     code = world.sample(3, (9,))
-    outputs = world.exported(code)
+    outputs = world.outputs.from_code(code)
     assert torch.allclose(outputs[ROTATION_6D][..., :3], outputs["rotation"][..., 0])
     by_export, by_world = [], pixels_of(world, code, novel=False)
     slots = [kind for kind in world.kinds for _ in range(kind.num_slots)]
@@ -230,8 +232,8 @@ def test_exported_poses_are_what_the_camera_sees(worlds: dict[str, MeshWorld], n
         by_export.append((projected[..., :2] / projected[..., 2:]).reshape(-1, 2))
     assert np.concatenate(by_export) == pytest.approx(by_world, abs=1e-3)
     if name == "light":
-        turn = torch.from_numpy(world.stage.cam_from_world.rotation).float()
-        assert torch.allclose(outputs[LIGHT], world.light(code) @ turn.T, atol=1e-6)
+        turn = torch.from_numpy(world.setup.cam_from_world.rotation).float()
+        assert torch.allclose(outputs[LIGHT], world.setup.light(code) @ turn.T, atol=1e-6)
         assert (outputs[LIGHT] @ turn)[:, 1].min() > 0
 
 
@@ -251,9 +253,9 @@ def test_without_codes_the_label_file_is_not_opened(worlds: dict[str, MeshWorld]
         world.source("test", 0, with_code=True, cache=tmp_path)
 
 
-@pytest.mark.parametrize("method", get_args(Method))
+@pytest.mark.parametrize("method", get_args(MethodName))
 @pytest.mark.parametrize("name", NAMES)
-def test_every_method_learns_a_fixed_batch(worlds: dict[str, MeshWorld], name: str, method: Method) -> None:
+def test_every_method_learns_a_fixed_batch(worlds: dict[str, MeshWorld], name: str, method: MethodName) -> None:
     world = worlds[name]
     config = RunConfig(WORLDS[name](), method=method, recipe=FAST, network=THIN)
     with torch.no_grad():

@@ -4,18 +4,20 @@ For clients that bring their own preprocessing, ``tritonclient`` for one. The im
 and camera already; :mod:`curio_serve.api.pose_detector` is the way for frames as cameras give them.
 """
 
-from functools import partial
+from collections.abc import Iterator
 from importlib.metadata import version as installed_version
 
 import numpy as np
 from curio_proto.inference import inference_pb2 as messages
 from curio_proto.inference.inference_pb2_grpc import GRPCInferenceServiceServicer
 
-from curio_serve.api.pose_detector import CallGuard, Context
-from curio_serve.errors import ArgumentError, CurioError, ModelNotFound
+from curio_serve.api.admission import WorkQueue
+from curio_serve.api.pose_detector import Context
+from curio_serve.api.registration import only_message
+from curio_serve.api.status import CallLog
+from curio_serve.errors import ArgumentError, ModelNotFound
 from curio_serve.models.model import INPUT, Model, Outputs
 from curio_serve.models.repository import Repository
-from curio_serve.server.direct_calls import Caller, Method
 from curio_serve.telemetry import Metrics
 
 _MAX_BATCH = 64
@@ -25,13 +27,13 @@ _FP32 = np.dtype("<f4")
 class InferenceService(GRPCInferenceServiceServicer):
     """Answers ``inference.GRPCInferenceService``."""
 
-    def __init__(self, repository: Repository, metrics: Metrics) -> None:
-        self._repository = repository
-        self._guard = CallGuard(metrics)
+    def __init__(self, repository: Repository, work: WorkQueue, metrics: Metrics) -> None:
+        self._repository, self._work = repository, work
+        self._calls = CallLog(metrics)
         self._is_ready = True
 
     def drain(self) -> None:
-        """Say from now on that no new work is wanted."""
+        """Answer "not ready" from now on."""
         self._is_ready = False
 
     def ServerLive(self, request: messages.ServerLiveRequest, context: Context) -> messages.ServerLiveResponse:
@@ -41,7 +43,8 @@ class InferenceService(GRPCInferenceServiceServicer):
         return messages.ServerReadyResponse(ready=self._is_ready)
 
     def ModelReady(self, request: messages.ModelReadyRequest, context: Context) -> messages.ModelReadyResponse:
-        return self._guard.run("ModelReady", "", context, partial(self._model_ready, request))
+        with self._calls.record("ModelReady", context):
+            return self._model_ready(request)
 
     def ServerMetadata(
         self, request: messages.ServerMetadataRequest, context: Context
@@ -49,18 +52,18 @@ class InferenceService(GRPCInferenceServiceServicer):
         return messages.ServerMetadataResponse(name="curio-serve", version=installed_version("curio-pose"))
 
     def ModelMetadata(self, request: messages.ModelMetadataRequest, context: Context) -> messages.ModelMetadataResponse:
-        return self._guard.run("ModelMetadata", "", context, partial(self._metadata, request))
+        with self._calls.record("ModelMetadata", context):
+            return self._metadata(request)
 
-    @property
-    def direct(self) -> Method:
-        """``ModelInfer``, for :mod:`curio_serve.server.direct_calls`."""
-        refused = partial(self._guard.refused, "ModelInfer", "")
-        return Method("/inference.GRPCInferenceService/ModelInfer", messages.ModelInferRequest, self._answer, refused)
-
-    def _answer(
-        self, request: messages.ModelInferRequest, caller: Caller, _waited_s: float
-    ) -> messages.ModelInferResponse | CurioError:
-        return self._guard.attempt("ModelInfer", request.id[:128], caller, partial(self._infer, request))
+    def ModelInfer(
+        self, requests: Iterator[messages.ModelInferRequest], context: Context
+    ) -> messages.ModelInferResponse:
+        """Answer the one request; a full queue refuses it before it is read."""
+        with self._calls.record("ModelInfer", context) as call, self._work.reserve(context) as place:
+            request = only_message(requests)
+            call.request_id = request.id
+            with self._work.slot(context, place):
+                return self._infer(request)
 
     def _model_ready(self, request: messages.ModelReadyRequest) -> messages.ModelReadyResponse:
         try:

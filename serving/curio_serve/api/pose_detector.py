@@ -1,38 +1,39 @@
-"""The typed API ``curio.v1.PoseDetector``: translates between messages and the detector, and nothing else."""
+"""Answers the typed API ``curio.v1.PoseDetector`` by calling the detector."""
 
 import itertools
-import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache, partial
-from typing import TypeVar
+from functools import partial
 
 import grpc
 from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer
 
-from curio_serve.api import messages as wire
-from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, InternalError, Overloaded, status_of
+from curio_serve.api.admission import WorkQueue, check_is_wanted
+from curio_serve.api.messages import camera_from_message, frame_from_raw, region_from_message
+from curio_serve.api.registration import only_message
+from curio_serve.api.status import CallLog, frame_error
+from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, Overloaded
 from curio_serve.imaging import image
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.repository import Repository
-from curio_serve.server.admission import WorkQueue
-from curio_serve.server.direct_calls import Caller, Method
-from curio_serve.telemetry import LOGGER, Metrics, log
+from curio_serve.telemetry import Metrics
 
 Context = grpc.ServicerContext
-Answer = TypeVar("Answer")
 _MAX_ID_LENGTH = 128
+# One connection may have this part of the streams, but at least so many.
+_STREAM_FRACTION, _LEAST_STREAMS = 4, 8
 _ID_PREFIX, _ID_NUMBERS = secrets.token_hex(8), itertools.count()
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a request may ask for. Names are those of the server's settings."""
+    """The most that a request may ask for; names are those of the server's settings."""
 
     max_pixels: int = image.MAX_PIXELS
     max_regions: int = 64
@@ -42,106 +43,78 @@ class Limits:
     full_decode: bool = False
 
 
-class CallGuard:
-    """Runs a call's body, turns its exceptions into statuses, counts and logs it."""
-
-    def __init__(self, metrics: Metrics) -> None:
-        self._requests = cache(metrics.requests.labels)  # labels() checks and locks each time
-
-    def run(self, method: str, request_id: str, context: Context, body: Callable[[], Answer]) -> Answer:
-        """Call the body; abort the call with the status of what it raises."""
-        answer = self.attempt(method, request_id, context, body)
-        if isinstance(answer, CurioError):
-            context.abort_with_status(wire.status_from_error(answer))
-        return answer
-
-    def attempt(self, method: str, request_id: str, caller: Caller, body: Callable[[], Answer]) -> Answer | CurioError:
-        """Call the body; what it raises is counted, logged and returned."""
-        try:
-            answer = body()
-        except CurioError as exc:
-            self.refused(method, request_id, exc, caller)
-            return exc
-        except Exception:  # noqa: BLE001 - a fault of ours, which its caller shall hear of
-            LOGGER.exception("a request could not be answered")
-            error = InternalError("the server failed on this request; its log says where")
-            self.refused(method, request_id, error, caller)
-            return error
-        self._requests(method, "OK").inc()
-        log(logging.DEBUG, "answered", method=method, request_id=request_id)
-        return answer
-
-    def refused(self, method: str, request_id: str, error: CurioError, caller: Caller) -> None:
-        """Count and log a call that ends without an answer."""
-        code = status_of(error)
-        self._requests(method, code).inc()
-        level = logging.INFO
-        if isinstance(error, InternalError):
-            level = logging.ERROR
-        elif isinstance(error, Overloaded | CallEnded):
-            level = logging.DEBUG  # they come by the thousand, when time is shortest; the metrics count them
-        if LOGGER.isEnabledFor(level):
-            reason = str(error)[: wire.MAX_TEXT]
-            log(level, "refused", reason=reason, method=method, request_id=request_id, code=code, peer=caller.peer())
-
-
 class PoseService(PoseDetectorServicer):
-    """Answers ``PoseDetector``'s calls: ``Detect`` by :attr:`direct`, the others each on a thread of its own."""
+    """Answers ``PoseDetector``'s calls, each on a thread of its own."""
 
     def __init__(self, repository: Repository, work: WorkQueue, limits: Limits, metrics: Metrics) -> None:
         self._repository, self._work, self._limits, self._metrics = repository, work, limits, metrics
-        self._guard = CallGuard(metrics)
-        self._num_streams, self._lock = 0, threading.Lock()
-        metrics.streams.set_function(lambda: self._num_streams)
+        self._calls = CallLog(metrics)
+        self._streams: Counter[str] = Counter()  # of each connection
+        self._lock = threading.Lock()
+        metrics.streams.set_function(self._streams.total)
 
-    @property
-    def direct(self) -> Method:
-        """``Detect``, for :mod:`curio_serve.server.direct_calls`."""
-        refused = partial(self._guard.refused, "Detect", "")
-        return Method("/curio.v1.PoseDetector/Detect", messages.DetectRequest, self._answer, refused)
-
-    def _answer(
-        self, request: messages.DetectRequest, caller: Caller, waited_s: float
-    ) -> messages.DetectResponse | CurioError:
-        body = partial(self._detect_at_once, request, waited_s)
-        return self._guard.attempt("Detect", request.request_id[:_MAX_ID_LENGTH], caller, body)
+    def Detect(self, requests: Iterator[messages.DetectRequest], context: Context) -> messages.DetectResponse:
+        """Answer the one request; a full queue refuses it before it is read."""
+        with self._calls.record("Detect", context) as call, self._work.reserve(context) as place:
+            request = only_message(requests)
+            call.request_id = request.request_id
+            detectors = self._detectors(request)
+            with self._work.slot(context, place) as waited_s:
+                return self._detect(request, detectors, waited_s, context)
 
     def DetectStream(
-        self, request_iterator: Iterator[messages.DetectRequest], context: Context
+        self, requests: Iterator[messages.DetectRequest], context: Context
     ) -> Iterator[messages.DetectResponse]:
-        self._guard.run("DetectStream", "", context, partial(self._open_stream, context))
-        # One frame of a stream at a time: the next is read when this one is answered, so the client feels the load.
-        for request in request_iterator:
-            yield self._frame_of_stream(request, context)
+        with self._calls.record("DetectStream", context):
+            self._open_stream(context)
+            # One frame of a stream at a time: the next is read when this one is answered, so the client feels the load.
+            for request in requests:
+                yield self._frame_of_stream(request, context)
 
     def ListModels(self, request: messages.ListModelsRequest, context: Context) -> messages.ListModelsResponse:
-        return self._guard.run("ListModels", "", context, self._list)
+        with self._calls.record("ListModels", context):
+            return self._list()
 
     def GetModel(self, request: messages.GetModelRequest, context: Context) -> messages.GetModelResponse:
-        return self._guard.run("GetModel", "", context, partial(self._get, request))
+        with self._calls.record("GetModel", context):
+            model = self._repository.get(request.model.name, request.model.version)
+            return messages.GetModelResponse(spec=model.spec, version=model.version)
 
     def _frame_of_stream(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
-        """One frame's answer, or why it has none; only what ends the call ends the stream."""
-        request_id = request.request_id[:_MAX_ID_LENGTH]
-        body = partial(self._detect_in_turn, request, context)
-        answer = self._guard.attempt("DetectStream.frame", request_id, context, body)
-        if isinstance(answer, CallEnded):
-            context.abort_with_status(wire.status_from_error(answer))
-        if isinstance(answer, CurioError):
-            return messages.DetectResponse(request_id=request_id or new_request_id(), error=wire.frame_error(answer))
-        return answer
+        """One frame's answer, or its error; only the end of the call ends the stream."""
+        try:
+            with self._calls.record("DetectStream.frame", context) as call:
+                call.request_id = request.request_id
+                detectors = self._detectors(request)
+                with self._work.slot(context, always=True) as waited_s:
+                    return self._detect(request, detectors, waited_s, context)
+        except CallEnded:
+            raise
+        except CurioError as exc:
+            request_id = request.request_id[:_MAX_ID_LENGTH] or new_request_id()
+            return messages.DetectResponse(request_id=request_id, error=frame_error(exc))
 
     def _open_stream(self, context: Context) -> None:
+        peer, most = context.peer(), self._limits.max_streams
+        most_of_peer = max(_LEAST_STREAMS, most // _STREAM_FRACTION)
         with self._lock:
-            if self._num_streams >= self._limits.max_streams:
-                raise Overloaded(f"{self._num_streams} streams are open, which is the limit (--max-streams)", 1.0)
-            self._num_streams += 1
-        if not context.add_callback(self._close_stream):
-            self._close_stream()
+            if self._streams.total() >= most:
+                raise Overloaded(f"{most} streams are open, which is the limit (--max-streams)", 1.0)
+            if self._streams[peer] >= most_of_peer:
+                raise Overloaded(
+                    f"{most_of_peer} streams of this connection are open, which is the limit of one connection "
+                    f"(a part of --max-streams {most}); open another connection, or close a stream",
+                    1.0,
+                )
+            self._streams[peer] += 1
+        if not context.add_callback(partial(self._close_stream, peer)):
+            self._close_stream(peer)
 
-    def _close_stream(self) -> None:
+    def _close_stream(self, peer: str) -> None:
         with self._lock:
-            self._num_streams -= 1
+            self._streams[peer] -= 1
+            if not self._streams[peer]:
+                del self._streams[peer]
 
     def _list(self) -> messages.ListModelsResponse:
         answer = messages.ListModelsResponse()
@@ -151,31 +124,20 @@ class PoseService(PoseDetectorServicer):
             answer.models.add(name=name, versions=sorted(loaded), world=spec.world, objects=objects)
         return answer
 
-    def _get(self, request: messages.GetModelRequest) -> messages.GetModelResponse:
-        model = self._repository.get(request.model.name, request.model.version)
-        return messages.GetModelResponse(spec=model.spec, version=model.version)
-
-    def _detect_in_turn(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
-        detectors = self._detectors(request)
-        with self._work.slot(context, always=True) as waited_s:
-            return self._detect(request, detectors, waited_s)
-
-    def _detect_at_once(self, request: messages.DetectRequest, waited_s: float) -> messages.DetectResponse:
-        return self._detect(request, self._detectors(request), waited_s)
-
     def _detect(
-        self, request: messages.DetectRequest, detectors: list[Detector], waited_s: float
+        self, request: messages.DetectRequest, detectors: list[Detector], waited_s: float, context: Context
     ) -> messages.DetectResponse:
         """Decode a request's frame and run the models on it.
 
         Raises:
+            CallEnded: The deadline passed, or the client or the server ended the call, before the last run.
             RequestError: The image, the camera or a region is not acceptable.
             InternalError: A network failed.
         """
         begun = time.perf_counter()
         limits = self._limits
-        camera = wire.camera_from_message(request.camera) if request.HasField("camera") else None
-        regions = list(map(wire.region_from_message, request.regions))
+        camera = camera_from_message(request.camera) if request.HasField("camera") else None
+        regions = list(map(region_from_message, request.regions))
         min_confidence = request.min_confidence if request.HasField("min_confidence") else limits.min_confidence
         frame, camera = _decode(request, camera, detectors, limits)
         decoded = time.perf_counter()
@@ -189,6 +151,7 @@ class PoseService(PoseDetectorServicer):
                 max_detections=request.max_detections or None,
                 reduction=frame.reduction,
                 results=answer.results,
+                before_run=partial(check_is_wanted, context),
             )
         inferred = time.perf_counter()
         # Only now: what writes messages has gone cold by the time that a network has run.
@@ -196,7 +159,9 @@ class PoseService(PoseDetectorServicer):
         answer.width, answer.height = frame.width, frame.height
         spent = answer.milliseconds
         spent.queue, spent.decode, spent.inference = waited_s * 1e3, (decoded - begun) * 1e3, (inferred - decoded) * 1e3
-        self._metrics.phases.observe(waited_s, decoded - begun, inferred - decoded)
+        self._metrics.queue_s.observe(waited_s)
+        self._metrics.decode_s.observe(decoded - begun)
+        self._metrics.inference_s.observe(inferred - decoded)
         return answer
 
     def _detectors(self, request: messages.DetectRequest) -> list[Detector]:
@@ -212,7 +177,16 @@ class PoseService(PoseDetectorServicer):
             raise ArgumentError(f"request_id has {len(request.request_id)} characters; at most {_MAX_ID_LENGTH}")
         if request.HasField("max_detections") and not request.max_detections:
             raise ArgumentError("max_detections is 0; leave it out for no limit, or give at least 1")
-        return [Detector(self._repository.get(model.name, model.version)) for model in models]
+        most_runs = max(limits.max_models, limits.max_regions)
+        if len(models) * num_regions > most_runs:
+            raise ArgumentError(
+                f"{len(models)} models times {num_regions} regions are {len(models) * num_regions} runs of a network; "
+                f"at most {most_runs} are accepted (the larger of --max-models and --max-regions)"
+            )
+        found = [self._repository.get(model.name, model.version) for model in models]
+        if len(set(found)) < len(found):
+            raise ArgumentError("models names a model more than once; expected each once")
+        return list(map(Detector, found))
 
 
 def new_request_id() -> str:
@@ -227,7 +201,7 @@ def _decode(
     if kind is None:
         raise ImageError("the request has no image; set encoded (JPEG, PNG, WebP) or raw")
     if kind == "raw":
-        return wire.frame_from_raw(request.raw, limits.max_pixels), camera
+        return frame_from_raw(request.raw, limits.max_pixels), camera
     data = request.encoded  # each look at the field copies it
     header = image.open_header(data, limits.max_pixels)
     reductions = [1 if limits.full_decode else d.reduction(camera, header.width, header.height) for d in detectors]

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import tyro
 
-from curio_serve.arguments import parse
 from curio_serve.cores import num_cores
 from curio_serve.errors import CameraError, CurioError, UsageError
 
@@ -77,7 +76,7 @@ class DetectArguments:
 
 def main() -> NoReturn:
     """Entry point of the command."""
-    arguments: DetectArguments = parse(DetectArguments, prog="curio-detect")
+    arguments: DetectArguments = tyro.cli(DetectArguments, prog="curio-detect")
     # Both by name: a process started in the background inherits an ignored SIGINT, and Python then leaves it so.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _terminate)
@@ -111,11 +110,14 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.progress import Progress
     from curio_serve.batch.result_file import ResultFile
     from curio_serve.batch.sources import check_arguments, images
+    from curio_serve.models.model_check import ChildCheck
 
     _check_numbers(arguments)
     check_arguments(arguments.images)
     cv2.setNumThreads(1)  # the images are what runs in parallel
     settings = _settings(arguments)
+    if os.path.exists(arguments.model):
+        ChildCheck()(Path(arguments.model))
     estimator = _estimator(arguments, settings)
     form = _format(arguments, estimator.spec)
     _check_camera(arguments, estimator)

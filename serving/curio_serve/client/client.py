@@ -1,11 +1,11 @@
-"""A client for the pose service, blocking and asynchronous.
+"""Clients for the pose service, blocking and asynchronous.
 
     with PoseClient("127.0.0.1:8500") as client:
         answer = client.detect("ape", "frame.jpg", camera="camera.json")
 
-Every call has a deadline. A call is repeated only where that is safe and of use: detection changes nothing, so it is
-tried again when the server was out of reach, or when its queue was full and it said when to come back; never past the
-deadline. Failures come back as the exceptions that the server raised (:mod:`curio_serve.errors`).
+Every call has a deadline. Detection changes nothing on the server, so a client tries a call again, within its deadline,
+if the server was out of reach, or if its queue was full and it said when to come back. Failures come back as the
+exceptions that the server raised (:mod:`curio_serve.errors`).
 """
 
 import asyncio
@@ -29,20 +29,17 @@ _CHANNEL_OPTIONS = (("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_recon
 
 @dataclass(frozen=True)
 class Tls:
-    """Files (PEM) for an encrypted connection.
-
-    Attributes:
-        root_certificates: Who may have signed the server's certificate; None: the system's authorities.
-        certificate: Our own certificate, where the server asks for one.
-        private_key: Its key.
-    """
+    """Files (PEM) for an encrypted connection."""
 
     root_certificates: Path | None = None
+    """Authorities that may have signed the server's certificate; None: the system's."""
     certificate: Path | None = None
+    """The client's own certificate, if the server asks for one."""
     private_key: Path | None = None
+    """Key of the client's certificate."""
 
     def credentials(self) -> grpc.ChannelCredentials:
-        """What gRPC makes of the files.
+        """Credentials for gRPC from the files.
 
         Raises:
             UsageError: One cannot be read, or certificate and key do not come together.
@@ -54,19 +51,19 @@ class Tls:
 
 
 class _Client:
-    """What both clients have in common: where the server is and how a call is made, not when."""
+    """The part that both clients share: the server's address, deadlines and credentials."""
 
     def __init__(
         self, address: str, *, timeout_s: float = 10.0, max_attempts: int = 5, tls: Tls | None = None, token: str = ""
     ) -> None:
-        """Does not connect yet: the first call does.
+        """Prepare a connection; the first call makes it.
 
         Args:
             address: ``host:port``.
-            timeout_s: Deadline of a call, all its attempts together, where the call names no other.
-            max_attempts: How often a call is tried at most.
-            tls: Encrypt; None: plain, for servers on the loopback.
-            token: Bearer token, where the server asks for one.
+            timeout_s: Deadline of a call, all its attempts together, if the call names no other.
+            max_attempts: Largest number of attempts a call.
+            tls: Encrypts the connection; None: plain, for servers on the loopback.
+            token: Bearer token, if the server asks for one.
         """
         self.address = address
         self._timeout_s = timeout_s
@@ -121,15 +118,15 @@ class PoseClient(_Client):
             image: Path of a JPEG, PNG or WebP file, its bytes, or pixels uint8 RGB [height, width, 3].
             camera: Camera file, :class:`~curio_serve.imaging.camera.PinholeCamera` or K [3, 3] in pixels; None for
                 models that need none.
-            regions: Where to look, each (x, y, width, height) in pixels; none: everywhere.
-            min_confidence: Leave out what is below; None: the server's own threshold.
-            max_detections: Most confident first, a region and model; None: no limit.
+            regions: Rectangles to search, each (x, y, width, height) in pixels; none: the whole frame.
+            min_confidence: Detections below it are left out; None: the server's own threshold.
+            max_detections: Largest number a region and model, the most confident; None: no limit.
             apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
             request_id: Comes back with the answer; empty: the server makes one up.
             timeout_s: Deadline of this call.
 
         Raises:
-            CurioError: What the server raised, or that it is out of reach.
+            CurioError: The server raised it, or is out of reach.
         """
         request = detect_request(
             model,
@@ -185,7 +182,7 @@ class PoseClient(_Client):
 
 
 class AsyncPoseClient(_Client):
-    """The same for asyncio; arguments and errors are those of :class:`PoseClient`."""
+    """Client for asyncio; arguments and errors are those of :class:`PoseClient`."""
 
     def __init__(
         self, address: str, *, timeout_s: float = 10.0, max_attempts: int = 5, tls: Tls | None = None, token: str = ""

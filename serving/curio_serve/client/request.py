@@ -1,5 +1,6 @@
-"""A detection request from what a caller has at hand: a path or pixels, a camera file or a matrix."""
+"""Builds a detection request from a path or pixels, and a camera file or a matrix."""
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -8,13 +9,16 @@ import numpy as np
 from curio_proto.v1 import detector_pb2 as messages
 
 from curio_serve.errors import ArgumentError, ImageError
+from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.camera_files import read_camera_file
+from curio_serve.imaging.image import MAX_FILE_BYTES
 from curio_serve.imaging.view import Region
 
 ImageLike: TypeAlias = str | Path | bytes | np.ndarray
 CameraLike: TypeAlias = str | Path | PinholeCamera | np.ndarray | Sequence[Sequence[float]] | None
 RegionLike: TypeAlias = Region | Sequence[float]
+_VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
 
 def detect_request(
@@ -43,8 +47,8 @@ def detect_request(
 
     Raises:
         ArgumentError: A value is of the wrong shape or kind.
-        ImageError: The file cannot be read, or the pixels are none.
-        CameraError: The camera file or matrix is not one.
+        ImageError: The file cannot be read, or the array is no image.
+        CameraError: The camera file cannot be read, or the matrix is no K.
     """
     request = messages.DetectRequest(
         request_id=request_id,
@@ -66,11 +70,11 @@ def selector(model: str) -> messages.ModelSelector:
     """``name`` (the latest version) or ``name/version``.
 
     Raises:
-        ArgumentError: The version is not a number above 0.
+        ArgumentError: The version is not a number from 1 to 999999999.
     """
     name, slash, version = model.partition("/")
-    if slash and not (version.isdecimal() and int(version) > 0):
-        raise ArgumentError(f"model {model!r}: expected name or name/version with a version number from 1")
+    if slash and not _VERSION.fullmatch(version):
+        raise ArgumentError(f"model {model!r}: expected name or name/version with a version from 1 to 999999999")
     return messages.ModelSelector(name=name, version=int(version or 0))
 
 
@@ -86,7 +90,7 @@ def _raw(pixels: np.ndarray) -> messages.RawImage:
 
 def _read(path: str | Path) -> bytes:
     try:
-        return Path(path).read_bytes()
+        return read_file(path, MAX_FILE_BYTES)
     except OSError as exc:
         raise ImageError(f"{path} cannot be read: {exc.strerror}") from exc
 

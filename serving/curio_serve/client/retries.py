@@ -1,4 +1,4 @@
-"""Why a call failed, as the exception that the server raised, and whether to try again before its deadline."""
+"""Turns a failed call into the exception that the server raised, and decides whether to try again."""
 
 import random
 import time
@@ -16,7 +16,7 @@ _STATUS_DETAILS_KEY = "grpc-status-details-bin"
 
 
 class Attempts:
-    """One call's deadline, and the decision to try again."""
+    """Counts the attempts of one call and keeps its deadline."""
 
     def __init__(self, address: str, timeout_s: float, max_attempts: int) -> None:
         self._address = address
@@ -26,13 +26,14 @@ class Attempts:
 
     @property
     def remaining_s(self) -> float:
+        """Seconds until the deadline."""
         return max(0.0, self._end - time.monotonic())
 
     def pause_after(self, failure: grpc.RpcError) -> float:
         """Seconds until the next attempt.
 
         Raises:
-            CurioError: There shall be none; this is why the call failed.
+            CurioError: The call is not tried again; this is why it failed.
         """
         error = error_from_call(failure, self._address)
         if isinstance(error, Overloaded):
@@ -49,7 +50,7 @@ class Attempts:
 
 
 def error_from_call(failure: Any, address: str) -> CurioError:
-    """The exception behind a failed call: the server's own where it told which, else what gRPC's status means."""
+    """The exception behind a failed call: the one that the server names, else what gRPC's status means."""
     status, text = failure.code().name, failure.details() or ""
     reason, retry_after_s = _details(failure)
     if not reason and status == "UNAVAILABLE":
@@ -66,7 +67,7 @@ def error_from_call(failure: Any, address: str) -> CurioError:
 
 
 def error_from_answer(answer: DetectResponse) -> CurioError | None:
-    """The exception that one frame of a stream was answered with; None where it has results."""
+    """The exception that a server answered one frame of a stream with; None if the answer has results."""
     if not answer.HasField("error"):
         return None
     names = {code.value[0]: code.name for code in grpc.StatusCode}
@@ -74,7 +75,7 @@ def error_from_answer(answer: DetectResponse) -> CurioError | None:
 
 
 def _details(failure: Any) -> tuple[str, float | None]:
-    """(ErrorInfo's reason, RetryInfo's delay in seconds) of a failed call, as far as it has them."""
+    """(ErrorInfo's reason or "", RetryInfo's delay in seconds or None) of a failed call."""
     reason, retry_after_s = "", None
     packed = dict(failure.trailing_metadata() or ()).get(_STATUS_DETAILS_KEY, b"")
     info, retry = error_details_pb2.ErrorInfo(), error_details_pb2.RetryInfo()

@@ -1,4 +1,4 @@
-"""Pinhole cameras: what a frame's intrinsics have to be, and rays and pixels.
+"""Pinhole cameras: checks intrinsics, and converts between pixels and rays.
 
 OpenCV's frame: x right, y down, z forward. Pixel centres lie at integer coordinates, so a change of size by s means
 p' + 1/2 = s (p + 1/2).
@@ -7,7 +7,7 @@ p' + 1/2 = s (p + 1/2).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -24,18 +24,17 @@ _MIN_FOCAL_WIDTHS, _MAX_FOCAL_WIDTHS = 0.1, 50.0
 class PinholeCamera:
     """Intrinsics of the camera that took a frame.
 
-    Attributes:
-        matrix: K, float [3, 3], pixels.
-        distortion: OpenCV's k1, k2, p1, p2, k3 (none, 4, 5 or 8 values).
-        size: (width, height) in pixels that K belongs to, where known.
-
     Raises:
-        CameraError: Not finite, singular, not a pinhole matrix, or an impossible focal length or principal point.
+        CameraError: Not finite, singular, not a pinhole matrix, or an impossible focal length, principal point or
+            distortion.
     """
 
     matrix: Array
+    """K, float [3, 3], pixels."""
     distortion: tuple[float, ...] = ()
+    """OpenCV's k1, k2, p1, p2, k3, k4, k5, k6: none, 4, 5 or 8 values."""
     size: tuple[int, int] | None = None
+    """(width, height) in pixels of the frames that K belongs to; None if unknown."""
 
     def __post_init__(self) -> None:
         """Check what can be checked without the frame."""
@@ -52,7 +51,7 @@ class PinholeCamera:
 
     @cached_property
     def coefficients(self) -> Array | None:
-        """Distortion as OpenCV takes it, or None where there is none."""
+        """Distortion as OpenCV takes it; None without distortion."""
         return np.array(self.distortion) if any(self.distortion) else None
 
     @cached_property
@@ -70,7 +69,8 @@ class PinholeCamera:
         """Refuse a frame this camera cannot have taken.
 
         Raises:
-            CameraError: Another size than K belongs to, a principal point outside, an implausible focal length.
+            CameraError: Another size than K belongs to, a principal point outside, an implausible focal length or
+                distortion.
         """
         if self.size is not None and self.size != (width, height):
             raise CameraError(
@@ -89,12 +89,14 @@ class PinholeCamera:
                     f"{name} = {focal:g} px is implausible for {side} pixels "
                     f"(field of view {np.degrees(2 * np.arctan2(side, 2 * focal)):.3g} degrees); K must be in pixels"
                 )
+        if self.coefficients is not None:
+            _check_distortion(self, width, height)
 
     def turned(self, quarter_turns: int, width: int, height: int) -> "PinholeCamera":
         """The camera of a frame after clockwise quarter turns of its pixels.
 
-        A turn takes (x, y) to (height - 1 - y, x). The tangential coefficients act as the vector (p2, p1), which turns
-        with the picture: Brown's model adds r² q + 2 (q·x) x for q = (p2, p1).
+        A quarter turn takes (x, y) to (height - 1 - y, x). The tangential coefficients act as the vector (p2, p1),
+        which turns with the image: Brown's model adds r² q + 2 (q·x) x for q = (p2, p1).
 
         Args:
             quarter_turns: How many.
@@ -114,7 +116,7 @@ class PinholeCamera:
         return camera
 
     def ray(self, x: float, y: float) -> Array:
-        """Unit direction [3] in the camera frame of what is seen at a pixel."""
+        """Unit direction [3], camera frame, of the ray through a pixel."""
         (fx, _, cx), (_, fy, cy), _ = self._rows
         slope_x, slope_y = (x - cx) / fx, (y - cy) / fy
         if self.coefficients is not None:
@@ -135,7 +137,7 @@ class PinholeCamera:
         return found[:, 0]
 
     def pixels(self, points: Sequence[Sequence[float]]) -> list[float]:
-        """The same of a few points as plain numbers, x and y in turn: without the cost of numpy's calls."""
+        """Pixels of a few points, x and y in turn, as plain numbers: numpy's calls cost more than these sums."""
         if self.coefficients is not None:
             found: list[float] = self.project(np.array(points)).ravel().tolist()
             return found
@@ -152,14 +154,29 @@ def _check_matrix(matrix: Array) -> None:
     shown = matrix.tolist()
     if not np.isfinite(matrix).all():
         raise CameraError(f"K has values that are not finite: {shown}")
+    if (matrix[2] != (0, 0, 1)).any() and (matrix[:, 2] == (0, 0, 1)).all():
+        raise CameraError(f"K is {shown}; it is transposed: expected rows [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     if (matrix[2] != (0, 0, 1)).any() or matrix[1, 0] != 0:
         raise CameraError(f"K is {shown}; its last row has to be [0, 0, 1] and the entry below fx 0")
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise CameraError(
-            f"K is singular or mirrored: fx = {matrix[0, 0]:g}, fy = {matrix[1, 1]:g}; both must be above 0"
+            f"K is singular or mirrored: fx = {matrix[0, 0]:g}, fy = {matrix[1, 1]:g}; a focal length must be above 0"
         )
     if abs(matrix[0, 1]) > 1e-6 * matrix[0, 0]:
         raise CameraError(f"K has a skew of {matrix[0, 1]:g} px; expected 0: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+
+
+@lru_cache(32)
+def _check_distortion(camera: PinholeCamera, width: int, height: int) -> None:
+    """Refuse a distortion that moves a point of the frame's border by more than half the diagonal: past the centre."""
+    x, y = np.meshgrid([-0.5, (width - 1) / 2, width - 0.5], [-0.5, (height - 1) / 2, height - 0.5])
+    border = np.stack([x.ravel(), y.ravel(), np.ones(9)])
+    moved_px = np.abs(camera.project((np.linalg.inv(camera.matrix) @ border).T) - border[:2].T).max()
+    if not moved_px <= math.hypot(width, height) / 2:
+        raise CameraError(
+            f"the distortion {list(camera.distortion)} moves pixels of a frame of {width}x{height} by up to "
+            f"{moved_px:.3g} px; expected the coefficients k1, k2, p1, p2, k3 of this camera, in OpenCV's order"
+        )
 
 
 def scaling(x_scale: float, y_scale: float) -> Array:

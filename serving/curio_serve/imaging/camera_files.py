@@ -1,4 +1,4 @@
-"""Camera files: our JSON, BOP's camera.json and scene_camera.json, OpenCV's YAML.
+"""Reads camera files: our JSON, BOP's camera.json and scene_camera.json, OpenCV's YAML.
 
 ours              {"camera_matrix": [[fx,0,cx],[0,fy,cy],[0,0,1]], "width": w, "height": h, "distortion": [...]}
 camera.json       {"fx":, "fy":, "cx":, "cy":, "width":, "height":, ...}
@@ -17,22 +17,28 @@ import cv2
 import numpy as np
 
 from curio_serve.errors import CameraError
+from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
+
+MAX_BYTES = 64 << 20
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a camera file holds: one camera for all images, or one for each image number."""
+    """The content of a camera file: one camera for all images, or one for each image number."""
 
     path: Path
+    """The file."""
     camera: PinholeCamera | None
+    """The camera of all images; None if each image has its own."""
     per_image: Mapping[int, PinholeCamera]
+    """Cameras by image number; empty if one camera took all images."""
 
     def camera_for(self, image: str | Path) -> PinholeCamera:
         """The camera of an image; in a file with one for each, by the last number in the image's file name.
 
         Raises:
-            CameraError: The file has none for it.
+            CameraError: The file has no camera for it.
         """
         if self.camera is not None:
             return self.camera
@@ -56,7 +62,7 @@ def read_camera_file(path: str | Path) -> CameraFile:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_file(path, MAX_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as exc:
         raise CameraError(f"camera file {path} cannot be read: {exc}") from exc
     try:
@@ -67,7 +73,7 @@ def read_camera_file(path: str | Path) -> CameraFile:
         raise CameraError(f"camera file {path} is not JSON: {exc}; OpenCV files need the suffix .yml or .yaml") from exc
     except CameraError as exc:
         raise CameraError(f"camera file {path}: {exc}") from exc
-    except (TypeError, ValueError, KeyError, SystemError, cv2.error) as exc:
+    except (TypeError, ValueError, KeyError, OverflowError, RecursionError, SystemError, cv2.error) as exc:
         # OpenCV's reader turns its own errors into SystemError.
         raise CameraError(f"camera file {path} cannot be understood: {exc!r}") from exc
 
@@ -75,7 +81,7 @@ def read_camera_file(path: str | Path) -> CameraFile:
 def _from_json(path: Path, content: Any) -> CameraFile:
     if isinstance(content, dict) and "camera_matrix" in content:
         size = _size(content.get("width"), content.get("height"))
-        distortion = tuple(float(v) for v in content.get("distortion") or ())
+        distortion = _distortion(content.get("distortion"))
         return CameraFile(path, PinholeCamera(_matrix(content["camera_matrix"]), distortion, size), {})
     if isinstance(content, dict) and {"fx", "fy", "cx", "cy"} <= content.keys():
         fx, fy, cx, cy = (float(content[name]) for name in ("fx", "fy", "cx", "cy"))
@@ -95,8 +101,19 @@ def _matrix(values: Any) -> np.ndarray:
     return array.reshape(3, 3) if array.shape == (9,) else array
 
 
+def _distortion(values: Any) -> tuple[float, ...]:
+    if values is not None and not isinstance(values, list):
+        raise CameraError(f"distortion is {values!r}; expected a list of numbers [k1, k2, p1, p2, k3]")
+    return tuple(float(v) for v in values or ())
+
+
 def _size(width: Any, height: Any) -> tuple[int, int] | None:
-    return None if width is None or height is None else (int(width), int(height))
+    if width is None or height is None:
+        return None
+    for name, value in (("width", width), ("height", height)):
+        if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value) or value < 1:
+            raise CameraError(f"{name} is {value!r}; expected a whole number of pixels")
+    return int(width), int(height)
 
 
 def _from_opencv(text: str) -> PinholeCamera:
@@ -107,7 +124,7 @@ def _from_opencv(text: str) -> PinholeCamera:
             raise CameraError("no matrix camera_matrix; expected a file of OpenCV's calibration")
         distortion = storage.getNode("distortion_coefficients").mat()
         width, height = storage.getNode("image_width"), storage.getNode("image_height")
-        size = None if width.empty() or height.empty() else (int(width.real()), int(height.real()))
+        size = None if width.empty() or height.empty() else _size(width.real(), height.real())
     finally:
         storage.release()
     return PinholeCamera(matrix, () if distortion is None else tuple(map(float, distortion.ravel())), size)

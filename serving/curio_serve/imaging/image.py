@@ -1,4 +1,4 @@
-"""Bytes to pixels, refusing before decoding.
+"""Decodes images, and refuses what is not acceptable before decoding.
 
 All pixels are uint8 RGB [height, width, 3] as stored: EXIF rotation is applied only on request, because K belongs to
 the stored pixels. Grey becomes three equal channels, 16 bits lose their low byte, alpha is dropped (colours as stored).
@@ -13,9 +13,11 @@ import numpy as np
 
 from curio_serve.errors import ImageError
 from curio_serve.imaging.image_header import Header, read_header
+from curio_serve.imaging.png import pixels_only
 
 MIN_SIDE_PX = 16
 MAX_PIXELS = 1 << 25  # 33.5 million: 8K video fits
+MAX_FILE_BYTES = 1 << 28  # more than so many pixels of 8 bytes take without compression
 RawFormat = Literal["RGB8", "BGR8", "GRAY8"]
 
 _REDUCED = {
@@ -29,21 +31,18 @@ _QUARTER_TURNS = {1: 0, 3: 2, 6: 1, 8: 3}  # EXIF orientation to clockwise quart
 
 @dataclass(frozen=True)
 class Frame:
-    """A decoded image.
-
-    Attributes:
-        pixels: uint8 RGB [height / reduction, width / reduction, 3].
-        width: Of the image in full size; K belongs to this size.
-        height: Likewise.
-        reduction: 1, 2, 4 or 8: how much smaller than the image the pixels were decoded.
-        quarter_turns: Clockwise turns applied to the stored pixels; K has to be turned likewise.
-    """
+    """A decoded image."""
 
     pixels: np.ndarray
+    """uint8 RGB [height / reduction, width / reduction, 3]."""
     width: int
+    """Of the image in full size, to which K belongs."""
     height: int
+    """Of the image in full size, to which K belongs."""
     reduction: int = 1
+    """1, 2, 4 or 8: how much smaller than the image the pixels were decoded."""
     quarter_turns: int = 0
+    """Clockwise turns applied to the stored pixels; K has to be turned with them."""
 
 
 def check_size(width: int, height: int, max_pixels: int = MAX_PIXELS) -> None:
@@ -62,7 +61,7 @@ def check_size(width: int, height: int, max_pixels: int = MAX_PIXELS) -> None:
 
 
 def open_header(data: bytes, max_pixels: int = MAX_PIXELS) -> Header:
-    """Header of an encoded image that is fit to be decoded.
+    """The header of an encoded image, after checking that the image may be decoded.
 
     Raises:
         ImageError: Says what is wrong with it.
@@ -86,10 +85,10 @@ def decode(
 
     Args:
         data: The file's bytes.
-        header: From :func:`open_header`, where the caller has it already.
+        header: From :func:`open_header`, if the caller has it already.
         max_pixels: Most pixels accepted, checked before anything is decoded.
-        max_reduction: 1, 2, 4 or 8: a JPEG may be decoded this much smaller, which costs far less. Used as far as it
-            divides both sides, so that the scale is exact.
+        max_reduction: 1, 2, 4 or 8: a JPEG may be decoded this much smaller, which costs far less. The largest such
+            number that divides both sides is used, so that the scale is exact.
         apply_exif_rotation: Turn the pixels as EXIF says.
 
     Raises:
@@ -122,7 +121,7 @@ def _reduction(header: Header, max_reduction: int) -> int:
 
 
 def _decode_pixels(data: bytes, header: Header, reduction: int) -> np.ndarray:
-    buffer = np.frombuffer(data, np.uint8)
+    buffer = np.frombuffer(pixels_only(data) if header.format == "png" else data, np.uint8)
     try:
         pixels = cv2.imdecode(buffer, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as exc:
@@ -138,7 +137,7 @@ def _decode_pixels(data: bytes, header: Header, reduction: int) -> np.ndarray:
 def from_raw(
     data: bytes, raw_format: RawFormat, width: int, height: int, stride: int = 0, *, max_pixels: int = MAX_PIXELS
 ) -> Frame:
-    """Pixels that come without an encoding.
+    """A frame from pixels without an encoding.
 
     Args:
         data: Rows from top to bottom.

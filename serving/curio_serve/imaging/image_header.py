@@ -1,4 +1,4 @@
-"""What an encoded image says about itself, read from its first bytes without decoding a pixel.
+"""Reads what an encoded image declares about itself, without decoding a pixel.
 
 A decoder told to open a file of 140 kB may allocate 432 MB; so size, colour model, completeness and EXIF orientation
 are read here first, and what is not acceptable never reaches the decoder.
@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from curio_serve.errors import ImageError
+from curio_serve.imaging.png import MAGIC, chunks
 
 ImageFormat = Literal["jpeg", "png", "webp"]
 
-_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _EXIF_ORIENTATION = 0x0112
 _SOF_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _PROGRESSIVE = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
@@ -22,21 +22,18 @@ MAX_JPEG_SCANS = 64
 
 @dataclass(frozen=True)
 class Header:
-    """What the head of an image file declares.
-
-    Attributes:
-        format: Container.
-        width: Pixels as stored.
-        height: Pixels as stored.
-        num_channels: 1 grey, 2 grey + alpha, 3 colour, 4 colour + alpha or CMYK.
-        orientation: EXIF orientation 1 … 8; 1 where there is none.
-    """
+    """What the head of an image file declares."""
 
     format: ImageFormat
+    """Container."""
     width: int
+    """Pixels as stored."""
     height: int
+    """Pixels as stored."""
     num_channels: int
+    """1 grey, 2 grey + alpha, 3 colour, 4 colour + alpha or CMYK."""
     orientation: int = 1
+    """EXIF orientation 1 … 8; 1 without EXIF."""
 
 
 def read_header(data: bytes) -> Header:
@@ -50,7 +47,7 @@ def read_header(data: bytes) -> Header:
     try:
         if data[:3] == b"\xff\xd8\xff":
             return _read_jpeg(data)
-        if data[:8] == _PNG_MAGIC:
+        if data[:8] == MAGIC:
             return _read_png(data)
         if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
             return _read_webp(data)
@@ -130,18 +127,15 @@ def _read_png(data: bytes) -> Header:
     num_channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(color_type)
     if num_channels is None:
         raise ImageError(f"the PNG is damaged: colour type {color_type} does not exist; send the file again")
-    orientation, position, num_data_bytes = 1, 8, 0
-    while position + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, position)
-        kind = data[position + 4 : position + 8]
+    orientation, num_data_bytes = 1, 0
+    for kind, start, length in chunks(data):
         if kind == b"IEND":
             if not num_data_bytes:
                 raise ImageError("the PNG has no picture data (no IDAT chunk); the file is damaged")
             return Header("png", width, height, num_channels, orientation)
         num_data_bytes += length if kind == b"IDAT" else 0
         if kind == b"eXIf":
-            orientation = exif_orientation(data[position + 8 : position + 8 + length])
-        position += 12 + length
+            orientation = exif_orientation(data[start : start + length])
     raise ImageError(f"the PNG is cut short: no end chunk in its {len(data)} bytes; send the whole file")
 
 
@@ -177,7 +171,7 @@ def _webp_orientation(data: bytes) -> int:
 
 
 def exif_orientation(tiff: bytes) -> int:
-    """Orientation 1 … 8 of an EXIF block (TIFF 6.0 header and first directory); 1 where it tells none or is damaged."""
+    """Orientation 1 … 8 of an EXIF block (TIFF 6.0 header and first directory); 1 if it has none or is damaged."""
     order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
     if order is None:
         return 1

@@ -171,17 +171,17 @@ def _draw_segment(
 
 
 def _draw_label(canvas: Pixels, corners_px: NDArray[np.float64], text: str, color: Rgb) -> None:
-    """Name and confidence on a dark plate over the box, moved inside the frame where it would stick out."""
+    """Name and confidence on a dark label over the box, moved inside the frame where it would stick out."""
     seen_px = corners_px[np.isfinite(corners_px).all(axis=1)]
     if not len(seen_px):
         return
     height, width = canvas.shape[:2]
     scale = max(0.35, min(height, width) / 1000)
     (text_width, text_height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    plate_width, plate_height = text_width + 8, text_height + below + 6
-    left = int(np.clip(seen_px[:, 0].min(), 0, max(0, width - plate_width)))
-    top = int(np.clip(seen_px[:, 1].min() - plate_height - 3, 0, max(0, height - plate_height)))
-    plate = canvas[top : top + plate_height, left : left + plate_width]
-    plate[:] = plate // 4
-    plate[:, :3] = color
+    label_width, label_height = text_width + 8, text_height + below + 6
+    left = int(np.clip(seen_px[:, 0].min(), 0, max(0, width - label_width)))
+    top = int(np.clip(seen_px[:, 1].min() - label_height - 3, 0, max(0, height - label_height)))
+    label = canvas[top : top + label_height, left : left + label_width]
+    label[:] = label // 4
+    label[:, :3] = color
     cv2.putText(canvas, text, (left + 6, top + text_height + 3), cv2.FONT_HERSHEY_SIMPLEX, scale, _TEXT, 1, cv2.LINE_AA)

@@ -1,6 +1,7 @@
-"""Image in, poses out: one loaded model over the regions of a frame. No gRPC here."""
+"""Detects a model's objects in the regions of a frame. No gRPC here."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,10 +13,10 @@ from curio_proto.v1.detector_pb2 import (
     RegionResult,
 )
 
-from curio_serve.errors import ArgumentError, CameraMissing, ImageError
+from curio_serve.errors import ArgumentError, CameraError, CameraMissing, ImageError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
-from curio_serve.imaging.view import FlatFrame, PinholeFrame, Region, View
+from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
 from curio_serve.models.model import Model, Slot
 
 if TYPE_CHECKING:
@@ -46,59 +47,62 @@ class Detector:
         max_detections: int | None = None,
         reduction: int = 1,
         results: "Results | None" = None,
+        before_run: Callable[[], None] = lambda: None,
     ) -> "Results":
         """Poses in one frame.
 
         Args:
             pixels: uint8 RGB [height / reduction, width / reduction, 3].
             camera: Intrinsics of the full-size frame; None for 2D worlds and for models that allow a default.
-            regions: Where to look, in pixels of the full-size frame; none: the whole frame.
-            min_confidence: Detections below are left out; 0 … 1.
+            regions: Rectangles to search, in pixels of the full-size frame; none: the whole frame.
+            min_confidence: Detections below it are left out; 0 … 1.
             max_detections: Most detections a region; None: all.
             reduction: How much smaller than the frame the pixels were decoded.
-            results: Those of an answer, to which these are added; None: of an answer that has none yet.
+            results: The field of a response to which results are added; None: a new one.
+            before_run: Called before each run of the network; what it raises ends the detection.
 
         Returns:
             One result a region, in order; detections most confident first.
 
         Raises:
             CameraMissing: The model needs K.
-            CameraError: K cannot be this frame's.
-            ImageError: Not uint8 RGB.
-            ArgumentError: A region or threshold that makes no sense.
+            CameraError: K cannot be this frame's, or gives a pose that is not finite.
+            ImageError: The pixels are not uint8 RGB.
+            ArgumentError: A region or threshold is out of range.
             InternalError: The network failed.
         """
         _check_arguments(pixels, regions, min_confidence)
         frame = self._frame(pixels, camera, reduction)
-        views = [
-            frame.look(region) if region.overlaps(frame.width, frame.height) else None
+        crops = [
+            frame.crop(region) if region.overlaps(frame.width, frame.height) else None
             for region in regions or [Region(0, 0, frame.width, frame.height)]
         ]
-        answers = iter(self._answers([view.image for view in views if view is not None]))
+        outputs = iter(self._outputs([crop.image for crop in crops if crop is not None], before_run))
         results = DetectResponse().results if results is None else results
-        for index, view in enumerate(views):
+        for index, crop in enumerate(crops):
             result = results.add(model=self.model.name, model_version=self.model.version, region=index)
-            if view is None:
+            if crop is None:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
-                _fill(result, view, self.model.slots, next(answers), min_confidence, max_detections)
+                _fill(result, crop, self.model.slots, next(outputs), min_confidence, max_detections)
         return results
 
-    def _answers(self, images: list[Array]) -> list[Values]:
-        """What the network says of each image, computed a few at a time: memory stays flat however many there are."""
-        answers: list[Values] = []
+    def _outputs(self, images: list[Array], before_run: Callable[[], None]) -> list[Values]:
+        """The network's outputs for each image, computed a few at a time: memory stays flat however many there are."""
+        outputs: list[Values] = []
         for start in range(0, len(images), _MAX_BATCH):
+            before_run()
             batch = images[start : start + _MAX_BATCH]
-            outputs = self.model.run(batch[0][None] if len(batch) == 1 else np.stack(batch))
-            rows = zip(*[value.tolist() for value in outputs.values()], strict=True)
-            answers += [dict(zip(outputs, row, strict=True)) for row in rows]
-        return answers
+            found = self.model.run(batch[0][None] if len(batch) == 1 else np.stack(batch))
+            rows = zip(*[value.tolist() for value in found.values()], strict=True)
+            outputs += [dict(zip(found, row, strict=True)) for row in rows]
+        return outputs
 
     def reduction(self, camera: PinholeCamera | None, width: int, height: int) -> int:
         """How much smaller a frame may be decoded (1, 2, 4, 8) without going below the model's own resolution.
 
         Args:
-            camera: Of the frame, where known.
+            camera: Of the frame, if known.
             width: Of the frame.
             height: Of the frame.
         """
@@ -142,15 +146,19 @@ def _check_arguments(pixels: Array, regions: Sequence[Region], min_confidence: f
 
 def _fill(
     result: RegionResult,
-    view: View,
+    crop: Crop,
     slots: Sequence[Slot],
     values: Values,
     min_confidence: float,
     max_detections: int | None,
 ) -> None:
-    """Turn one image's outputs back into the frame's camera; write down the most confident, best first."""
+    """Write the most confident detections of one crop into a result, best first, in the frame's camera.
+
+    Raises:
+        CameraError: A pose is not finite in the frame's camera.
+    """
     if "light" in values:
-        result.light.extend(view.turn([[value] for value in values["light"]]))
+        result.light.extend(crop.rotate([[value] for value in values["light"]]))
     confidences = [min(max(c, 0.0), 1.0) for c in values.get("confidence", [1.0] * len(slots))]
     confident = [row for row, confidence in enumerate(confidences) if confidence >= min_confidence]
     if not confident:
@@ -159,8 +167,10 @@ def _fill(
     result.status = REGION_STATUS_DETECTED
     confident.sort(key=confidences.__getitem__, reverse=True)
     for row in confident[:max_detections]:
-        translation = view.translation(values["translation_m"][row])
-        rotation = view.turn(values["rotation"][row]) if "rotation" in values else ()
+        translation = crop.translation(values["translation_m"][row])
+        rotation = crop.rotate(values["rotation"][row]) if "rotation" in values else ()
+        if not all(map(math.isfinite, (*translation, *rotation, *result.light))):
+            raise CameraError("the camera gives a pose that is not finite; check K and the distortion")
         result.detections.add(
             object=slots[row].object,
             confidence=confidences[row],
@@ -169,14 +179,20 @@ def _fill(
             rotation=rotation,
             quaternion_xyzw=quaternion_xyzw(rotation) if rotation else (),
             color=values["color"][row] if "color" in values else (),
-            box_px=view.project(_placed(slots[row].box_corners, rotation or _UPRIGHT, translation)),
+            box_px=crop.project(_transformed(slots[row].box_corners, rotation or _UPRIGHT, translation)),
         )
 
 
-def _placed(
+def _transformed(
     points: Sequence[Sequence[float]], rotation: Sequence[float], translation: Sequence[float]
 ) -> Sequence[Sequence[float]]:
-    """An object's points in the frame's camera."""
+    """An object's points in the frame's camera, metres.
+
+    Args:
+        points: Object frame, metres.
+        rotation: Of cam_from_obj, 9 values row after row.
+        translation: Of cam_from_obj, metres.
+    """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation
     x, y, z = translation
     return [

@@ -1,4 +1,4 @@
-"""A loaded model: an ONNX file opened by onnxruntime, with its specification checked against its graph.
+"""Loads a model: opens an ONNX file with onnxruntime and checks its specification against its graph.
 
 The only file that imports onnxruntime, and that when a model is loaded.
 """
@@ -15,6 +15,7 @@ import numpy as np
 from curio_proto.v1.model_spec_pb2 import Field, ModelSpec
 
 from curio_serve.errors import CameraError, InternalError, ModelError
+from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.view import CanonicalCamera
 from curio_serve.models.batching import Batcher
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     import onnxruntime
 
 INPUT = "image"
+MAX_BYTES = 1 << 30
 Outputs = Mapping[str, np.ndarray]
 
 # Shape of each output after [batch, num_slots] or [batch], and whether it is one a slot.
@@ -35,21 +37,18 @@ _OUTPUT_SHAPES: dict[str, tuple[tuple[int, ...], bool]] = {
     "confidence": ((), True),
     "light": ((3,), False),
 }
-# What the exporter may derive from another field, so that the spec need not list it.
+# Outputs that the exporter derives from another field, so that the spec need not list them.
 _DERIVED = {"rotation", "rotation_6d"}
 
 
 @dataclass(frozen=True)
 class Runtime:
-    """How networks are run.
-
-    Attributes:
-        providers: onnxruntime's execution providers in order of preference.
-        max_batch: Most images of several calls in one run; 1: every call runs on its own.
-    """
+    """How networks are run."""
 
     providers: tuple[str, ...] = ("CPUExecutionProvider",)
+    """onnxruntime's execution providers in order of preference."""
     max_batch: int = 1
+    """Largest number of images of several calls in one run; 1: every call runs on its own."""
 
 
 DEFAULT_RUNTIME = Runtime()
@@ -57,25 +56,22 @@ DEFAULT_RUNTIME = Runtime()
 
 @dataclass(frozen=True, eq=False)
 class Slot:
-    """One row of the per-object outputs.
-
-    Attributes:
-        object: Name of the kind of object it holds.
-        box_corners: 8 points (x, y, z), object frame, metres (image widths in 2D worlds); none where the spec has none.
-    """
+    """One row of the per-object outputs."""
 
     object: str
+    """Name of the kind of object that the row describes."""
     box_corners: Sequence[Sequence[float]]
+    """8 points (x, y, z), object frame, metres (image widths in 2D worlds); empty if the spec has none."""
 
 
 class Model:
     """An exported network, ready to run; safe to share between threads.
 
     Attributes:
-        name: What clients ask for.
+        name: The name that clients use.
         version: Of the model folder; 0 for a file outside one.
         spec: As stored in the file.
-        camera: What its input shows.
+        camera: The canonical camera, of which its input is an image.
         slots: One for each row of the per-object outputs.
         sha256: Of the file, hexadecimal.
     """
@@ -113,10 +109,10 @@ class Model:
             images: uint8 RGB [batch, height, width, 3] of the size of ``camera``.
 
         Returns:
-            Physical outputs by name, float32, as section 4 of the design has them.
+            Outputs in physical units by name, float32 [batch, ...]: see ``_OUTPUT_SHAPES``.
 
         Raises:
-            InternalError: The network answered with values that are not finite, or the runtime failed.
+            InternalError: An output is not finite, or the runtime failed.
         """
         values = self._run_many(images)
         for name, value in zip(self.output_names, values, strict=True):
@@ -138,29 +134,44 @@ def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAUL
 
     Args:
         path: The file.
-        name: What clients ask for; empty: the name in its spec.
+        name: The name that clients use; empty: the name in its spec.
         version: Of the model folder.
         runtime: How the network is run.
 
     Raises:
-        ModelError: Says which promise the file breaks.
+        ModelError: Says how the content differs from what its specification or curio requires.
     """
     try:
-        data = path.read_bytes()
+        data = read_file(path, MAX_BYTES)
     except OSError as exc:
         raise ModelError(f"model file {path} cannot be read: {exc.strerror}; expected an .onnx file") from exc
-    spec = read_spec(data, str(path))
-    session = _open(data, path, runtime.providers)
-    model = Model(
-        session, spec, name or spec.name or path.stem, version, hashlib.sha256(data).hexdigest(), runtime.max_batch
-    )
+    return from_bytes(data, str(path), name, version, runtime)
+
+
+def from_bytes(data: bytes, where: str, name: str = "", version: int = 0, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
+    """Check and open the content of an ONNX file.
+
+    Args:
+        data: The content.
+        where: The file, for messages.
+        name: The name that clients use; empty: the name in its spec.
+        version: Of the model folder.
+        runtime: How the network is run.
+
+    Raises:
+        ModelError: Says how the content differs from what its specification or curio requires.
+    """
+    spec = read_spec(data, where)
+    session = _open(data, where, runtime.providers)
+    name = name or spec.name or Path(where).stem
+    model = Model(session, spec, name, version, hashlib.sha256(data).hexdigest(), runtime.max_batch)
     _check_graph(session, model)
-    _check_answer(model)
+    _check_outputs(model)
     return model
 
 
-def _open(data: bytes, path: Path, providers: Sequence[str]) -> "onnxruntime.InferenceSession":
-    """One thread a call: parallel calls share the session, which holds the weights once."""
+def _open(data: bytes, where: str, providers: Sequence[str]) -> "onnxruntime.InferenceSession":
+    """A session with one thread a call: parallel calls share it, so that the weights are in memory once."""
     # Before the import: unless told not to, onnxruntime from 1.29 on writes an identifier into the user's cache folder
     # and uploads events to its makers (its Privacy.md).
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
@@ -178,7 +189,7 @@ def _open(data: bytes, path: Path, providers: Sequence[str]) -> "onnxruntime.Inf
     try:
         return onnxruntime.InferenceSession(data, options, providers=list(providers))
     except _runtime_errors() as exc:
-        raise ModelError(f"{path}: onnxruntime refuses the graph: {exc}") from exc
+        raise ModelError(f"{where}: onnxruntime refuses the graph: {exc}") from exc
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:
@@ -190,16 +201,16 @@ def _runtime_errors() -> tuple[type[Exception], ...]:
 
 
 def _check_graph(session: "onnxruntime.InferenceSession", model: Model) -> None:
-    """Names and types of input and outputs are those the spec promises."""
+    """Refuse a graph whose inputs and outputs differ in name or type from the spec's."""
     inputs = [(i.name, i.type, i.shape[1:]) for i in session.get_inputs()]
     expected = [(INPUT, "tensor(uint8)", [model.camera.height, model.camera.width, 3])]
     if inputs != expected:
-        raise ModelError(f"model {model.label}: its inputs are {inputs}; its spec promises {expected}")
-    promised = {field.name for field in model.spec.fields}
+        raise ModelError(f"model {model.label}: its inputs are {inputs}; its spec has {expected}")
+    specified = {field.name for field in model.spec.fields}
     found = set(model.output_names)
-    if missing := promised - found:
-        raise ModelError(f"model {model.label}: its spec promises {sorted(missing)}, its graph gives {sorted(found)}")
-    if unknown := found - promised - _DERIVED:
+    if missing := specified - found:
+        raise ModelError(f"model {model.label}: its spec has {sorted(missing)}, its graph gives {sorted(found)}")
+    if unknown := found - specified - _DERIVED:
         raise ModelError(f"model {model.label}: its graph gives {sorted(unknown)}, which its spec does not describe")
     if strange := found - _OUTPUT_SHAPES.keys():
         raise ModelError(f"model {model.label}: unknown outputs {sorted(strange)}; known are {sorted(_OUTPUT_SHAPES)}")
@@ -226,8 +237,8 @@ def _check_field(field: Field, model: Model) -> None:
         )
 
 
-def _check_answer(model: Model) -> None:
-    """Two images through the graph: the shapes are right, and the batch is free."""
+def _check_outputs(model: Model) -> None:
+    """Run two grey images: refuse wrong shapes, and a graph whose batch is fixed."""
     images = np.full((2, model.camera.height, model.camera.width, 3), 128, np.uint8)
     try:
         outputs = model.run(images)
@@ -240,7 +251,7 @@ def _check_answer(model: Model) -> None:
 
 
 def canonical_camera(spec: ModelSpec, name: str) -> CanonicalCamera:
-    """The camera of a spec.
+    """The canonical camera of a spec.
 
     Raises:
         ModelError: Its size or K* is impossible.
@@ -261,7 +272,7 @@ def canonical_camera(spec: ModelSpec, name: str) -> CanonicalCamera:
 
 
 def slots(spec: ModelSpec, name: str) -> tuple[Slot, ...]:
-    """Which object each row of the outputs belongs to.
+    """The object of each row of the outputs, in the order of the rows.
 
     Raises:
         ModelError: A row belongs to no object or to two, or a box has not 8 corners.
@@ -276,6 +287,6 @@ def slots(spec: ModelSpec, name: str) -> tuple[Slot, ...]:
             if row in rows:
                 raise ModelError(f"model {name}: slot {row} belongs to both {rows[row].object} and {kind.name}")
             rows[row] = Slot(kind.name, corners)
-    if not spec.num_slots or sorted(rows) != list(range(spec.num_slots)):
+    if not rows or len(rows) != spec.num_slots or sorted(rows) != list(range(len(rows))):
         raise ModelError(f"model {name}: {spec.num_slots} slots, but its objects name the slots {sorted(rows)}")
-    return tuple(rows[row] for row in range(spec.num_slots))
+    return tuple(rows[row] for row in range(len(rows)))

@@ -1,9 +1,10 @@
-"""Loads one model version under limits and says whether it can serve.
+"""Loads a model in a process of its own, under limits of memory and time, and reports whether it can serve.
 
-    python -m curio_serve.models.model_check FOLDER VERSION
+    python -m curio_serve.models.model_check MODEL_FOLDER VERSION
+    python -m curio_serve.models.model_check MODEL
 
-The server runs this before it opens a candidate itself, so a file that crashes or exhausts the runtime takes this
-process and not the server. Exit status 0: fit; 1: refused, the last line on stderr says why.
+``curio-serve`` and ``curio-detect`` run this before they open a model themselves, so that a file that crashes or
+exhausts the runtime ends this process and not theirs. Exit status 0: fit; 1: refused, the last line on stderr says why.
 """
 
 import resource
@@ -19,51 +20,63 @@ TIMEOUT_S = 60
 
 
 class ChildCheck:
-    """Checks candidates, one at a time, each in a process of its own."""
+    """Checks models one at a time, each in a process of its own."""
 
     def __init__(self) -> None:
         self._child: subprocess.Popen[str] | None = None
 
-    def __call__(self, folder: Path, version: int) -> None:
-        """Check a version.
+    def __call__(self, path: Path, version: int | None = None) -> None:
+        """Check a model.
+
+        Args:
+            path: A model's folder; without a version anything that :func:`~curio_serve.models.model_folder.open_model`
+                takes.
+            version: Of the folder.
 
         Raises:
-            ModelError: What the child said, or how it died.
+            ModelError: The last line that the child wrote, or how it died.
         """
-        command = [sys.executable, "-m", "curio_serve.models.model_check", str(folder), str(version)]
+        arguments = [str(path)] if version is None else [str(path), str(version)]
+        label = Path(*arguments)
+        command = [sys.executable, "-m", "curio_serve.models.model_check", *arguments]
         try:
-            child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+            child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         except OSError as exc:  # no memory, no process, no file left for it
-            raise ModelError(f"{folder / str(version)}: its check could not be started: {exc.strerror}") from exc
+            raise ModelError(f"{label}: its check could not be started: {exc.strerror}") from exc
         with child:
             self._child = child
             try:
                 _, said = child.communicate(timeout=TIMEOUT_S)
             except subprocess.TimeoutExpired as exc:
-                child.kill()
-                raise ModelError(f"{folder / str(version)}: its check took longer than {TIMEOUT_S} s") from exc
+                raise ModelError(f"{label}: its check took longer than {TIMEOUT_S} s") from exc
+            finally:
+                child.kill()  # also after Ctrl-C
         last = (said.strip().splitlines() or ["without a word"])[-1]
         if child.returncode == 1:
-            raise ModelError(last)
+            raise ModelError(last if str(path) in last else f"{label}: {last}")
         if child.returncode:
-            raise ModelError(f"{folder / str(version)}: its check ended with status {child.returncode}: {last}")
+            raise ModelError(f"{label}: its check ended with status {child.returncode}: {last}")
 
     def stop(self) -> None:
-        """End a check that is going on; it counts as failed."""
+        """End a check that is running; it counts as failed."""
         if self._child is not None:
             self._child.kill()
 
 
 def main() -> int:
-    """Check the model version that the arguments name."""
+    """Check the model that the arguments name."""
     resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_S, MAX_CPU_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     # After the limits, so that they hold for the libraries too.
-    from curio_serve.models.model_folder import load_version
+    from curio_serve.models.model_folder import load_version, open_model
 
+    path, *version = sys.argv[1:]
     try:
-        load_version(Path(sys.argv[1]), int(sys.argv[2]))
+        if version:
+            load_version(Path(path), int(version[0]))
+        else:
+            open_model(path)
     except ModelError as exc:
         print(" ".join(str(exc).split()), file=sys.stderr)
         return 1

@@ -1,13 +1,16 @@
-"""A model's folder in Triton's layout: ``<name>/{config.pbtxt, CARD.md, SHA256SUMS, <version>/model.onnx}``.
+"""Loads models from folders in Triton's layout: ``<name>/{config.pbtxt, CARD.md, SHA256SUMS, <version>/model.onnx}``.
 
-What it promises beside the ONNX file is checked here: the file's hash, that Triton would serve the same tensors, and,
-where a version has ``golden.npz`` (``image`` uint8 [height, width, 3] and the outputs for it by name, without a batch),
-that the network gives those outputs on this machine.
+The files beside the ONNX file are checked, too: its hash in SHA256SUMS, the tensors in config.pbtxt, and, if a version
+has ``golden.npz`` (``image`` uint8 [height, width, 3] and the outputs for it by name, without a batch), whether the
+network gives those outputs on this machine.
+
+A version's folder is named 1 to 999999999 in ASCII digits without a leading zero; as in Triton, others are passed over.
 """
 
 import re
 import stat
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +24,7 @@ MODEL_FILE = "model.onnx"
 GOLDEN_FILE = "golden.npz"
 _GOLDEN_TOLERANCE = 1e-3  # metres, image widths, entries of matrices; float16 weights on another processor stay below
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
 
 def is_model_name(name: str) -> bool:
@@ -36,16 +40,14 @@ def versions(folder: Path) -> list[int]:
     """
     try:
         return sorted(
-            int(entry.name)
-            for entry in folder.iterdir()
-            if entry.name.isdecimal() and int(entry.name) > 0 and _has_model(entry)
+            int(entry.name) for entry in folder.iterdir() if _VERSION.fullmatch(entry.name) and _has_model(entry)
         )
     except OSError as exc:
         raise ModelError(f"model folder {folder} cannot be read: {exc.strerror}") from exc
 
 
 def _has_model(version: Path) -> bool:
-    """Whether a version's folder has a model, or may have: what cannot be looked at is for the load to say."""
+    """Whether a version's folder has a model; also if that cannot be found out, so that loading it says why."""
     try:
         return stat.S_ISREG((version / MODEL_FILE).stat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -58,7 +60,7 @@ def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME)
     """Load one version of a model's folder.
 
     Raises:
-        ModelError: Says which promise it breaks.
+        ModelError: Says what is wrong with it.
     """
     path = folder / str(version) / MODEL_FILE
     model = load(path, folder.name, version, runtime)
@@ -72,7 +74,7 @@ def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME)
 
 
 def open_model(path: str | Path) -> Model:
-    """Load what a command line calls MODEL: a model's folder (latest version), a version's folder or an .onnx file.
+    """Load the MODEL of a command line: a model's folder (latest version), a version's folder or an .onnx file.
 
     Raises:
         ModelError: There is no model, or it cannot be used.
@@ -84,7 +86,7 @@ def open_model(path: str | Path) -> Model:
         raise ModelError(f"no model at {path}; expected a model folder, a version folder or an .onnx file")
     resolved = path.resolve()
     if (path / MODEL_FILE).is_file():
-        if resolved.name.isdecimal():
+        if _VERSION.fullmatch(resolved.name):
             return load_version(resolved.parent, int(resolved.name))
         return load(path / MODEL_FILE)
     found = versions(path)
@@ -94,7 +96,7 @@ def open_model(path: str | Path) -> Model:
 
 
 def _check_sum(folder: Path, file: str, sha256: str) -> None:
-    """Compare with SHA256SUMS (``sha256sum``'s format), where the folder has one."""
+    """Compare with SHA256SUMS (``sha256sum``'s format), if the folder has one."""
     sums = folder / "SHA256SUMS"
     if not sums.is_file():
         return
@@ -110,13 +112,13 @@ def _check_sum(folder: Path, file: str, sha256: str) -> None:
 
 
 def _check_config(folder: Path, model: Model) -> None:
-    """Compare config.pbtxt, where the folder has one, with the graph."""
+    """Compare config.pbtxt, if the folder has one, with the graph."""
     path = folder / "config.pbtxt"
     if not path.is_file():
         return
     try:
         config = text_format.Parse(path.read_text(encoding="utf-8"), TritonConfig(), allow_unknown_field=True)
-    except (text_format.ParseError, UnicodeDecodeError) as exc:
+    except (text_format.ParseError, UnicodeDecodeError, RecursionError) as exc:
         raise ModelError(f"{path} is not a Triton model configuration: {exc}") from exc
     if config.name not in ("", folder.name):
         raise ModelError(f"{path}: name is {config.name!r}; Triton wants the folder's, {folder.name!r}")
@@ -137,13 +139,14 @@ def _check_config(folder: Path, model: Model) -> None:
 
 
 def _check_golden(path: Path, model: Model) -> None:
-    """Run the golden image, where the version has one, and compare the outputs with those stored beside it."""
+    """Run the golden image, if the version has one, and compare the outputs with those stored beside it."""
     if not path.is_file():
         return
     try:
         with np.load(path, allow_pickle=False) as file:
             expected = dict(file)
-    except (ValueError, EOFError, zipfile.BadZipFile) as exc:
+    # zipfile raises RuntimeError for encrypted members and unknown methods; np.load returns a bare array as it is.
+    except (ValueError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as exc:
         raise ModelError(f"{path} is not an archive of arrays: {exc}; export the model again") from exc
     image, size = expected.pop(INPUT, None), (model.camera.height, model.camera.width, 3)
     if image is None or image.shape != size or image.dtype != np.uint8 or not expected:

@@ -1,8 +1,8 @@
-"""The models a server offers: found in a folder, loaded, and swapped while serving.
+"""Finds the models that a server offers in a folder, loads them, and swaps them while serving.
 
-A model is ``<root>/<name>/<version>/model.onnx``. What is loaded is one immutable table, replaced as a whole, so a call
-sees the old or the new state and never something between. A candidate that comes while serving is first loaded in a
-child process with bounded memory and time; one that fails leaves what serves untouched.
+A model is ``<root>/<name>/<version>/model.onnx``. The loaded models are one immutable table, replaced as a whole, so
+that a call sees the old or the new state and never a mixture. A check in a child process with bounded memory and time
+comes before loading; a candidate that fails it leaves the models that serve untouched.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -20,19 +20,16 @@ _FOLDER = 0  # in place of a version: the model's folder itself
 
 @dataclass(frozen=True)
 class Change:
-    """What became of one version at a look into the folder.
-
-    Attributes:
-        name: Of the model.
-        version: Of the model; 0: its folder cannot be read.
-        event: "loaded", "unloaded" or "refused".
-        reason: Why it was refused.
-    """
+    """What happened to one version when the folder was scanned."""
 
     name: str
+    """Of the model."""
     version: int
+    """Of the model; 0: its folder cannot be read."""
     event: str
+    """One of "loaded", "unloaded", "refused"."""
     reason: str = ""
+    """Why it was refused."""
 
 
 class Repository:
@@ -68,13 +65,13 @@ class Repository:
         return iter(sorted(self._models.items()))
 
     def refresh(self, check: Callable[[Path, int], None] | None = None) -> list[Change]:
-        """Look into the folder, load what is new or changed and drop what is gone.
+        """Scan the folder, load versions that are new or changed, and drop those that are gone.
 
         Args:
             check: Called with the model's folder and the version before this process opens the file; raises ModelError.
 
         Returns:
-            What changed. A refused candidate is not tried again until its files change.
+            The changes. A refused candidate is not tried again until its files change.
 
         Raises:
             ModelError: The folder itself cannot be read.
@@ -97,13 +94,13 @@ class Repository:
         seen: dict[Key, Signature],
         changes: list[Change],
     ) -> Mapping[int, Model]:
-        """What shall serve of a model: its newest versions that can; where its folder cannot be read, what serves now.
+        """The versions of a model to serve: the newest ones that load; if its folder cannot be read, the present ones.
 
         Args:
             folder: Of the model.
             check: See :meth:`refresh`.
-            seen: Gets what was found.
-            changes: Gets what changed.
+            seen: Signatures of the versions found are added to it.
+            changes: Changes are added to it.
         """
         name = folder.name
         try:
@@ -132,7 +129,7 @@ class Repository:
         check: Callable[[Path, int], None] | None,
         changes: list[Change],
     ) -> Model | None:
-        """What shall serve a version: loaded anew if its files changed; else, or if that fails, what serves now."""
+        """A version's model: loaded anew if its files changed; else, or if that fails, the present one."""
         present = self._models.get(folder.name, {}).get(version)
         if self._seen.get((folder.name, version)) == signature:
             return present

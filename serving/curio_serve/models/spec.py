@@ -1,4 +1,4 @@
-"""Reads what an ONNX file says about itself, before any runtime opens it.
+"""Reads the specification stored in an ONNX file, before any runtime opens the file.
 
 External data is a path out of the model folder waiting to be followed, so a file that has any is refused here. The walk
 covers every place where ONNX allows a tensor: initialisers, attributes of nodes, subgraphs, functions, training graphs.

@@ -1,7 +1,6 @@
-"""The server's settings, and where they may come from: flags, environment, TOML file, defaults, in this order."""
+"""Reads the server's settings from flags, environment, TOML file and defaults, in this order."""
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -9,10 +8,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from curio_serve.arguments import parse
 from curio_serve.errors import UsageError
+from curio_serve.settings import environment_settings, read_toml, to_arguments
 
 ENV_PREFIX = "CURIO_SERVE_"
+_NOT_STORED = {"config", "dump_config"}
+_MAX_WORKERS = 1024
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,16 @@ class ServeConfig:
     """Open calls of any kind, also those whose message has not come yet."""
     max_message_mb: int = 32
     """Largest request, in MiB."""
+    message_memory_mb: int = 256
+    """Memory for requests that arrive or wait, in MiB; each counts as the largest until it has arrived."""
+    message_s: float = 10.0
+    """Seconds in which the first message of a call has to arrive."""
+    idle_s: float = 60.0
+    """Seconds in which each further message of a stream has to arrive."""
     max_pixels: int = 1 << 25
     """Most pixels of an image; checked before it is decoded."""
     max_regions: int = 64
-    """Most regions of interest in a request."""
+    """Most regions of interest in a request, and, with --max-models, most runs of a network: models times regions."""
     max_models: int = 16
     """Most models named in a request."""
     min_confidence: float = 0.0
@@ -85,7 +92,7 @@ class ServeConfig:
         least = {
             "port": 0, "workers": 0, "queue": 0, "max_streams": 0, "max_calls": 1, "max_message_mb": 1,
             "max_pixels": 256, "max_regions": 1, "max_models": 1, "versions": 1, "refresh_s": 0, "batch": 0,
-            "grace_s": 0,
+            "message_memory_mb": 1, "message_s": 0.1, "idle_s": 0.1, "grace_s": 0,
         }  # fmt: skip
         for name, smallest in least.items():
             if not getattr(self, name) >= smallest:
@@ -97,6 +104,10 @@ class ServeConfig:
             raise UsageError(f"--min-confidence is {self.min_confidence}; expected 0 to 1")
         if self.max_message_mb > 1024:
             raise UsageError(f"--max-message-mb is {self.max_message_mb}; expected at most 1024")
+        if self.workers > _MAX_WORKERS:
+            raise UsageError(f"--workers is {self.workers}; expected at most {_MAX_WORKERS}")
+        if not self.host:
+            raise UsageError("--host is empty; expected an address such as 127.0.0.1, or 0.0.0.0 for all interfaces")
         if self.log_level not in ("debug", "info", "warning", "error"):
             raise UsageError(f"--log-level is {self.log_level!r}; expected debug, info, warning or error")
         if (self.tls_certificate is None) != (self.tls_key is None):
@@ -129,7 +140,8 @@ def read_config(arguments: list[str], environment: Mapping[str, str]) -> ServeCo
 
 
 def _parse(arguments: list[str], default: ServeConfig, source: str = "") -> ServeConfig:
-    config: ServeConfig = parse(ServeConfig, args=arguments, default=default, prog=f"curio-serve {source}".strip())
+    prog = f"curio-serve {source}".strip()
+    config: ServeConfig = tyro.cli(ServeConfig, args=arguments, default=default, prog=prog)
     return config
 
 
@@ -138,48 +150,38 @@ def _flag(name: str) -> str:
 
 
 def _file_arguments(path: Path) -> list[str]:
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as exc:
-        raise UsageError(f"--config {path} cannot be read: {exc}") from exc
-    except tomllib.TOMLDecodeError as exc:
-        raise UsageError(f"--config {path} is not TOML: {exc}") from exc
-    known = {field.name for field in fields(ServeConfig)} - {"config", "dump_config"}
+    content = read_toml(path, "--config")
+    known = {field.name for field in fields(ServeConfig)} - _NOT_STORED
     if unknown := content.keys() - known:
         raise UsageError(f"--config {path} has unknown keys {sorted(unknown)}; known are {sorted(known)}")
     return [argument for name, value in content.items() for argument in _arguments(name, value, str(path))]
 
 
 def _environment_arguments(environment: Mapping[str, str]) -> list[str]:
-    known = {field.name: str(field.type) for field in fields(ServeConfig)}
+    known = {field.name for field in fields(ServeConfig)}
     arguments = []
-    for variable, text in environment.items():
-        name = variable.removeprefix(ENV_PREFIX).lower()
-        if not variable.startswith(ENV_PREFIX) or name in ("config", "dump_config"):
+    for variable, name, text in environment_settings(environment, ENV_PREFIX):
+        if name in _NOT_STORED:
             continue
         if name not in known:
             names = ", ".join(sorted(ENV_PREFIX + name.upper() for name in known))
             raise UsageError(f"environment variable {variable} is no setting; known are {names}")
-        value: Any = text
-        if isinstance(getattr(ServeConfig, name), bool):
-            if text.lower() not in ("true", "false", "1", "0"):
-                raise UsageError(f"{variable} is {text!r}; expected true or false")
-            value = text.lower() in ("true", "1")
-        elif isinstance(getattr(ServeConfig, name), tuple):
-            value = text.split(",")
-        arguments += _arguments(name, value, variable)
+        arguments += _arguments(name, _typed(variable, text, getattr(ServeConfig, name)), variable)
     return arguments
 
 
+def _typed(variable: str, text: str, default: Any) -> Any:
+    """A variable's text as the kind of value that its setting has."""
+    if isinstance(default, bool):
+        if text.lower() not in ("true", "false", "1", "0"):
+            raise UsageError(f"{variable} is {text!r}; expected true or false")
+        return text.lower() in ("true", "1")
+    return text.split(",") if isinstance(default, tuple) else text
+
+
 def _arguments(name: str, value: Any, source: str) -> list[str]:
-    """One setting as command line arguments, so that one parser checks all sources."""
-    if isinstance(value, bool):
-        return [f"--{_flag(name)}" if value else f"--no-{_flag(name)}"]
-    if isinstance(value, dict):
-        raise UsageError(f"{source}: {name} is a table; expected a value")
-    if isinstance(value, list):
-        return [f"--{_flag(name)}", *map(str, value)]
-    return [str(value)] if name == "models" else [f"--{_flag(name)}={value}"]
+    """``models`` is the one setting without a flag."""
+    return [str(value)] if name == "models" else to_arguments(name, value, source)
 
 
 def to_toml(config: ServeConfig) -> str:
@@ -189,6 +191,6 @@ def to_toml(config: ServeConfig) -> str:
         # JSON's strings, numbers, booleans and lists are TOML's.
         f"{name} = {json.dumps(str(value) if isinstance(value, Path) else value, ensure_ascii=False)}"
         for name, value in values.items()
-        if value is not None and name not in ("config", "dump_config")
+        if value is not None and name not in _NOT_STORED
     )
     return "\n".join(lines) + "\n"

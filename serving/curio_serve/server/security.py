@@ -1,6 +1,8 @@
-"""Who may call: TLS, client certificates, bearer tokens."""
+"""Checks who may call: TLS, client certificates, bearer tokens."""
 
 import hmac
+import logging
+import ssl
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -9,9 +11,10 @@ from typing import Any, NoReturn
 import grpc
 from grpc_health.v1 import health
 
-from curio_serve.api.messages import status_from_error
-from curio_serve.errors import TokenError, UsageError
+from curio_serve.api.status import status_from_error
+from curio_serve.errors import TokenError, UsageError, status_of
 from curio_serve.server.config import ServeConfig
+from curio_serve.telemetry import Metrics, log
 
 _HEALTH_PREFIX = f"/{health.SERVICE_NAME}/"
 
@@ -29,7 +32,7 @@ class Tokens:
         shown = dict(metadata).get("authorization", "")
         text = shown.encode() if isinstance(shown, str) else shown
         token = text.removeprefix(b"Bearer ")
-        # Every token is compared, in constant time, so that timing tells nothing.
+        # Every token is compared, in constant time, so that timing reveals nothing.
         matches = [hmac.compare_digest(token, known) for known in self._known]
         if token != text and any(matches):
             return None
@@ -39,8 +42,9 @@ class Tokens:
 class TokenInterceptor(grpc.ServerInterceptor):
     """Lets calls pass that show a known bearer token, and health checks."""
 
-    def __init__(self, tokens: Tokens) -> None:
-        self._tokens = tokens
+    def __init__(self, tokens: Tokens, metrics: Metrics) -> None:
+        """Count refused calls in ``metrics``."""
+        self._tokens, self._metrics = tokens, metrics
 
     def intercept_service(
         self,
@@ -52,23 +56,28 @@ class TokenInterceptor(grpc.ServerInterceptor):
         error = self._tokens.refuse(handler_call_details.invocation_metadata)
         if error is None:
             return continuation(handler_call_details)
-        return grpc.stream_stream_rpc_method_handler(partial(_abort, status_from_error(error)))
+        # A handler of streams ends the call before its message is read.
+        return grpc.stream_stream_rpc_method_handler(partial(self._refuse, error, handler_call_details.method))
 
-
-def _abort(status: grpc.Status, _requests: Iterator[bytes], context: grpc.ServicerContext) -> NoReturn:
-    context.abort_with_status(status)
+    def _refuse(
+        self, error: TokenError, path: str, _requests: Iterator[bytes], context: grpc.ServicerContext
+    ) -> NoReturn:
+        # The caller chose the path, so it goes into the log, shortened, and not into a label.
+        self._metrics.requests.labels("any", status_of(error)).inc()
+        log(logging.INFO, "refused", reason=str(error), method=path[:100], code=status_of(error), peer=context.peer())
+        context.abort_with_status(status_from_error(error))
 
 
 def server_credentials(config: ServeConfig) -> grpc.ServerCredentials | None:
     """TLS as configured, or None.
 
     Raises:
-        UsageError: A file cannot be read.
+        UsageError: A file cannot be read, or --client-ca holds no certificate.
     """
     if config.tls_certificate is None or config.tls_key is None:
         return None
     pair = (_read(config.tls_key, "--tls-key"), _read(config.tls_certificate, "--tls-certificate"))
-    authority = _read(config.client_ca, "--client-ca") if config.client_ca else None
+    authority = _read_authority(config.client_ca) if config.client_ca else None
     return grpc.ssl_server_credentials([pair], authority, require_client_auth=authority is not None)
 
 
@@ -82,6 +91,15 @@ def read_tokens(path: Path) -> list[bytes]:
     if not tokens:
         raise UsageError(f"--token-file {path} holds no token; expected one a line")
     return tokens
+
+
+def _read_authority(path: Path) -> bytes:
+    data = _read(path, "--client-ca")
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_verify_locations(cadata=data.decode("ascii"))
+    except (ssl.SSLError, UnicodeDecodeError) as exc:
+        raise UsageError(f"--client-ca {path} cannot be used; expected a PEM file of certificates") from exc
+    return data
 
 
 def _read(path: Path, flag: str) -> bytes:

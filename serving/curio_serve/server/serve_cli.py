@@ -1,15 +1,17 @@
 """The command ``curio-serve``."""
 
+import logging
 import os
 import signal
 import sys
 
 from curio_serve.errors import CurioError
 from curio_serve.server.config import ServeConfig, read_config, to_toml
+from curio_serve.telemetry import log, start_logging
 
 
 def main() -> None:
-    """Serve the models of a folder until SIGTERM or Ctrl-C."""
+    """Serve the models of a folder until SIGTERM, SIGHUP or Ctrl-C."""
     try:
         config = read_config(sys.argv[1:], os.environ)
         if config.dump_config:
@@ -27,21 +29,25 @@ def main() -> None:
 def _serve(config: ServeConfig) -> None:
     # gRPC's own stderr lines say again, and less clearly, what our messages say.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
-    # Connections are read by the threads that answer, not by threads of gRPC's own that would wake them.
-    os.environ.setdefault("GRPC_EXPERIMENTS", "-event_engine_listener")
     # Imported here, so that --help need not wait for gRPC and OpenCV.
     from curio_serve.server.server import PoseServer
-    from curio_serve.telemetry import start_logging
 
     lines = start_logging(config.log_level)
     try:
         server = PoseServer(config)
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda _number, _frame: server.stop())
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup sets it
+                signal.signal(number, lambda _number, _frame: server.stop())
         address, *metrics = server.start()
-        print(f"listening on {address}", flush=True)
-        for url in metrics:
-            print(f"metrics on {url}", flush=True)
+        _announce([f"listening on {address}", *(f"metrics on {url}" for url in metrics)])
         server.serve_until_stopped()
     finally:
         lines.stop()
+
+
+def _announce(lines: list[str]) -> None:
+    """Print the addresses; a server whose stdout is a full disk serves all the same."""
+    try:
+        os.write(sys.stdout.fileno(), "".join(f"{line}\n" for line in lines).encode())
+    except OSError as exc:
+        log(logging.WARNING, "stdout cannot be written", reason=exc.strerror, lines=lines)

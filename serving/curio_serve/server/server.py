@@ -14,18 +14,18 @@ from grpc_health.v1 import health, health_pb2
 from grpc_reflection.v1alpha import reflection, reflection_pb2
 from prometheus_client import CollectorRegistry, start_http_server
 
+from curio_serve.api.admission import WorkQueue
 from curio_serve.api.kserve import InferenceService
 from curio_serve.api.pose_detector import Limits, PoseService
 from curio_serve.api.registration import register
-from curio_serve.cores import num_cores
+from curio_serve.cores import memory_limit, num_cores
 from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.models.model import Runtime
 from curio_serve.models.model_check import ChildCheck
 from curio_serve.models.repository import Change, Repository
-from curio_serve.server.admission import WorkQueue
+from curio_serve.server import memory
 from curio_serve.server.config import ServeConfig
-from curio_serve.server.direct_calls import DirectCalls
-from curio_serve.server.events import share_events
+from curio_serve.server.reception import Reception, ReceptionLimits
 from curio_serve.server.security import TokenInterceptor, Tokens, read_tokens, server_credentials
 from curio_serve.telemetry import Metrics, log
 
@@ -36,6 +36,7 @@ _REFLECTION = reflection_pb2.DESCRIPTOR.services_by_name["ServerReflection"]
 _SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
 
 
+_MEMORY_USED = 0.8  # of a container's memory, beyond which streams are ended
 _DEVICE_BATCH = 8  # of a GPU provider
 
 
@@ -56,10 +57,10 @@ class PoseServer:
         # Watchers of health wait without a thread each.
         watchers = ThreadPoolExecutor(1)
         self._health = health.HealthServicer(experimental_non_blocking=True, experimental_thread_pool=watchers)
-        self._inference = InferenceService(self._repository, self._metrics)
+        self._inference = InferenceService(self._repository, self._work, self._metrics)
+        self._reception = Reception(_reception_limits(config))
         self._check = ChildCheck()
         self._server: grpc.Server | None = None
-        self._direct: DirectCalls | None = None
         self._stopped = threading.Event()
 
     def start(self) -> list[str]:
@@ -75,33 +76,32 @@ class PoseServer:
         """
         # Frames run in parallel already, one a core; OpenCV's own threads would only get in their way.
         cv2.setNumThreads(1)
-        self._report(self._repository.refresh())
+        memory.bound_heaps()
+        self._report(self._repository.refresh(self._check))
         if not list(self._repository):
             raise ModelError(
                 f"no model could be loaded from {self.config.models}; the log says why each was refused. "
                 "Export one with curio-export"
             )
-        self._server, self._direct = self._build()
+        self._server = self._build()
         addresses = [self._open_port(self._server)]
         if self.config.metrics_port is not None:
             addresses.append(self._open_metrics(self.config.metrics_port))
+        self._reception.start()
         self._server.start()
-        self._direct.start()
         self._announce()
         return addresses
 
-    def _build(self) -> tuple[grpc.Server, DirectCalls]:
+    def _build(self) -> grpc.Server:
         config = self.config
         tokens = Tokens(read_tokens(config.token_file) if config.token_file else ())
-        options = channel_options(config)
         server = grpc.server(
             # Threads are made as calls need them, so their number follows the load; one that waits takes 16 kB.
             ThreadPoolExecutor(config.max_calls, thread_name_prefix="curio-call"),
-            interceptors=[TokenInterceptor(tokens)],
-            options=options,
+            interceptors=[TokenInterceptor(tokens, self._metrics)],
+            options=channel_options(config),
             maximum_concurrent_rpcs=config.max_calls,
         )
-        events = share_events(server, options)
         limits = Limits(
             config.max_pixels,
             config.max_regions,
@@ -111,14 +111,13 @@ class PoseServer:
             config.full_decode,
         )
         pose = PoseService(self._repository, self._work, limits, self._metrics)
-        methods = [pose.direct, self._inference.direct]
-        direct = DirectCalls(server, events, self._work, methods, config.max_calls, tokens.refuse)
-        register(server, _POSE, pose, without=["Detect"])
-        register(server, _INFERENCE, self._inference, without=["ModelInfer"])
-        register(server, _HEALTH, self._health)
+        receive = self._reception.receive
+        register(server, _POSE, pose, receive, unread=["Detect"])
+        register(server, _INFERENCE, self._inference, receive, unread=["ModelInfer"])
+        register(server, _HEALTH, self._health, receive)
         names = [service.full_name for service in (_POSE, _INFERENCE, _HEALTH, _REFLECTION)]
-        register(server, _REFLECTION, reflection.ReflectionServicer(names))
-        return server, direct
+        register(server, _REFLECTION, reflection.ReflectionServicer(names), receive)
+        return server
 
     def _open_port(self, server: grpc.Server) -> str:
         host, port = self.config.host, self.config.port
@@ -169,13 +168,13 @@ class PoseServer:
 
     def _drain(self) -> None:
         """Refuse new calls and let accepted ones finish."""
-        if self._server is None or self._direct is None:
+        if self._server is None:
             return
         log(logging.INFO, "draining", grace_s=self.config.grace_s)
         self._inference.drain()
         self._health.enter_graceful_shutdown()
         self._server.stop(self.config.grace_s).wait()
-        self._direct.stop()
+        self._reception.stop()
 
     def _watch(self) -> None:
         """Pick up new model versions for as long as the server lives."""
@@ -200,17 +199,30 @@ class PoseServer:
         self._metrics.models.set(sum(len(loaded) for _, loaded in self._repository))
 
 
+def _reception_limits(config: ServeConfig) -> ReceptionLimits:
+    most = memory_limit()
+    return ReceptionLimits(
+        config.max_message_mb << 20,
+        config.message_memory_mb << 20,
+        config.message_s,
+        config.idle_s,
+        None if most is None else int(_MEMORY_USED * most),
+    )
+
+
 def channel_options(config: ServeConfig) -> list[tuple[str, int]]:
-    """What gRPC itself shall enforce on every connection."""
+    """The limits that gRPC itself enforces on every connection."""
     return [
         # Two servers on one port would share its calls without a word.
         ("grpc.so_reuseport", 0),
         ("grpc.max_receive_message_length", config.max_message_mb << 20),
         ("grpc.max_send_message_length", 64 << 20),
         ("grpc.max_metadata_size", 16 << 10),
-        # Well above the queue: a call that is refused early counts until its client has heard of it, and calls beyond
-        # this limit are reset without a word of when to come back.
+        # The part of --max-calls that one connection may have. Well above the queue: a call that is refused early
+        # counts until its client knows, and calls beyond this limit are reset without the time to come back.
         ("grpc.max_concurrent_streams", 512),
+        # Before a message is asked for, 64 kB of it are received; with probing it would be megabytes of each call.
+        ("grpc.http2.bdp_probe", 0),
         # Half-open connections are found out; idle clients may ping, but not more often than every 10 s.
         ("grpc.keepalive_time_ms", 60_000),
         ("grpc.keepalive_timeout_ms", 20_000),

@@ -4,16 +4,18 @@ import drjit
 import pytest
 import torch
 from curio_train.scene_code import SceneCode
-from curio_train.worlds.generated.light import Light
+from curio_train.worlds.generated.generated_world import GeneratedWorld
+from curio_train.worlds.generated.light import build
+from curio_train.worlds.options import LightOptions
 
 
 @pytest.fixture(scope="module")
-def world() -> Light:
+def world() -> GeneratedWorld:
     """The world with the longest programs: ten slots, shadows, a sun that moves."""
-    return Light()
+    return build(LightOptions())
 
 
-def step(world: Light, code: SceneCode) -> list[torch.Tensor]:
+def step(world: GeneratedWorld, code: SceneCode) -> list[torch.Tensor]:
     """Images and gradients."""
     attached = {name: value.clone().requires_grad_() for name, value in code.items()}
     images = world.render(attached)
@@ -22,7 +24,7 @@ def step(world: Light, code: SceneCode) -> list[torch.Tensor]:
     return [images.detach(), *(g for g in gradients if g is not None)]
 
 
-def test_no_step_compiles_what_another_did(world: Light) -> None:
+def test_no_step_compiles_what_another_did(world: GeneratedWorld) -> None:
     step(world, world.sample(4, (0,)))
     with drjit.scoped_set_flag(drjit.JitFlag.KernelHistory, True):
         drjit.kernel_history_clear()
@@ -33,7 +35,7 @@ def test_no_step_compiles_what_another_did(world: Light) -> None:
     assert all(entry["cache_hit"] for entry in kernels)
 
 
-def test_one_thread_repeats_to_the_bit(world: Light) -> None:
+def test_one_thread_repeats_to_the_bit(world: GeneratedWorld) -> None:
     """Several add to the same pixel and the same gradient in any order, so their last bits differ."""
     code, threads = world.sample(8, (1,)), drjit.thread_count()
     many = step(world, code)

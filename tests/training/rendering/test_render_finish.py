@@ -30,7 +30,7 @@ def drawer(mesh: Mesh, light: tuple[float, float, float], ambient: float = 0.1) 
             backgrounds=torch.zeros(1, 3, SIZE, SIZE),
             light=torch.tensor([light]),
             color=torch.full((1, 1, 3), 0.6),
-            finish=finish,
+            appearance=finish,
         )[0]
 
     return draw
@@ -44,7 +44,7 @@ def ball() -> Mesh:
 
 @pytest.fixture(scope="module")
 def post_on_a_plate() -> Mesh:
-    """The plate faces the camera, the post sticks out of it towards the camera."""
+    """The background image faces the camera, the post sticks out of it towards the camera."""
     plate = trimesh.creation.box(extents=(0.24, 0.24, 0.01))
     post = trimesh.creation.box(extents=(0.03, 0.03, 0.1))
     post.apply_translation([0, 0, -0.055])
@@ -129,7 +129,7 @@ def test_gradients_by_light_and_colour_equal_differences(meshes, draw, camera_ma
             backgrounds=codes.backgrounds,
             light=codes.light + moved["light"],
             color=codes.color + moved["color"],
-            finish=finish,
+            appearance=finish,
         )
         return (images - target).square().flatten(1).sum(1)
 

@@ -48,7 +48,7 @@ def test_edge_search_finds_every_silhouette_edge(meshes, name: str) -> None:
     """The clusters that are passed over hold none: compared with asking every edge of the mesh."""
     mesh = meshes[name]
     renderer = Renderer([mesh], [0], 64, 64, ambient=0.3)
-    setting = renderer.setting
+    setting = renderer.settings
     poses = Rotation.random(16, random_state=0).as_matrix()
     place = np.tile([0.02, -0.01, 0.25], (16, 1))
     values = renderer._pack(

@@ -91,7 +91,7 @@ class Calibration:
     Attributes:
         camera: K and distortion.
         error_px: Root mean square distance of corners from where the camera should see them.
-        focal_uncertainty: Standard deviation of the focal length, as a share of it.
+        focal_uncertainty: Standard deviation of the focal length, as a fraction of it.
         num_views: Photographs in which the board was found.
         unused: Photographs in which it was not.
     """

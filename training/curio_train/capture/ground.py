@@ -6,15 +6,16 @@ import numpy as np
 
 from curio_train.capture.structure import Structure
 from curio_train.errors import CameraError
+from curio_train.geometry import Pose
 
 _OFF_PLANE = 0.01  # of the distance from cameras to points: what still counts as ground
-_FEWEST_ON_GROUND = 0.2  # share of the points
+_FEWEST_ON_GROUND = 0.2  # fraction of the points
 _TRIALS = 500
 _LOWEST_VIEW = 0.05  # sine of the angle by which the first camera must look down
 
 
 def _plane(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, float, float]:
-    """The plane n · p = d near most of the points [n, 3] (RANSAC), fitted to those: n, d and their share."""
+    """The plane n · p = d near most of the points [n, 3] (RANSAC), fitted to those: n, d and their fraction."""
     random = np.random.default_rng(0)
     best = np.zeros(len(points), dtype=bool)
     for corners in points[random.integers(len(points), size=(_TRIALS, 3))]:
@@ -39,10 +40,10 @@ def to_world(structure: Structure) -> Structure:
     """
     centres = structure.centres
     distance = float(np.median(np.linalg.norm(structure.points - centres[0], axis=1)))
-    up, offset, share = _plane(structure.points, _OFF_PLANE * distance)
-    if share < _FEWEST_ON_GROUND:
+    up, offset, fraction = _plane(structure.points, _OFF_PLANE * distance)
+    if fraction < _FEWEST_ON_GROUND:
         raise CameraError(
-            f"found no ground: the best plane holds {share:.0%} of the {len(structure.points)} points, expected "
+            f"found no ground: the best plane holds {fraction:.0%} of the {len(structure.points)} points, expected "
             f"{_FEWEST_ON_GROUND:.0%}; let the photographs show more of the table, with a pattern on it"
         )
     if np.median(centres @ up) < offset:
@@ -63,7 +64,7 @@ def to_world(structure: Structure) -> Structure:
 
 
 def _moved(structure: Structure, new_from_old: np.ndarray) -> Structure:
-    points = structure.points @ new_from_old[:3, :3].T + new_from_old[:3, 3]
+    points = Pose.from_matrix(new_from_old).apply(structure.points)
     return replace(structure, points=points, cam_from_world=structure.cam_from_world @ np.linalg.inv(new_from_old))
 
 

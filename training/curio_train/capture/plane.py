@@ -1,4 +1,4 @@
-"""The plane that parts stand on: where cameras stand over it, what they see of it, and where anything ever lay.
+"""The plane that parts stand on: camera poses over it, its points at each pixel, and the pixels that ever changed.
 
 The world's frame is that of ``--calibrate --views-out``: y up, the plane at y = 0, metres.
 """
@@ -15,37 +15,36 @@ import numpy as np
 
 from curio_train.errors import CameraError, DataError
 
-_LARGEST_SHEAR = 1e-3
+_MAX_SHEAR = 1e-3
 _SAME_TILT_DEG, _SAME_HEIGHT = 2.0, 0.05
-_FARTHEST = 3.0  # of a plane that reaches the horizon: times the distance of what the optical axis meets
-_LEAST_CHANGE = 0.1  # of sRGB: noise, exposure and the rims of soft shadows stay below
-_LEAST_OFTEN = 0.02  # share of the photographs
-_LEAST_SHARE = 0.002  # of the frame
+_MAX_DISTANCE = 3.0  # of points on the plane, relative to the one on the optical axis
+_MIN_CHANGE = 0.1  # of sRGB: noise, exposure and the rims of soft shadows stay below
+_MIN_PHOTOGRAPHS = 0.02  # fraction of the photographs in which a pixel changed
+_MIN_AREA = 0.002  # fraction of the frame
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPoseFile:
     """The file of ``--plane`` and ``--views``: ``{"a.png": {"cam_from_world": [4x4], "plate": "plates/a.png"}, …}``.
 
-    Photographs are named by their path from the file's folder, or by their file name. Those of a camera that moves may
-    name a plate of their own; ``"unit": "m"`` says that the file's writer knew metres, which ``--views`` asks for.
-
-    Attributes:
-        file: Where it was read.
-        entries: By photograph.
-        flag: That named the file.
+    Photographs are named by their path from the file's folder, or by their file name. If the camera moves, each may
+    name a background image of its own as "plate"; ``"unit": "m"`` says that the pose is in metres, which ``--views``
+    requires.
     """
 
     file: Path
+    """Path of the file."""
     entries: Mapping[str, Any]
+    """By photograph."""
     flag: str = "--plane"
+    """The flag that named the file."""
 
     @classmethod
     def read(cls, file: Path, flag: str = "--plane") -> "CameraPoseFile":
         """Read the file.
 
         Raises:
-            CameraError: It is missing, or something else.
+            CameraError: It is missing, or no such file.
         """
         try:
             entries = json.loads(file.read_text(encoding="utf-8"))
@@ -57,27 +56,27 @@ class CameraPoseFile:
             raise CameraError(f"{flag} {file}: expected an object of photographs, each with its cam_from_world")
         return cls(file, entries, flag)
 
-    def anywhere(self, photograph: Path) -> np.ndarray:
-        """cam_from_world of a photograph: rigid [4, 4].
+    def cam_from_world(self, photograph: Path) -> np.ndarray:
+        """The camera pose of a photograph: rigid [4, 4].
 
         Raises:
-            CameraError: The file does not say, or it is not rigid.
+            CameraError: The file has none, or it is not rigid.
         """
         entry = self._entry(photograph)
         if "cam_from_world" not in entry:
             raise CameraError(
-                f"{self.flag} {self.file}: says nothing of {photograph.name}; it has {', '.join([*self.entries][:5])}. "
+                f"{self.flag} {self.file}: has no pose of {photograph.name}, only of {', '.join([*self.entries][:5])}. "
                 "Photographs are named by their path from that file's folder, or by their file name"
             )
         return _rigid(entry["cam_from_world"], self._where(photograph))
 
-    def cam_from_world(self, photograph: Path) -> np.ndarray:
-        """The same of a photograph that was taken from above the plane, looking down on it.
+    def pose_above_plane(self, photograph: Path) -> np.ndarray:
+        """The same of a camera that has to be above the plane and look down on it.
 
         Raises:
-            CameraError: The file does not say, or it is no such place.
+            CameraError: The file has no pose, or another one.
         """
-        matrix = self.anywhere(photograph)
+        matrix = self.cam_from_world(photograph)
         height, forward = (-matrix[:3, :3].T @ matrix[:3, 3])[1], matrix[2, 1]
         if height <= 0 or forward >= 0:
             raise CameraError(
@@ -88,30 +87,30 @@ class CameraPoseFile:
         return matrix
 
     def in_metres(self, photograph: Path) -> bool:
-        """Whether the file says so of this photograph, and with that where it was taken."""
+        """Whether the file has a pose of this photograph in metres."""
         return self._entry(photograph).get("unit") == "m"
 
-    def plate(self, photograph: Path) -> Path | None:
-        """The photograph's own plate, if it has one."""
+    def background_image(self, photograph: Path) -> Path | None:
+        """The photograph's own image of the empty scene, if it has one."""
         name = self._entry(photograph).get("plate")
         return None if name is None else self.file.parent / str(name)
 
-    def sees_alike(self, photograph: Path, plate: Path) -> None:
-        """Refuse a photograph taken from another height or tilt than a plate; round the scene is the same to a world.
+    def check_same_viewpoint(self, photograph: Path, background: Path) -> None:
+        """Refuse a photograph taken from another height or tilt than the background image; the azimuth may differ.
 
         Raises:
             CameraError: Says how they differ.
         """
         if "cam_from_world" not in self._entry(photograph):
             return
-        one, other = (self.cam_from_world(path) for path in (photograph, plate))
+        one, other = (self.pose_above_plane(path) for path in (photograph, background))
         tilt = float(np.degrees(np.arccos(np.clip(one[:3, 1] @ other[:3, 1], -1, 1))))
         heights = [float((-matrix[:3, :3].T @ matrix[:3, 3])[1]) for matrix in (one, other)]
         if tilt > _SAME_TILT_DEG or abs(heights[0] / heights[1] - 1) > _SAME_HEIGHT:
             raise CameraError(
                 f"{self.flag} {self.file}: {photograph.name} was taken {heights[0]:.3g} m above the plane and tilted "
-                f"by {tilt:.1f} degrees to {plate.name}, taken at {heights[1]:.3g} m; a camera that moves has to keep "
-                f"its height within {_SAME_HEIGHT:.0%} and its tilt within {_SAME_TILT_DEG:g} degrees"
+                f"by {tilt:.1f} degrees to {background.name}, taken at {heights[1]:.3g} m; a camera that moves has to "
+                f"keep its height within {_SAME_HEIGHT:.0%} and its tilt within {_SAME_TILT_DEG:g} degrees"
             )
 
     def _where(self, photograph: Path) -> str:
@@ -132,32 +131,42 @@ def _rigid(values: object, where: str) -> np.ndarray:
         raise CameraError(f"{where}: cam_from_world has shape {matrix.shape}, expected 4x4 finite numbers")
     rotation = matrix[:3, :3]
     shear = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if shear > _LARGEST_SHEAR or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise CameraError(f"{where}: cam_from_world is not rigid; expected a rotation, a shift and (0, 0, 0, 1)")
+    if shear > _MAX_SHEAR or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise CameraError(f"{where}: cam_from_world is not rigid; expected a rotation, a translation and (0, 0, 0, 1)")
     return matrix
 
 
-def seen_points(matrix: np.ndarray, cam_from_world: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Where on the plane each pixel looks, [height, width, 3]; NaN above the horizon and far beyond the scene."""
+def points_on_plane(matrix: np.ndarray, cam_from_world: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The point of the plane at each pixel, metres, world frame.
+
+    Args:
+        matrix: K [3, 3].
+        cam_from_world: [4, 4].
+        width: Of the image, pixels.
+        height: Of the image, pixels.
+
+    Returns:
+        [height, width, 3]; NaN above the horizon and far beyond the scene.
+    """
     columns, rows = np.meshgrid(np.arange(width), np.arange(height))
     pixels = np.stack([columns, rows, np.ones_like(rows)], axis=-1).astype(np.float64)
     rotation, centre = cam_from_world[:3, :3], -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
     rays = pixels @ np.linalg.inv(matrix).T @ rotation
     with np.errstate(divide="ignore", invalid="ignore"):
         along = -centre[1] / rays[..., 1]
-    farthest = -_FARTHEST * centre[1] / rotation[2, 1]
+    farthest = -_MAX_DISTANCE * centre[1] / rotation[2, 1]
     along[~((along > 0) & (along <= farthest))] = np.nan
     points: np.ndarray = centre + along[..., None] * rays
     points[..., 1] = np.where(np.isnan(along), np.nan, 0.0)
     return points
 
 
-def ever_changed(photographs: Sequence[np.ndarray], plates: Sequence[np.ndarray]) -> np.ndarray:
-    """Pixels where things ever were: those that differ from the plate in more than a few photographs.
+def changed_pixels(photographs: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray]) -> np.ndarray:
+    """Pixels that differ from the background image in more than a few photographs: things ever were there.
 
     Args:
         photographs: Each [3, height, width] uint8.
-        plates: The plate of each.
+        backgrounds: The background image of each.
 
     Returns:
         Mask [height, width].
@@ -165,22 +174,23 @@ def ever_changed(photographs: Sequence[np.ndarray], plates: Sequence[np.ndarray]
     Raises:
         DataError: There are next to none.
     """
-    changes = [_change(photo, plate) for photo, plate in zip(photographs, plates, strict=True)]
-    often = (np.mean([change > _LEAST_CHANGE for change in changes], axis=0) > _LEAST_OFTEN).astype(np.uint8)
+    changes = [_change(photo, background) for photo, background in zip(photographs, backgrounds, strict=True)]
+    often = (np.mean([change > _MIN_CHANGE for change in changes], axis=0) > _MIN_PHOTOGRAPHS).astype(np.uint8)
     mask: np.ndarray = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).astype(bool)
-    if mask.mean() < _LEAST_SHARE:
+    if mask.mean() < _MIN_AREA:
         raise DataError(
-            f"the {len(photographs)} photographs show nothing but the plate (a change on {mask.mean():.2%} of the "
+            f"the {len(photographs)} photographs show nothing but the background (a change on {mask.mean():.2%} of the "
             "frame); expected parts in them, and --background without"
         )
     return mask
 
 
-def _change(photograph: np.ndarray, plate: np.ndarray) -> np.ndarray:
-    """The largest difference of a channel, [height, width] in [0, 1], once noise is smoothed and exposure is evened."""
-    seen, empty = (
-        cv2.GaussianBlur(image.transpose(1, 2, 0).astype(np.float32) / 255, (5, 5), 0) for image in (photograph, plate)
+def _change(photograph: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Largest difference of a channel after smoothing and equalising the exposures, [height, width] in [0, 1]."""
+    photo, empty = (
+        cv2.GaussianBlur(image.transpose(1, 2, 0).astype(np.float32) / 255, (5, 5), 0)
+        for image in (photograph, background)
     )
-    gain = np.median(seen, axis=(0, 1)) / np.maximum(np.median(empty, axis=(0, 1)), 1e-3)
-    change: np.ndarray = np.abs(seen - empty * gain).max(axis=2)
+    gain = np.median(photo, axis=(0, 1)) / np.maximum(np.median(empty, axis=(0, 1)), 1e-3)
+    change: np.ndarray = np.abs(photo - empty * gain).max(axis=2)
     return change

@@ -12,7 +12,7 @@ from curio_train.camera import Intrinsics, check_matrix
 from curio_train.errors import CameraError, DataError
 
 _FEWEST_PHOTOGRAPHS = 3
-_FEWEST_PLACED = 0.8  # share of the photographs
+_FEWEST_PLACED = 0.8  # fraction of the photographs
 _FEWEST_POINTS = 100
 _LARGEST_ERROR_PX = 2.0
 _NEIGHBOURS = 10

@@ -19,31 +19,28 @@ _VALUES_AT_ONCE = 2**17  # half a megabyte: what lies between two operations sta
 
 @dataclass(frozen=True)
 class AugmentationStrength:
-    """How much pictures are disturbed: each by amounts drawn evenly from these ranges.
-
-    Attributes:
-        occluded: Share of the images with something in front.
-        shade: Largest standard deviation of the logarithm of uneven light.
-        gamma: Largest logarithm, up or down, of the exponent on values.
-        saturation: Least and largest factor on colours' difference from grey.
-        exposure: Least and largest factor on values.
-        tint: Largest share by which a channel is lighter or darker than that.
-        contrast: Least and largest factor on values' difference from their mean.
-        offset: Largest that is then added or taken away.
-        blur: Largest weight of the image behind a Gaussian of one pixel, beside the sharp one.
-        noise: Largest standard deviation.
-    """
+    """How much pictures are augmented: each by amounts drawn evenly from these ranges."""
 
     occluded: float
+    """Fraction of the images with something in front."""
     shade: float
+    """Largest standard deviation of the logarithm of uneven light."""
     gamma: float
+    """Largest logarithm, up or down, of the exponent on values."""
     saturation: tuple[float, float]
+    """Least and largest factor on colours' difference from grey."""
     exposure: tuple[float, float]
+    """Least and largest factor on values."""
     tint: float
+    """Largest fraction by which a channel is lighter or darker than that."""
     contrast: tuple[float, float]
+    """Least and largest factor on values' difference from their mean."""
     offset: float
+    """Largest that is then added or taken away."""
     blur: float
+    """Largest weight of the image behind a Gaussian of one pixel, beside the sharp one."""
     noise: float
+    """Largest standard deviation."""
 
 
 UNKNOWN_SCENE = AugmentationStrength(
@@ -105,7 +102,7 @@ class _Amounts(NamedTuple):
 def augment(
     images: Float[Tensor, "batch 3 height width"], random: np.random.Generator, most: AugmentationStrength
 ) -> Float[Tensor, "batch 3 height width"]:
-    """Pictures as a camera on a cluttered desk might take them; each is disturbed by amounts of its own.
+    """Pictures as a camera on a cluttered desk might take them; each is augmented by amounts of its own.
 
     Args:
         images: sRGB in [0, 1].
@@ -120,7 +117,7 @@ def augment(
     at_once = max(1, _VALUES_AT_ONCE // images[0].numel())
     for first in range(0, len(images), at_once):
         part = slice(first, first + at_once)
-        images[part] = _disturbed(images[part], _Amounts._make(values[part] for values in amounts))
+        images[part] = _augmented(images[part], _Amounts._make(values[part] for values in amounts))
     return images
 
 
@@ -147,7 +144,7 @@ def _draw(images: Tensor, random: np.random.Generator, most: AugmentationStrengt
     )
 
 
-def _disturbed(images: Tensor, by: _Amounts) -> Tensor:
+def _augmented(images: Tensor, by: _Amounts) -> Tensor:
     # Uneven light and the camera's response to it, in the domain where one is a sum and the other a product.
     lit = images.clamp(min=_LEAST).log_().add_(by.light).clamp_(_DARKEST, 0).mul_(by.exponent).exp_()
     # Saturation, exposure, white balance, contrast: one matrix on the channels.
@@ -187,10 +184,10 @@ def _noise_line(num_values: int, device: torch.device) -> Tensor:
     return torch.from_numpy(values).to(device)
 
 
-def _occlude(images: Tensor, random: np.random.Generator, share: float) -> Tensor:
+def _occlude(images: Tensor, random: np.random.Generator, fraction: float) -> Tensor:
     """A copy, in which some images have a piece of another image of the batch in front: a rotated rectangle."""
     images, before = images.clone(), images
-    chosen = np.flatnonzero(random.random(len(images)) < share)
+    chosen = np.flatnonzero(random.random(len(images)) < fraction)
     for image, mask in zip(
         chosen.tolist(), _rectangles(len(chosen), images.shape[2], images.shape[3], random), strict=True
     ):

@@ -1,7 +1,7 @@
 """Where photographs of a scene differ from a photograph of it empty, and where that is no more than a shadow.
 
-Each photograph is brought to the plate's exposure and white balance first. What clearly differs is parts and their
-shadows; what is merely darker than the plate, in the plate's own tint, is a shadow.
+Each photograph is brought to the background image's exposure and white balance first. What clearly differs is parts and
+their shadows; what is merely darker than the background image, in the background image's own tint, is a shadow.
 """
 
 from typing import NamedTuple
@@ -12,32 +12,29 @@ from torch import Tensor
 from curio_train.color import linear_from_srgb, srgb_from_linear
 
 _LEAST_DIFFERENCE, _DEVIATIONS = 0.08, 6.0  # sRGB; what noise, vignettes and drifting light do not reach
-_SHADOW_TINT = 0.25  # how far the logarithms of a shadow's three ratios to the plate may lie apart
+_SHADOW_TINT = 0.25  # how far the logarithms of a shadow's three ratios to the background image may lie apart
 _LEAST_LIGHT = 1e-3
 
 
 class BackgroundDifference(NamedTuple):
-    """Photographs beside their plate.
-
-    Attributes:
-        difference: Largest of the three channels', sRGB, exposure allowed for.
-        differs: Where it is clear.
-        shaded: Where the photograph is the plate made darker.
-    """
+    """Photographs beside their background image."""
 
     difference: Float[Tensor, "num height width"]
+    """Largest of the three channels', sRGB, exposure allowed for."""
     differs: Bool[Tensor, "num height width"]
+    """Where it is clear."""
     shaded: Bool[Tensor, "num height width"]
+    """Where the photograph is the background image made darker."""
 
 
 def compare(
-    photographs: Float[Tensor, "num 3 height width"], plate: Float[Tensor, "3 height width"]
+    photographs: Float[Tensor, "num 3 height width"], background_image: Float[Tensor, "3 height width"]
 ) -> BackgroundDifference:
     """Compare photographs with the empty scene, both sRGB in [0, 1]."""
-    light, empty = linear_from_srgb(photographs), linear_from_srgb(plate)
+    light, empty = linear_from_srgb(photographs), linear_from_srgb(background_image)
     ratio = (light + _LEAST_LIGHT) / (empty + _LEAST_LIGHT)
     ratio = ratio / ratio.flatten(2).median(dim=2).values[..., None, None]
-    difference = (srgb_from_linear(empty * ratio) - plate).abs().amax(dim=1)
+    difference = (srgb_from_linear(empty * ratio) - background_image).abs().amax(dim=1)
     level = _median(difference)
     limit = (level + _DEVIATIONS * 1.4826 * _median((difference - level).abs())).clamp(min=_LEAST_DIFFERENCE)
     logs = ratio.clamp(min=_LEAST_LIGHT).log()

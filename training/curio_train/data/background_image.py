@@ -1,9 +1,9 @@
-"""The empty scene behind an object: a plate, taken by the camera that will look for the object.
+"""The empty scene behind an object: a background image, taken by the camera that will look for the object.
 
-A detector that has seen the plate takes nothing in it for the object; one that has seen nothing else is lost when a
-tool lies there. So the plate is mixed with clutter, and no two views of it are alike: light drifts, shadows fall, and
-a tripod is touched now and then. Crops show the dark spot that the part's own shadow leaves, which our renderer doesn't
-draw where no plane is known.
+A detector that has seen the background image takes nothing in it for the object; one that has seen nothing else is lost
+when a tool lies there. So the background image is mixed with clutter, and no two views of it are alike: light drifts,
+shadows fall, and a tripod is touched now and then. Crops show the dark spot that the part's own shadow leaves, which
+our renderer doesn't draw where no plane is known.
 """
 
 from pathlib import Path
@@ -18,11 +18,11 @@ from curio_train.data.backgrounds import Backgrounds
 from curio_train.data.photographs import read_frame
 
 BACKGROUND_IMAGE_FRACTION = 0.85
-"""Of backgrounds that are the plate where it is mixed with others, which are the rare case in use."""
+"""Of backgrounds that are the background image where it is mixed with others, which are the rare case in use."""
 
 _LARGEST_SHIFT = 0.04  # of the frame's width, and as much of its height
-_SHORTEST_SIDE = 128  # of a plate that is halved once more
-_LEAST_SHRUNK = 1.5  # a view is shrunk by as much from a level of the plate, to look smooth
+_SHORTEST_SIDE = 128  # of a background image that is halved once more
+_LEAST_SHRUNK = 1.5  # a view is shrunk by as much from a level of the background image, to look smooth
 _GAIN, _TINT = 0.2, 0.06
 _SHADOW = 0.1  # standard deviation of the light's unevenness
 _SHADOW_GRID = 4
@@ -33,20 +33,20 @@ _DARKEST_CAST = 0.6
 class BackgroundImages(Backgrounds):
     """One photograph of the empty scene, shifted and lit a little differently each time."""
 
-    def __init__(self, plate: np.ndarray, shares: tuple[float, float] | None = None) -> None:
-        """Views of a plate.
+    def __init__(self, background_image: np.ndarray, fractions: tuple[float, float] | None = None) -> None:
+        """Views of a background image.
 
         Args:
-            plate: [height, width, 3] uint8 sRGB, without distortion.
-            shares: Of its width that a view spans, least and largest; None: all of it.
+            background_image: [height, width, 3] uint8 sRGB, without distortion.
+            fractions: Of its width that a view spans, least and largest; None: all of it.
         """
-        self._levels, self._shares = [plate], shares
+        self._levels, self._fractions = [background_image], fractions
         while min(self._levels[-1].shape[:2]) >= _SHORTEST_SIDE:  # to shrink much takes long, and views are many
             self._levels.append(cv2.resize(self._levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
     @classmethod
     def read(cls, path: Path, camera: Intrinsics) -> "BackgroundImages":
-        """The plate in a file.
+        """The background image in a file.
 
         Raises:
             DataError: It cannot be read, or is not of the camera's size.
@@ -54,7 +54,7 @@ class BackgroundImages(Backgrounds):
         return cls(read_frame(path, camera))
 
     def split(self, train: bool) -> "BackgroundImages":
-        """The plate is known in use, so it is no secret of the test."""
+        """The background image is known in use, so it is no secret of the test."""
         return self
 
     def of_crops(self, least: float, largest: float) -> "BackgroundImages":
@@ -75,16 +75,16 @@ class BackgroundImages(Backgrounds):
         smaller = cv2.INTER_AREA if columns >= width else cv2.INTER_LINEAR
         seen = cv2.resize(part, (width, height), interpolation=smaller).astype(np.float32) / 255
         light = _light(width, height, random)
-        if self._shares is not None:
+        if self._fractions is not None:
             light *= _cast(width, height, random)
         return np.clip(seen * light, 0, 1)
 
     def _region(self, width: int, height: int, random: np.random.Generator) -> tuple[int, int]:
-        """Rows and columns of the plate that a view spans."""
-        if self._shares is None:
+        """Rows and columns of the background image that a view spans."""
+        if self._fractions is None:
             kept = 1 - random.uniform(0, _LARGEST_SHIFT)
             return round(self._size[0] * kept), round(self._size[1] * kept)
-        least, largest = np.log(self._shares)
+        least, largest = np.log(self._fractions)
         columns = self._size[1] * np.exp(random.uniform(least, largest))
         columns = min(columns, self._size[1], self._size[0] * width / height)
         return max(1, int(columns * height / width)), max(1, int(columns))
@@ -97,20 +97,20 @@ class BackgroundImages(Backgrounds):
 class MixedBackgrounds(Backgrounds):
     """Some backgrounds from one source and the others from a second."""
 
-    def __init__(self, first: Backgrounds, second: Backgrounds, share: float) -> None:
-        """Take ``share`` of all backgrounds from the first."""
-        self._first, self._second, self._share = first, second, share
+    def __init__(self, first: Backgrounds, second: Backgrounds, fraction: float) -> None:
+        """Take ``fraction`` of all backgrounds from the first."""
+        self._first, self._second, self._fraction = first, second, fraction
 
     def split(self, train: bool) -> "MixedBackgrounds":
-        return MixedBackgrounds(self._first.split(train), self._second.split(train), self._share)
+        return MixedBackgrounds(self._first.split(train), self._second.split(train), self._fraction)
 
     def of_crops(self, least: float, largest: float) -> "MixedBackgrounds":
         return MixedBackgrounds(
-            self._first.of_crops(least, largest), self._second.of_crops(least, largest), self._share
+            self._first.of_crops(least, largest), self._second.of_crops(least, largest), self._fraction
         )
 
     def draw(self, count: int, width: int, height: int, seed: tuple[int, ...]) -> Tensor:
-        of_first = np.random.default_rng(seed).random(count) < self._share
+        of_first = np.random.default_rng(seed).random(count) < self._fraction
         images = torch.empty(count, 3, height, width)
         for source, chosen in ((self._first, of_first), (self._second, ~of_first)):
             if chosen.any():

@@ -29,7 +29,7 @@ from curio_train.rendering.renderer import Renderer
 
 POOL_SIZE = 240
 POOL_WIDTH, POOL_HEIGHT = 320, 240
-HEAPS = 3  # of NUM_SLOTS shapes each, one over the other
+CLUTTER_LAYERS = 3  # of NUM_SLOTS shapes each, one over the other
 NUM_SLOTS = 8
 _SEED = 20211
 
@@ -42,7 +42,7 @@ class Backgrounds(ABC):
         """Four fifths of the sources for training, or the others for tests."""
 
     def of_crops(self, least: float, largest: float) -> "Backgrounds":
-        """Views behind crops that span these shares of a frame's width; the same where views are of any scale."""
+        """Views behind crops that span these fractions of a frame's width; the same where views are of any scale."""
         return self
 
     @abstractmethod
@@ -84,7 +84,7 @@ class ClutterBackgrounds(Backgrounds):
             DataError: The cache folder cannot be written.
         """
         names = [mesh.sha256 for mesh in others]
-        recipe = json.dumps([POOL_SIZE, POOL_WIDTH, POOL_HEIGHT, HEAPS, NUM_SLOTS, _SEED, "v3", *names])
+        recipe = json.dumps([POOL_SIZE, POOL_WIDTH, POOL_HEIGHT, CLUTTER_LAYERS, NUM_SLOTS, _SEED, "v3", *names])
         path = cache.expanduser() / f"clutter-{hashlib.sha256(recipe.encode()).hexdigest()[:16]}.npy"
         if not path.is_file():
             _make_folder(path.parent)  # before half a minute is spent on the pictures
@@ -126,18 +126,18 @@ def render_pool(count: int, seed: int, others: Sequence[Mesh] = ()) -> np.ndarra
     meshes = [_patterned(mesh, random) for mesh in _shapes(random) for _ in range(4)]
     images = np.stack([_desk(random) for _ in range(count)])
     pool = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
-    for heap in range(HEAPS):
-        known = list(others[heap::HEAPS])[:NUM_SLOTS]
+    for layer in range(CLUTTER_LAYERS):
+        known = list(others[layer::CLUTTER_LAYERS])[:NUM_SLOTS]
         shapes = [meshes[kind] for kind in random.choice(len(meshes), NUM_SLOTS)]
         kinds = [*known, *shapes[len(known) :]]
         renderer = Renderer(kinds, range(NUM_SLOTS), POOL_WIDTH, POOL_HEIGHT, ambient=0.35)
         for start in range(0, count, 40):
             part = slice(start, start + 40)
-            pool[part] = _heap(renderer, pool[part], random, heap)
+            pool[part] = _clutter_layer(renderer, pool[part], random, layer)
     return (pool.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).numpy()
 
 
-def _heap(renderer: Renderer, behind: Tensor, random: np.random.Generator, seed: int) -> Tensor:
+def _clutter_layer(renderer: Renderer, behind: Tensor, random: np.random.Generator, seed: int) -> Tensor:
     count = len(behind)
     focal = 0.9 * POOL_WIDTH
     depth = random.uniform(0.5, 1.6, (count, NUM_SLOTS))

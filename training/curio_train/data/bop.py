@@ -59,42 +59,36 @@ _HOW_TO_GET = (
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image and its camera; no label.
-
-    Attributes:
-        scene_id: Number of the scene folder.
-        image_id: Number in the file's name.
-        path: The image file.
-        matrix: K [3, 3], pixels, pixel centres at integers.
-        width: Of the file, pixels.
-        height: Of the file, pixels.
-    """
+    """One image and its camera; no label."""
 
     scene_id: int
+    """Number of the scene folder."""
     image_id: int
+    """Number in the file's name."""
     path: Path
+    """The image file."""
     matrix: np.ndarray
+    """K [3, 3], pixels, pixel centres at integers."""
     width: int
+    """Of the file, pixels."""
     height: int
+    """Of the file, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Annotation:
-    """One object in one image: labels, for scoring.
-
-    Attributes:
-        scene_id: Number of the scene folder.
-        image_id: Number of the image.
-        object_id: BOP's number of the object.
-        pose: cam_from_obj, metres.
-        visible_fraction: Of the object's silhouette, in [0, 1]; None where ``scene_gt_info.json`` is missing.
-    """
+    """One object in one image: labels, for scoring."""
 
     scene_id: int
+    """Number of the scene folder."""
     image_id: int
+    """Number of the image."""
     object_id: int
+    """BOP's number of the object."""
     pose: Pose
+    """Cam_from_obj, metres."""
     visible_fraction: float | None
+    """Of the object's silhouette, in [0, 1]; None where ``scene_gt_info.json`` is missing."""
 
 
 @dataclass(frozen=True)
@@ -109,17 +103,14 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class ModelInfo:
-    """What ``models_info.json`` says of an object.
-
-    Attributes:
-        diameter_m: Largest distance of two model points.
-        symmetries: Discrete ones, each [4, 4] in metres, the identity left out.
-        symmetry_axes: Continuous ones, each (axis [3], point on it in metres [3]).
-    """
+    """What ``models_info.json`` says of an object."""
 
     diameter_m: float
+    """Largest distance of two model points."""
     symmetries: tuple[np.ndarray, ...] = ()
+    """Discrete ones, each [4, 4] in metres, the identity left out."""
     symmetry_axes: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+    """Continuous ones, each (axis [3], point on it in metres [3])."""
 
     @property
     def is_symmetric(self) -> bool:

@@ -25,15 +25,12 @@ _TRAINING_NUMBERS = (3, 10, 17)  # of each twenty: 15 %, evenly spread
 
 @dataclass(frozen=True, eq=False)
 class ScoredFrames:
-    """The frames to score an object on.
-
-    Attributes:
-        split_name: How they were chosen.
-        targets: Of the object, at most one a frame.
-    """
+    """The frames to score an object on."""
 
     split_name: str
+    """How they were chosen."""
     targets: Sequence[Annotation]
+    """Of the object, at most one a frame."""
 
 
 def scored_frames(dataset: BopDataset, name: str) -> ScoredFrames:

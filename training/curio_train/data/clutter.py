@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-_MOST_LEAVES = 160
-_SMALLEST_PX, _LARGEST_SHARE = 7.0, 0.5
+_MOST_SHAPES = 160
+_SMALLEST_PX, _LARGEST_FRACTION = 7.0, 0.5
 _SIZE_EXPONENT = 1.1  # the number of leaves above a size falls with its power
-_SHARES = {"plain": 0.5, "stripes": 0.15, "tiles": 0.15, "print": 0.2}
+_FRACTIONS = {"plain": 0.5, "stripes": 0.15, "tiles": 0.15, "print": 0.2}
 _LETTERS = "ABCDEFGHJKLMNPRSTUVWXYZabdefghkmnpqrstuy0123456789=#&%"
 
 
@@ -22,8 +22,8 @@ def dead_leaves_texture(image: Float[np.ndarray, "height width 3"], random: np.r
         image: float32 in [0, 1].
         random: Decides everything.
     """
-    sizes = _SMALLEST_PX * random.random(int(random.integers(20, _MOST_LEAVES))) ** (-1 / _SIZE_EXPONENT)
-    for size in np.sort(sizes.clip(max=_LARGEST_SHARE * image.shape[1]))[::-1]:
+    sizes = _SMALLEST_PX * random.random(int(random.integers(20, _MOST_SHAPES))) ** (-1 / _SIZE_EXPONENT)
+    for size in np.sort(sizes.clip(max=_LARGEST_FRACTION * image.shape[1]))[::-1]:
         _put(image, size, random)
 
 
@@ -67,7 +67,7 @@ def _color(random: np.random.Generator) -> np.ndarray:
 
 def _pattern(shape: tuple[int, ...], size: float, random: np.random.Generator) -> np.ndarray:
     """How much of a leaf's first colour each pixel has, float32 [height, width]."""
-    kind = random.choice(list(_SHARES), p=list(_SHARES.values()))
+    kind = random.choice(list(_FRACTIONS), p=list(_FRACTIONS.values()))
     if kind == "plain" or size < 8:
         return np.ones(shape, np.float32)
     if kind == "print":

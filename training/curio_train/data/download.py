@@ -45,7 +45,7 @@ def download_linemod(cache: Path) -> Path:
     """
     folder = cache.expanduser() / "bop" / "lm"
     state = folder / ".download"
-    with _explained(f"cannot download {REPOSITORY} to {folder}"):
+    with _as_data_errors(f"cannot download {REPOSITORY} to {folder}"):
         state.mkdir(parents=True, exist_ok=True)
         if not sys.stderr.isatty():
             disable_progress_bars()
@@ -57,8 +57,8 @@ def download_linemod(cache: Path) -> Path:
 
 
 @contextmanager
-def _explained(failure: str) -> Iterator[None]:
-    """Everything that can go wrong on the way, mapped once; a message each."""
+def _as_data_errors(failure: str) -> Iterator[None]:
+    """Turns every failure of a download into a DataError that says what to do."""
     again = "what has arrived is kept: give the same command again"
     try:
         yield

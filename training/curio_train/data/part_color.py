@@ -20,27 +20,24 @@ from curio_train.meshes.meshes import Mesh
 _WIDTH_PX = 160
 _MOST_COMPARED = 64
 _FEWEST = 3
-_FEWEST_SHARE = 0.25  # of the photographs compared
+_LEAST_FRACTION = 0.25  # of the photographs compared
 _CLEARLY = 0.5  # of the strongest difference: a shadow beside a part is weaker
 _LEAST_AREA, _LARGEST_AREA = 0.001, 0.4  # of the frame
 _LEAST_UNSHADED = 0.2  # of all that differs; below it the part itself is a grey like a shadow
 _WELL_LIT = 0.9  # quantile of the photographs' values: shadows darken some, nothing makes paint lighter
-_LARGEST_SPREAD = 0.12  # of the photographs' tints, as shares of the largest channel
+_LARGEST_SPREAD = 0.12  # of the photographs' tints, as fractions of the largest channel
 
 
 @dataclass(frozen=True)
 class FoundColor:
-    """A part's colour.
-
-    Attributes:
-        hex: As in HTML, sRGB, such as #8a6f4c.
-        num_used: Photographs that show it.
-        num_compared: Photographs looked at.
-    """
+    """A part's colour."""
 
     hex: str
+    """As in HTML, sRGB, such as #8a6f4c."""
     num_used: int
+    """Photographs that show it."""
     num_compared: int
+    """Photographs looked at."""
 
 
 def is_unpainted(mesh: Mesh) -> bool:
@@ -48,14 +45,14 @@ def is_unpainted(mesh: Mesh) -> bool:
     return mesh.texture is None and mesh.vertex_colors_srgb is None
 
 
-def find_color(photos: Path, plate: Path, camera: Intrinsics) -> FoundColor | None:
-    """The colour of what moves over a plate, or None where the photographs do not tell it.
+def find_color(photos: Path, background_image: Path, camera: Intrinsics) -> FoundColor | None:
+    """The colour of what moves over a background image, or None where the photographs do not tell it.
 
     What is found is the colour of its better lit half: paint of about this colour looks so in light of strength one.
 
     Args:
         photos: Folder; up to 64 photographs spread over it are read.
-        plate: The empty scene.
+        background_image: The empty scene.
         camera: That took both.
 
     Raises:
@@ -64,16 +61,16 @@ def find_color(photos: Path, plate: Path, camera: Intrinsics) -> FoundColor | No
     paths = Photographs(photos).paths
     chosen = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, _MOST_COMPARED).astype(int))]
     height = max(1, round(_WIDTH_PX * camera.height / camera.width))
-    empty = cv2.resize(read_frame(plate, camera), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    empty = cv2.resize(read_frame(background_image, camera), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
     frames = read_frames(chosen, camera, _WIDTH_PX, height).transpose(0, 2, 3, 1)
     seen = [color for frame in frames if (color := _color_of_piece(frame, empty)) is not None]
-    if len(seen) < max(_FEWEST, _FEWEST_SHARE * len(chosen)):
+    if len(seen) < max(_FEWEST, _LEAST_FRACTION * len(chosen)):
         return None
-    agreed = _agreed(seen)
+    agreed = _consensus(seen)
     return None if agreed is None else FoundColor(_hex(agreed), len(seen), len(chosen))
 
 
-def _agreed(colors: Sequence[np.ndarray]) -> np.ndarray | None:
+def _consensus(colors: Sequence[np.ndarray]) -> np.ndarray | None:
     """The median tint of linear colours, well lit, [3] sRGB, unless their tints are those of several parts."""
     srgb = srgb_from_linear(torch.from_numpy(np.stack(colors))).numpy()
     tints = srgb / srgb.max(axis=1, keepdims=True).clip(1e-3)
@@ -83,9 +80,9 @@ def _agreed(colors: Sequence[np.ndarray]) -> np.ndarray | None:
     return tint / tint.max() * np.quantile(srgb.max(axis=1), _WELL_LIT)
 
 
-def _color_of_piece(frame: np.ndarray, plate: np.ndarray) -> np.ndarray | None:
+def _color_of_piece(frame: np.ndarray, background_image: np.ndarray) -> np.ndarray | None:
     """Linear colour [3] of what two uint8 sRGB pictures [height, width, 3] differ in; None if nothing, or all."""
-    photograph, empty = (torch.from_numpy(picture / 255.0).permute(2, 0, 1) for picture in (frame, plate))
+    photograph, empty = (torch.from_numpy(picture / 255.0).permute(2, 0, 1) for picture in (frame, background_image))
     difference, differs, shaded = (found[0].numpy() for found in compare(photograph[None], empty))
     if not differs.any():
         return None

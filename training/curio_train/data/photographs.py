@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.view import undistort
 from jaxtyping import Bool, Float
 from PIL import Image
 
@@ -19,15 +21,12 @@ from curio_train.errors import DataError
 
 
 class CameraPoses(NamedTuple):
-    """Poses of the camera that took some photographs of one scene.
-
-    Attributes:
-        cam_from_world: Rigid, [num, 4, 4]; NaN for photographs whose camera pose is unknown.
-        in_metres: Whether translations are in metres; else the scene has an arbitrary scale.
-    """
+    """Poses of the camera that took some photographs of one scene."""
 
     cam_from_world: Float[np.ndarray, "num 4 4"]
+    """Rigid, [num, 4, 4]; NaN for photographs whose camera pose is unknown."""
     in_metres: bool = False
+    """Whether translations are in metres; else the scene has an arbitrary scale."""
 
     @property
     def known(self) -> Bool[np.ndarray, " num"]:
@@ -37,15 +36,12 @@ class CameraPoses(NamedTuple):
 
 
 class UnlabelledPhotographs(NamedTuple):
-    """Photographs that a world offers for self-training.
-
-    Attributes:
-        paths: Their files; at most :data:`MAX_UNLABELLED`.
-        cameras: Where the camera stood for each; None if unknown.
-    """
+    """Photographs that a world offers for self-training."""
 
     paths: Sequence[Path]
+    """Their files; at most :data:`MAX_UNLABELLED`."""
     cameras: CameraPoses | None = None
+    """Where the camera stood for each; None if unknown."""
 
 
 MAX_UNLABELLED = 300
@@ -98,12 +94,7 @@ def read_frame(path: Path, camera: Intrinsics) -> np.ndarray:
             f"{path}: found {width}x{height} pixels, but the camera file is for {camera.width}x{camera.height}; "
             "expected photographs as that camera stores them, neither resized nor turned"
         )
-    if not any(camera.distortion):
-        return pixels
-    matrix, size = camera.matrix, (pixels.shape[1], pixels.shape[0])
-    maps = cv2.initUndistortRectifyMap(matrix, np.array(camera.distortion), None, matrix, size, cv2.CV_32FC1)
-    # As serving does it: what lies beyond the photograph's edge continues it, and is no black frame to find things in.
-    return cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return undistort(pixels, PinholeCamera(camera.matrix, camera.distortion))
 
 
 def read_frames(paths: Sequence[Path], camera: Intrinsics, width: int, height: int) -> np.ndarray:

@@ -9,23 +9,20 @@ Sureness = Literal["certain", "likely", "possible"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at.
-
-    Attributes:
-        subject: What was looked at.
-        state: good; warning: works, but worse than it could; bad: will not work.
-        text: What was found.
-        remedy: What to do; empty where nothing is to be done.
-        sure: certain: it follows from the file; likely: other causes are rare; possible: have a look.
-        fault: A short name of the kind of fault, the same in every version; empty where all is well.
-    """
+    """One thing looked at."""
 
     subject: str
+    """What was looked at."""
     state: State
+    """Good; warning: works, but worse than it could; bad: will not work."""
     text: str
+    """What was found."""
     remedy: str = ""
+    """What to do; empty where nothing is to be done."""
     sure: Sureness = "certain"
+    """Certain: it follows from the file; likely: other causes are rare; possible: have a look."""
     fault: str = ""
+    """A short name of the kind of fault, the same in every version; empty where all is well."""
 
     def __str__(self) -> str:
         """In one line, without subject and state."""

@@ -113,11 +113,11 @@ def _trial(expression: str) -> tuple[float | None, str]:
 
 
 def _rendering() -> Finding:
-    share, problem = _trial("render_a_box")
-    if share is None:
+    fraction, problem = _trial("render_a_box")
+    if fraction is None:
         remedy = "Try another libLLVM (DRJIT_LIBLLVM_PATH), version 17 or newer"
         return Finding("rendering", "bad", f"a test picture {problem}", remedy, fault="rendering")
-    return Finding("rendering", "good", f"a box covers {share:.0%} of a test picture, as it should")
+    return Finding("rendering", "good", f"a box covers {fraction:.0%} of a test picture, as it should")
 
 
 def _training_time() -> Finding:

@@ -9,7 +9,7 @@ from curio_train.errors import RendererError
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.learning.losses import image_loss
 from curio_train.meshes.shapes import box, sphere
-from curio_train.networks.paper.pose import PoseNetwork
+from curio_train.networks.paper.network import PoseNetwork
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, Field, Layout
 
@@ -23,7 +23,7 @@ def _camera_matrix(side: int) -> np.ndarray:
 
 
 def render_a_box() -> float:
-    """Share of the pixels that a white box covers whose face fills a quarter of the picture.
+    """Fraction of the pixels that a white box covers whose face fills a quarter of the picture.
 
     Raises:
         RendererError: The picture shows something else.
@@ -36,10 +36,10 @@ def render_a_box() -> float:
         backgrounds=torch.zeros(1, 3, _SMALL_PX, _SMALL_PX),
         light=torch.zeros(1, 3),
     )
-    share = float((picture.mean(dim=1) > 0.25).float().mean())
-    if not 0.24 <= share <= 0.26:
-        raise RendererError(f"the test picture's box covers {share:.1%} of it, expected 25 %")
-    return share
+    fraction = float((picture.mean(dim=1) > 0.25).float().mean())
+    if not 0.24 <= fraction <= 0.26:
+        raise RendererError(f"the test picture's box covers {fraction:.1%} of it, expected 25 %")
+    return fraction
 
 
 def images_per_second() -> float:

@@ -13,7 +13,7 @@ from curio_train.meshes.meshes import Unit, load_mesh
 
 
 def draw(
-    scenes: Path, out: Path, meshes: Sequence[str], mesh_unit: Unit | None, world: str | None, wish: RenderOptions
+    scenes: Path, out: Path, meshes: Sequence[str], mesh_unit: Unit | None, world: str | None, options: RenderOptions
 ) -> Iterator[Path]:
     """Draw every scene of a file and yield the pictures' paths as they are written.
 
@@ -23,7 +23,7 @@ def draw(
         meshes: FILE or NAME=FILE, as on the command line.
         mesh_unit: Of their coordinates; the file's own unless given.
         world: Generated world that brings meshes, light and ground; a code names its own.
-        wish: How to draw.
+        options: How to draw.
 
     Raises:
         UsageError: Both meshes and a world, or neither where one is needed.
@@ -39,7 +39,7 @@ def draw(
         if around is None:
             raise UsageError(f"{scenes}: detections don't say what the objects look like; add --mesh FILE or --world")
         path = out / f"{scene.name}.png"
-        _write(path, picture(scene, around, wish))
+        _write(path, picture(scene, around, options))
         yield path
 
 

@@ -30,35 +30,33 @@ LIGHT = (-0.25, -0.45, -0.5)
 
 @dataclass(frozen=True, eq=False)
 class SceneContext:
-    """What a scene itself does not say.
-
-    Attributes:
-        meshes: By the object's name; the one named "" stands for every object without its own.
-        ambient: Radiance from everywhere.
-        light: Camera frame, towards the light [3], where the scene has none.
-        center_m: Camera frame, what the camera is carried round; None: the middle of the objects.
-        up: Camera frame, the axis that it is carried round.
-        ground: What the objects stand on, camera frame, or None.
-    """
+    """What a scene itself does not say."""
 
     meshes: Mapping[str, Mesh]
+    """By the object's name; the one named "" stands for every object without its own."""
     ambient: float = AMBIENT
+    """Radiance from everywhere."""
     light: np.ndarray | None = None
+    """Camera frame, towards the light [3], where the scene has none."""
     center_m: np.ndarray | None = None
+    """Camera frame, what the camera is carried round; None: the middle of the objects."""
     up: tuple[float, ...] = (0.0, -1.0, 0.0)
+    """Camera frame, the axis that it is carried round."""
     ground: Ground | None = None
+    """What the objects stand on, camera frame, or None."""
 
     @classmethod
     def of_world(cls, world: MeshWorld) -> "SceneContext":
         """Those of a generated world."""
-        turn, shift = world.stage.cam_from_world
+        setup = world.setup
+        cam_from_world = setup.cam_from_world
         return cls(
             {kind.name: kind.mesh for kind in world.kinds},
-            world.stage.ambient,
-            turn @ np.array(world.stage.sun),
-            turn @ np.array(world.stage.center_m) + shift,
-            tuple((turn @ np.array(world.stage.up)).tolist()),
-            world.ground(world.stage.cam_from_world),
+            setup.ambient,
+            cam_from_world.rotation @ np.array(setup.sun),
+            cam_from_world.apply(np.array(setup.center_m)),
+            tuple((cam_from_world.rotation @ np.array(setup.up)).tolist()),
+            setup.ground(cam_from_world),
         )
 
     def mesh(self, kind: str) -> Mesh:
@@ -75,21 +73,18 @@ class SceneContext:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How a scene is to be drawn.
-
-    Attributes:
-        height: Of the picture, pixels; None: the scene's own.
-        turn_deg: How far the camera is carried round the objects; 90 is the novel view of the paper's image error.
-        over_photograph: Draw over the photograph that the objects were found in.
-        path_traced: By stock Mitsuba's path tracer, with the light that surfaces give each other.
-        samples: A pixel.
-    """
+    """How a scene is to be drawn."""
 
     height: int | None = None
+    """Of the picture, pixels; None: the scene's own."""
     turn_deg: float = 0.0
+    """How far the camera is carried round the objects; 90 is the novel view of the paper's image error."""
     over_photograph: bool = False
+    """Draw over the photograph that the objects were found in."""
     path_traced: bool = False
+    """By stock Mitsuba's path tracer, with the light that surfaces give each other."""
     samples: int = 64
+    """A pixel."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be drawn."""
@@ -100,29 +95,29 @@ class RenderOptions:
 
 
 def picture(
-    scene: Scene, around: SceneContext, wish: RenderOptions, photograph: np.ndarray | None = None
+    scene: Scene, around: SceneContext, options: RenderOptions, photograph: np.ndarray | None = None
 ) -> np.ndarray:
     """Draw a scene: [height, width, 3] uint8 sRGB.
 
     Args:
         scene: What to draw.
         around: What the scene itself does not say.
-        wish: How to draw it.
+        options: How to draw it.
         photograph: [height, width, 3] uint8 sRGB to draw over, in place of the scene's file.
 
     Raises:
         DataError: An object without a mesh, or a photograph that is missing or of another size.
         RendererError: No usable libLLVM, or a mesh that cannot be rendered.
     """
-    scene, around = _resized(scene, wish.height), _with_light(scene, around)
+    scene, around = _resized(scene, options.height), _with_light(scene, around)
     behind = _fitted(photograph, scene) if photograph is not None else None
-    if wish.over_photograph:
+    if options.over_photograph:
         behind = _photograph(scene)
     if behind is not None:
         around = replace(around, ground=None)
-    scene, around = _carried(scene, around, wish.turn_deg)
-    draw = _path_traced if wish.path_traced else _rendered
-    image = draw(scene, around, behind, wish.samples)
+    scene, around = _carried(scene, around, options.turn_deg)
+    draw = _path_traced if options.path_traced else _rendered
+    image = draw(scene, around, behind, options.samples)
     return np.asarray((image.clip(0, 1) * 255 + 0.5).astype(np.uint8))
 
 
@@ -160,15 +155,13 @@ def _fitted(pixels: np.ndarray, scene: Scene) -> np.ndarray:
 
 def _carried(scene: Scene, around: SceneContext, turn_deg: float) -> tuple[Scene, SceneContext]:
     """Everything as the camera sees it that was carried round the middle, still looking at it."""
-    places = [item.pose.translation_m for item in scene.objects]
-    center = np.mean(places, axis=0) if around.center_m is None and places else around.center_m
+    positions = [item.pose.translation_m for item in scene.objects]
+    center = np.mean(positions, axis=0) if around.center_m is None and positions else around.center_m
     if turn_deg == 0 or center is None:
         return scene, around
     turn = Rotation.from_rotvec(-np.radians(turn_deg) * np.array(around.up)).as_matrix()
-    objects = tuple(
-        replace(item, pose=Pose(turn @ item.pose.rotation, turn @ (item.pose.translation_m - center) + center))
-        for item in scene.objects
-    )
+    orbit = Pose(turn, center - turn @ center)
+    objects = tuple(replace(item, pose=orbit @ item.pose) for item in scene.objects)
     ground = around.ground
     if ground is not None:
         up = turn @ ground.up
@@ -238,4 +231,5 @@ def _path_traced(scene: Scene, around: SceneContext, behind: np.ndarray | None, 
 
 
 def _posed(item: Placed, around: SceneContext) -> PosedMesh:
-    return PosedMesh(around.mesh(item.kind), *item.pose, item.color_srgb, item.confidence)
+    rotation, translation_m = item.pose
+    return PosedMesh(around.mesh(item.kind), rotation, translation_m, item.color_srgb, item.confidence)

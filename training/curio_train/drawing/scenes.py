@@ -24,44 +24,38 @@ EXPECTED = 'a line of curio-detect with "detections", or {"world": NAME, "code":
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """One object of a scene.
-
-    Attributes:
-        kind: Its name, by which its mesh is found.
-        pose: cam_from_obj, metres.
-        color_srgb: Albedo [3] that multiplies the mesh's own.
-        confidence: Its opacity.
-    """
+    """One object of a scene."""
 
     kind: str
+    """Its name, by which its mesh is found."""
     pose: Pose
+    """Cam_from_obj, metres."""
     color_srgb: tuple[float, ...] = (1.0, 1.0, 1.0)
+    """Albedo [3] that multiplies the mesh's own."""
     confidence: float = 1.0
+    """Its opacity."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Objects before a camera.
-
-    Attributes:
-        name: For the picture's file.
-        width: Of the image that the camera matrix belongs to, pixels.
-        height: Likewise.
-        camera_matrix: K [3, 3].
-        objects: In the camera's frame.
-        light: Camera frame, towards the light [3], or None: not known.
-        photograph: That the objects were found in, or None.
-        world: Name of the generated world that the scene is a code of, or None.
-    """
+    """Objects before a camera."""
 
     name: str
+    """For the picture's file."""
     width: int
+    """Of the image that the camera matrix belongs to, pixels."""
     height: int
+    """Likewise."""
     camera_matrix: np.ndarray
+    """K [3, 3]."""
     objects: tuple[Placed, ...]
+    """In the camera's frame."""
     light: np.ndarray | None
+    """Camera frame, towards the light [3], or None: not known."""
     photograph: Path | None = None
+    """That the objects were found in, or None."""
     world: str | None = None
+    """Name of the generated world that the scene is a code of, or None."""
 
 
 @functools.cache
@@ -161,7 +155,7 @@ def scene_of_code(world: World, code: SceneCode, number: int) -> Scene:
         code: Of one image (batch size 1).
         number: Goes into the scene's name.
     """
-    seen = {name: values[0].double().numpy() for name, values in world.exported(code).items()}
+    seen = {name: values[0].double().numpy() for name, values in world.outputs.from_code(code).items()}
     slots = len(seen[TRANSLATION])
     rotation = seen.get("rotation", np.broadcast_to(np.eye(3), (slots, 3, 3)))
     color, confidence = seen.get(COLOR, np.ones((slots, 3))), seen.get(CONFIDENCE, np.ones(slots))

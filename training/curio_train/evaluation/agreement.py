@@ -4,12 +4,14 @@ Numbers of a photograph, each in [0, 1]; all images are compared behind a 9x9 Ga
 channel (exposure and white balance are not known):
 
 * **inside**: the share of the silhouette's pixels that differ by less than 0.15 in every channel;
-* **overlap**, with a plate: intersection over union of the silhouette and what differs from the plate and is no shadow;
+* **overlap**, with a background image: intersection over union of the silhouette and what differs from the background
+image and is no shadow;
 * **explained**, without one: of the difference, in and around the silhouette, between the photograph and what it shows
   around it, the share that the part as drawn takes away. So a drawing in the colours of its surroundings says nothing.
 
-Measured on 250 path-traced photographs of a bracket (256x192, its plate, a camera file two pixels off) with a model
-that had 36 % of ADD below 0.1 diameters once the camera's error was taken out. AUROC against that, and of right poses
+Measured on 250 path-traced photographs of a bracket (256x192, its background image, a camera file two pixels off) with
+a model that had 36 % of ADD below 0.1 diameters once the camera's error was taken out. AUROC against that, and of right
+poses
 against rotations off by more than 30 degrees: overlap 0.66 and 0.92; explained 0.66 and 0.85; inside 0.66 and 0.82; one
 minus DSSIM in the silhouette 0.56 and 0.72; the model's own confidence 0.64 and 0.90. So a pose that is wrong is told
 from one that is nearly right, and a tenth of a diameter from a fifth is not: a shift of two pixels is hardly seen.
@@ -27,7 +29,7 @@ from torch import Tensor
 
 from curio_train.data.background_difference import compare
 from curio_train.metrics.images import blurred
-from curio_train.refinement.inpainting import filled_in
+from curio_train.refinement.inpainting import inpainted
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
 
@@ -40,15 +42,12 @@ _DARKEST = 0.02  # of a rendering's pixels that a gain is read from
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """Scenes drawn so that they can be laid over anything.
-
-    Attributes:
-        over_black: [num, 3, height, width], sRGB in [0, 1].
-        through: Likewise, the share of what is behind that is seen.
-    """
+    """Scenes drawn so that they can be laid over anything."""
 
     over_black: Tensor
+    """[num, 3, height, width], sRGB in [0, 1]."""
     through: Tensor
+    """Likewise, the share of what is behind that is seen."""
 
     @property
     def silhouette(self) -> Bool[Tensor, "num height width"]:
@@ -69,20 +68,20 @@ def draw(world: World, code: SceneCode) -> Drawing:
 
 
 def inside(photographs: Tensor, drawing: Drawing, backgrounds: Tensor) -> Float[Tensor, " num"]:
-    """Share of the silhouette that looks as drawn; 0 where there is none.
+    """Fraction of the silhouette that looks as drawn; 0 where there is none.
 
     Args:
         photographs: [num, 3, height, width], sRGB in [0, 1].
         drawing: What was found in them.
-        backgrounds: What is thought to be behind: the plate, or the photographs themselves.
+        backgrounds: What is thought to be behind: the background image, or the photographs themselves.
     """
     seen, drawn, mask = blurred(photographs), blurred(drawing.over(backgrounds)), drawing.silhouette
     near = (_gains(seen, drawn, mask) * drawn - seen).abs().amax(dim=1) < _TOLERANCE
     return (near & mask).sum((1, 2)).double() / mask.sum((1, 2)).clamp(min=1)
 
 
-def explained(photographs: Tensor, drawing: Drawing) -> Float[Tensor, " num"]:
-    """Share of what the surroundings, continued, do not explain of photographs and the drawing does; 0 at worst.
+def inlier_ratio(photographs: Tensor, drawing: Drawing) -> Float[Tensor, " num"]:
+    """Fraction of what the surroundings, continued, do not explain of photographs and the drawing does; 0 at worst.
 
     Differences are robust (Geman and McClure 1987), as in :mod:`~curio_train.refinement.render_and_compare`.
 
@@ -92,14 +91,14 @@ def explained(photographs: Tensor, drawing: Drawing) -> Float[Tensor, " num"]:
     """
     mask, reach = drawing.silhouette, max(1, round(_AROUND * photographs.shape[-1]))
     around = F.max_pool2d(mask[:, None].float(), 2 * reach + 1, 1, reach) > 0
-    behind, seen = filled_in(photographs, around), blurred(photographs)
+    behind, seen = inpainted(photographs, around), blurred(photographs)
     gains = _gains(seen, blurred(drawing.over(photographs)), mask)
     drawn = gains * blurred(drawing.over_black) + blurred(drawing.through * behind)
-    left, without = (_missed(image, seen, around[:, 0]) for image in (drawn, blurred(behind)))
+    left, without = (_residual(image, seen, around[:, 0]) for image in (drawn, blurred(behind)))
     return (1 - left / without.clamp(min=1)).clamp(0, 1).double()
 
 
-def _missed(images: Tensor, photographs: Tensor, where: Tensor) -> Float[Tensor, " num"]:
+def _residual(images: Tensor, photographs: Tensor, where: Tensor) -> Float[Tensor, " num"]:
     squared = ((images - photographs) / _SCALE).square().sum(dim=1)
     return (squared / (squared + 1) * where).sum((1, 2))
 
@@ -120,14 +119,14 @@ def overlap(silhouette: Tensor, differing: Tensor) -> Float[Tensor, " num"]:
     return torch.where(either > 0, common / either.clamp(min=1), 1.0)
 
 
-def differing(photographs: Tensor, plate: Tensor) -> Bool[Tensor, "num height width"]:
+def differing(photographs: Tensor, background_image: Tensor) -> Bool[Tensor, "num height width"]:
     """Where photographs clearly differ from the empty scene, shadows on it and speckles left out.
 
     Args:
         photographs: [num, 3, height, width], sRGB in [0, 1].
-        plate: [3, height, width], likewise.
+        background_image: [3, height, width], likewise.
     """
-    found = compare(photographs, plate)
+    found = compare(photographs, background_image)
     masks = (found.differs & ~found.shaded).numpy().astype(np.uint8)
     opened = [cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) for mask in masks]
     return torch.from_numpy(np.stack(opened)).bool()

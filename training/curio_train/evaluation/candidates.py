@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from curio_serve.models.model_folder import MODEL_FILE
+
 from curio_train.errors import DataError, UsageError
-from curio_train.export.folder import MODEL_FILE, find_model
-from curio_train.export.onnx import OnnxModel
+from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, to_portable
 from curio_train.worlds.options import LinemodOptions
@@ -20,19 +21,16 @@ SELF_TRAINED = ", self-trained"
 
 @dataclass(frozen=True)
 class Candidate:
-    """A run or a model of one LineMOD class.
-
-    Attributes:
-        path: Its folder.
-        name: The class.
-        method: That trained it; ``, self-trained`` follows where unlabelled real frames took part.
-        weights_sha256: Of the last checkpoint's tensors, or of the model file.
-    """
+    """A run or a model of one LineMOD class."""
 
     path: Path
+    """Its folder."""
     name: str
+    """The class."""
     method: str
+    """That trained it; ``, self-trained`` follows where unlabelled real frames took part."""
     weights_sha256: str
+    """Of the last checkpoint's tensors, or of the model file."""
 
 
 def candidates(folder: Path, flag: str = "--runs", *, of_any_method: bool = True) -> list[Candidate]:
@@ -74,14 +72,14 @@ def _found(folder: Path) -> Iterator[Candidate]:
                 )
         elif any(path.glob(f"[0-9]*/{MODEL_FILE}")):
             file = find_model(path)
-            spec = OnnxModel.open(file).spec
+            spec = ExportedModel.open(file).spec
             if spec.world == "linemod":
                 yield Candidate(path, spec.objects[0].name, _method(json.loads(spec.recipe)), files_sha256(file))
 
 
-def _method(making: Mapping[str, Any]) -> str:
+def _method(provenance: Mapping[str, Any]) -> str:
     """Models that are older than self-training say nothing of it."""
-    return str(making["method"]) + (SELF_TRAINED if making["recipe"].get("self_training") else "")
+    return str(provenance["method"]) + (SELF_TRAINED if provenance["recipe"].get("self_training") else "")
 
 
 def files_sha256(*files: Path) -> str:

@@ -19,11 +19,12 @@ from curio_train.export.card import EVALUATION_FILE
 from curio_train.learning.runs.configuration import CONFIG_FILE, world_name
 from curio_train.learning.runs.initial import uses_synthetic_labels
 from curio_train.learning.runs.provenance import machine
-from curio_train.metrics.certainty import auroc, calibration_error
+from curio_train.metrics.calibration import auroc, calibration_error
 from curio_train.metrics.poses import ADD_THRESHOLD
-from curio_train.refinement.render_and_compare import refined
+from curio_train.refinement.render_and_compare import with_refinement
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
 from curio_train.worlds.base import Split, World
+from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _BATCH_SIZE = 50
 _NUM_EMPTY = 100
@@ -32,17 +33,14 @@ _SEED = 0  # of the images: the same for every run, so that figures can be compa
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Images of a split with their true codes.
-
-    Attributes:
-        images: uint8 [num_images, 3, height, width].
-        code: Of all images.
-        empty: uint8 [num, 3, height, width], backgrounds without the object, in worlds whose codes have a confidence.
-    """
+    """Images of a split with their true codes."""
 
     images: Tensor
+    """Uint8 [num_images, 3, height, width]."""
     code: SceneCode
+    """Of all images."""
     empty: Tensor | None = None
+    """Uint8 [num, 3, height, width], backgrounds without the object, in worlds whose codes have a confidence."""
 
 
 def evaluate(
@@ -84,9 +82,9 @@ def evaluate(
     if bop_results is not None and data is None:
         raise UsageError("--bop-results needs the real frames that it is about: --data DIR")
     subject = load_subject(path, data)
-    if data is not None and subject.world.mesh is None:
+    if data is not None and not isinstance(subject.world, SingleObjectWorld):
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
-    better = replace(subject, predict=refined(subject.predict, subject.world)) if refine else None
+    better = replace(subject, predict=with_refinement(subject.predict, subject.world)) if refine else None
     progress(f"{num_images} images of the {split} split")
     held_out = draw(subject.world, split, num_images, cache)
     result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images)}
@@ -128,7 +126,7 @@ def draw(world: World, split: Split, num_images: int, cache: Path) -> HeldOut:
     images = torch.cat([(batch.images.clamp(0, 1) * 255).round().byte() for batch in batches])
     codes = [batch.code for batch in batches if batch.code is not None]
     code = {name: torch.cat([one[name] for one in codes])[:num_images] for name in codes[0]}
-    if world.mesh is None or CONFIDENCE not in world.layout:
+    if not isinstance(world, SingleObjectWorld) or CONFIDENCE not in world.layout:
         return HeldOut(images[:num_images], code)
     behind = source.backgrounds(len(batches), _NUM_EMPTY)  # of steps that have not been drawn
     return HeldOut(images[:num_images], code, None if behind is None else (behind.clamp(0, 1) * 255).round().byte())
@@ -143,19 +141,19 @@ def read(predict: Predict, images: Tensor) -> SceneCode:
 def score(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, float]:
     """All metrics that mean something in this world."""
     scores = scene_scores(world, predicted, true)
-    if world.mesh is not None:
+    if isinstance(world, SingleObjectWorld):
         info = world.objects[0].info
-        scores |= pose_scores(poses(predicted), poses(true), world.mesh.vertices_m, info)
+        scores |= pose_scores(poses(predicted), poses(true), world.object.mesh.vertices_m, info)
     return scores
 
 
-def certainty(world: World, predicted: SceneCode, true: SceneCode, on_empty: SceneCode) -> dict[str, float]:
+def calibration(world: World, predicted: SceneCode, true: SceneCode, on_empty: SceneCode) -> dict[str, float]:
     """What the confidence of one object is worth.
 
     Once as the probability that ADD(-S) is below a tenth of the diameter, once as a sign that the object is there.
     """
-    assert world.mesh is not None  # worlds of one object have one
-    errors = add_errors(poses(predicted), poses(true), world.mesh.vertices_m, world.objects[0].info)
+    assert isinstance(world, SingleObjectWorld)
+    errors = add_errors(poses(predicted), poses(true), world.object.mesh.vertices_m, world.objects[0].info)
     confidences, without = (code[CONFIDENCE].flatten().tolist() for code in (predicted, on_empty))
     return {
         "confidence_ece": calibration_error(confidences, [error < ADD_THRESHOLD for error in errors]),
@@ -167,7 +165,7 @@ def _scored(world: World, predict: Predict, held_out: HeldOut) -> tuple[SceneCod
     predicted = read(predict, held_out.images)
     scores = score(world, predicted, held_out.code)
     if held_out.empty is not None:
-        scores |= certainty(world, predicted, held_out.code, read(predict, held_out.empty))
+        scores |= calibration(world, predicted, held_out.code, read(predict, held_out.empty))
     return predicted, scores
 
 
@@ -179,7 +177,7 @@ def _origin(path: Path, subject: Subject) -> dict[str, Any]:
         "objects": [kind.name for kind in subject.world.objects],
         "method": config.method,
         "reading": config.network.reading or "whole",
-        "labels": config.labels if "label" in config.terms else 0.0,
+        "labels": config.labels if config.terms.label else 0.0,
         "labels_real": False,  # images with true codes are renderings in every world
         "labels_synthetic": uses_synthetic_labels(config),
         "preset": config.preset,

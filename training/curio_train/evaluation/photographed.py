@@ -2,15 +2,15 @@
 
 The prediction is rendered from the own camera and compared with what was photographed there: agreement inside the
 silhouette and around it (``agreement.py``). On a plane, and for the paper's novel-view test from a second known camera
-over its plate, also by DSSIM sharp, and with both images behind a 9x9 Gaussian filter, which leaves out much of what no
-renderer knows of a camera. The empty plate is the measure there: a prediction that is no nearer to the photograph than
-a scene without parts has found nothing.
+over its background image, also by DSSIM sharp, and with both images behind a 9x9 Gaussian filter, which leaves out much
+of what no renderer knows of a camera. The empty background image is the measure there: a prediction that is no nearer
+to the photograph than a scene without parts has found nothing.
 
-In free space a photograph agrees where the overlap is 0.75 or more, or where no plate is known, 0.4 or more of it is
-explained. Of the 250 photographs of ``agreement.py`` 93 % of the right poses had such an overlap (were so explained:
-95 %), and 21 % (43 %) of those turned by more than 30 degrees: a model that is right everywhere agrees with over nine
-photographs in ten. Of what agreed 41 % were right to a tenth of the diameter and 80 % to a fifth, of the rest 13 % and
-42 %; without a plate nearly the same.
+In free space a photograph agrees where the overlap is 0.75 or more, or where no background image is known, 0.4 or more
+of it is explained. Of the 250 photographs of ``agreement.py`` 93 % of the right poses had such an overlap (were so
+explained: 95 %), and 21 % (43 %) of those turned by more than 30 degrees: a model that is right everywhere agrees with
+over nine photographs in ten. Of what agreed 41 % were right to a tenth of the diameter and 80 % to a fifth, of the rest
+13 % and 42 %; without a background image nearly the same.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,11 +20,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from curio_train.evaluation.agreement import differing, draw, explained, inside, overlap
+from curio_train.evaluation.agreement import differing, draw, inlier_ratio, inside, overlap
 from curio_train.evaluation.subject import Predict
 from curio_train.metrics.images import blurred, dssim
 from curio_train.scene_code import CONFIDENCE, SceneCode
-from curio_train.worlds.base import View, World
+from curio_train.worlds.base import PhotographSet, World
+from curio_train.worlds.single_object.capture import CapturePhotographs
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.tabletop.world import TabletopWorld
 
 _TRUSTED, _DOUBTFUL = 0.9, 0.6
 _NAMES = ("own_view", "second_view")
@@ -36,22 +39,21 @@ _DRAWN_AT_ONCE = 8  # frames of a camera are larger than images of a plane
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """How far re-renderings are from photographs.
-
-    Attributes:
-        metrics: Means ``own_view_inside`` and ``own_view_overlap`` (without a plate ``own_view_explained``). In free
-            space ``own_view_agreeing``, the share of photographs. On a plane of each view ``…_dssim`` and
-            ``…_dssim_blurred``, the same of the empty plate as ``…_plate_…``, and ``better_than_plate``, the share of
-            scenes in which the last view is nearer than its plate.
-        verdict: Whether to trust the model, and what to do if not.
-        columns: Photograph and re-rendering of each view by heading, [num, 3, height, width] in [0, 1], worst first.
-        captions: The figures of each row.
-    """
+    """How far re-renderings are from photographs."""
 
     metrics: Mapping[str, float]
+    """Means ``own_view_inside`` and ``own_view_overlap`` (without a background image ``own_view_explained``).
+
+    In free space also ``own_view_agreeing``, the fraction of photographs that agree. On a plane, of each view,
+    ``…_dssim`` and ``…_dssim_blurred``, the same of the empty background image as ``…_plate_…``, and
+    ``better_than_plate``, the fraction of scenes in which the last view is nearer than its background image.
+    """
     verdict: str
+    """Whether to trust the model, and what to do if not."""
     columns: Mapping[str, Tensor]
+    """Photograph and re-rendering of each view by heading, [num, 3, height, width] in [0, 1], worst first."""
     captions: Sequence[str]
+    """The figures of each row."""
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -64,69 +66,76 @@ def judge(world: World, predict: Predict) -> Judgement | None:
     """Compare re-renderings with photographs; None in worlds without photographs to judge by.
 
     Args:
-        world: With its views, or its photographs.
+        world: With its photographs.
         predict: Reads the own camera's photographs.
 
     Raises:
-        DataError: A photograph or the plate cannot be read, or is not of the camera's size.
+        DataError: A photograph or the background image cannot be read, or is not of the camera's size.
     """
-    if views := world.views():
-        return _on_plane(world, predict, views)
-    photographs = world.photographs(_NUM_IN_SPACE)
-    return None if photographs is None else _in_space(world, predict, photographs, world.plate())
+    if isinstance(world, TabletopWorld):
+        return _on_plane(world, predict)
+    if isinstance(world, TwoStageWorld) and isinstance(world.photographs, CapturePhotographs):
+        photographs = world.photographs
+        return _in_space(world, predict, photographs.judged(_NUM_IN_SPACE), photographs.background_image())
+    return None
 
 
-def _on_plane(world: World, predict: Predict, views: Sequence[View]) -> Judgement:
+def _on_plane(world: TabletopWorld, predict: Predict) -> Judgement:
+    views = [view for view in (world.photographs.own, world.photographs.second) if view is not None]
     code = _read(predict, views[0].photographs)
     drawn = [_drawn(world, number, code) for number in range(len(views))]
-    agreed, _ = _agreement(world, _certain(code), views[0].photographs.float() / 255, views[0].plate.float() / 255)
+    agreed, _ = _agreement(
+        world, _certain(code), views[0].photographs.float() / 255, views[0].background_image.float() / 255
+    )
     metrics = _means(agreed)
     for name, view, images in zip(_NAMES, views, drawn, strict=False):
-        error, of_plate = _errors(view, images)
+        error, of_background_image = _errors(view, images)
         metrics |= {f"{name}_{kind}": float(values.mean()) for kind, values in error.items()}
-        metrics |= {f"{name}_plate_{kind}": float(values.mean()) for kind, values in of_plate.items()}
+        metrics |= {f"{name}_plate_{kind}": float(values.mean()) for kind, values in of_background_image.items()}
     worst = error["dssim_blurred"]
-    metrics["better_than_plate"] = float((worst < of_plate["dssim_blurred"]).double().mean())
+    metrics["better_than_plate"] = float((worst < of_background_image["dssim_blurred"]).double().mean())
     order = worst.argsort(descending=True)
     columns = {}
     for heading, view, images in zip(("", ", second camera"), views, drawn, strict=False):
         columns["photograph" + heading] = view.photographs[order].float() / 255
         columns["prediction" + heading] = images[order]
     verdict = _verdict(metrics["better_than_plate"], len(worst), len(views) > 1)
-    verdict += f" Drawn parts and what differs from the plate overlap by {metrics['own_view_overlap']:.2f} (1: all)."
+    verdict += f" Drawn parts and the difference from the background overlap by {metrics['own_view_overlap']:.2f}."
     return Judgement(metrics, verdict, columns, _captions(agreed | {"blurred DSSIM": worst}, order))
 
 
-def _in_space(world: World, predict: Predict, photographs: Tensor, plate: Tensor | None) -> Judgement:
+def _in_space(world: World, predict: Predict, photographs: Tensor, background_image: Tensor | None) -> Judgement:
     code = dict(_read(predict, (photographs * 255).round().byte()))
     if CONFIDENCE in code:  # drawn however unsure: whether it is right is the question
         code[CONFIDENCE] = torch.ones_like(code[CONFIDENCE])
-    agreed, images = _agreement(world, code, photographs, plate)
-    measure = "explained" if plate is None else "overlap"
+    agreed, images = _agreement(world, code, photographs, background_image)
+    measure = "explained" if background_image is None else "overlap"
     order = agreed[measure].argsort()
     metrics = _means(agreed)
     metrics["own_view_agreeing"] = float((agreed[measure] >= _AGREES[measure]).double().mean())
-    num_empty = 0 if plate is None else int((~differing(photographs, plate).any(dim=2).any(dim=1)).sum())
-    verdict = _verdict_in_space(metrics["own_view_agreeing"], len(photographs), plate is not None, num_empty)
+    num_empty = (
+        0 if background_image is None else int((~differing(photographs, background_image).any(dim=2).any(dim=1)).sum())
+    )
+    verdict = _verdict_in_space(metrics["own_view_agreeing"], len(photographs), background_image is not None, num_empty)
     columns = {"photograph": photographs[order], "what was found": images[order]}
     return Judgement(metrics, verdict, columns, _captions(agreed, order))
 
 
 def _agreement(
-    world: World, code: SceneCode, photographs: Tensor, plate: Tensor | None
+    world: World, code: SceneCode, photographs: Tensor, background_image: Tensor | None
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Numbers of each photograph by name, and what was found drawn over the plate, or else over the photographs."""
-    found: dict[str, list[Tensor]] = {"inside": [], "explained" if plate is None else "overlap": []}
+    """Numbers of each photograph by name, and what was found, drawn over the background image or the photographs."""
+    found: dict[str, list[Tensor]] = {"inside": [], "explained" if background_image is None else "overlap": []}
     images = []
     for start in range(0, len(photographs), _DRAWN_AT_ONCE):
         some = slice(start, start + _DRAWN_AT_ONCE)
         seen, drawing = photographs[some], draw(world, {name: values[some] for name, values in code.items()})
-        behind = seen if plate is None else plate.expand_as(seen)
+        behind = seen if background_image is None else background_image.expand_as(seen)
         found["inside"].append(inside(seen, drawing, behind))
-        if plate is None:
-            found["explained"].append(explained(seen, drawing))
+        if background_image is None:
+            found["explained"].append(inlier_ratio(seen, drawing))
         else:
-            found["overlap"].append(overlap(drawing.silhouette, differing(seen, plate)))
+            found["overlap"].append(overlap(drawing.silhouette, differing(seen, background_image)))
         images.append(drawing.over(behind))
     return {name: torch.cat(values) for name, values in found.items()}, torch.cat(images)
 
@@ -149,27 +158,27 @@ def _read(predict: Predict, photographs: Tensor) -> SceneCode:
     return {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
 
 
-def _drawn(world: World, view: int, code: SceneCode) -> Tensor:
+def _drawn(world: TabletopWorld, view: int, code: SceneCode) -> Tensor:
     """The scenes as the own (0) or the second camera sees them."""
     return (world.novel_view(code) if view else world.render(code)).clamp(0, 1)
 
 
-def _errors(view: View, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Of re-renderings, and of the plate in place of them."""
-    photographs, plate = view.photographs.float() / 255, view.plate.float() / 255
+def _errors(view: PhotographSet, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Of re-renderings, and of the background image in place of them."""
+    photographs, background_image = view.photographs.float() / 255, view.background_image.float() / 255
     of_both = []
-    for shown in (images, plate.expand_as(photographs)):
+    for shown in (images, background_image.expand_as(photographs)):
         soft = dssim(blurred(shown), blurred(photographs))
         of_both.append({"dssim": dssim(shown, photographs), "dssim_blurred": soft})
     return of_both[0], of_both[1]
 
 
-def _verdict(share: float, num: int, second: bool) -> str:
+def _verdict(fraction: float, num: int, second: bool) -> str:
     where = "from the second camera" if second else "from the own camera, which cannot tell depth,"
-    found = f"in {share:.0%} of {num} scenes what was found, seen {where} is nearer to the photograph than the plate is"
-    if share >= _TRUSTED:
+    found = f"in {fraction:.0%} of {num} scenes what was found, seen {where} is nearer to the photograph than no part"
+    if fraction >= _TRUSTED:
         return f"Trust it: {found}."
-    if share >= _DOUBTFUL:
+    if fraction >= _DOUBTFUL:
         return f"Trust it with care: {found}; look at the worst scenes, and train longer (--images) or --method sleep."
     return (
         f"Do not trust it: {found}. Train longer (--images) or with --method sleep; if that does not help, look "
@@ -178,20 +187,22 @@ def _verdict(share: float, num: int, second: bool) -> str:
     )
 
 
-def _verdict_in_space(share: float, num: int, has_plate: bool, num_empty: int) -> str:
-    measure = "covers what differs from the plate" if has_plate else "explains what stands out there"
-    found = f"in {share:.0%} of {num} photographs what was found {measure}"
+def _verdict_in_space(fraction: float, num: int, has_background_image: bool, num_empty: int) -> str:
+    measure = (
+        "covers what differs from the background image" if has_background_image else "explains what stands out there"
+    )
+    found = f"in {fraction:.0%} of {num} photographs what was found {measure}"
     limits = "a tenth of a diameter cannot be told from a fifth"
-    if not has_plate:
+    if not has_background_image:
         limits += "; --background tells right from wrong better"
     advice = "train longer (--images), or tell the network more (--upright, narrower --near-m and --far-m)"
-    if share >= _TRUSTED:
+    if fraction >= _TRUSTED:
         text = f"Trust it: {found}; {limits}."
-    elif share >= _DOUBTFUL:
+    elif fraction >= _DOUBTFUL:
         text = f"Trust it with care: {found}; look at the worst ones, and {advice}; {limits}."
     else:
         text = (
             f"Do not trust it: {found}. {advice.capitalize()}; if that does not help, look whether --mesh-unit, the "
             "camera file and --background fit (curio-doctor)."
         )
-    return text + (f" {num_empty} of them show nothing but the plate: leave those out." if num_empty else "")
+    return text + (f" {num_empty} of them show nothing but the background image: leave those out." if num_empty else "")

@@ -1,7 +1,7 @@
 """Score pose estimates on the real frames of a BOP data set: whole frames in, nothing but RGB and K.
 
-Frames are looked at as serving looks at them: averaged down, then warped to the canonical camera by K* R K⁻¹, where R
-turns the ray through the frame's centre to the one through the canonical centre. Labels are used for scoring alone.
+Serving's own code warps the frames to the canonical camera (:mod:`curio_serve.imaging.view`), so that scores are those
+of the poses that are served. Labels are used for scoring alone.
 """
 
 import time
@@ -10,18 +10,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
+from curio_serve.errors import CameraError
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.view import CanonicalCamera, PinholeCrop, PinholeFrame
 
-from curio_train.camera import scale_matrix
 from curio_train.data.bop import Annotation, BopDataset, Frame, ModelInfo
 from curio_train.data.bop_split import SPLIT, scored_frames
 from curio_train.data.photographs import read_photograph
 from curio_train.errors import DataError, UsageError
 from curio_train.evaluation.scores import add_errors, pose_scores, rotation_errors_deg
 from curio_train.evaluation.subject import Subject
-from curio_train.geometry import Pose, rotation_between
+from curio_train.geometry import Pose
 from curio_train.metrics.poses import (
     ADD_THRESHOLD,
     bootstrap_interval,
@@ -45,19 +46,16 @@ _MSPD_THRESHOLDS = [5.0 * step for step in range(1, 11)]  # pixels in an image 6
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What was found in a frame.
-
-    Attributes:
-        frame: The frame.
-        pose: cam_from_obj, metres.
-        confidence: 1 where the model has none.
-        seconds: Spent on the frame, reading included; mean of those read together.
-    """
+    """What was found in a frame."""
 
     frame: Frame
+    """The frame."""
     pose: Pose
+    """Cam_from_obj, metres."""
     confidence: float
+    """1 where the model has none."""
     seconds: float
+    """Spent on the frame, reading included; mean of those read together."""
 
 
 Pairs = Sequence[tuple[Estimate, Annotation]]
@@ -126,49 +124,30 @@ def estimate_frames(subject: Subject, dataset: BopDataset, targets: Sequence[Ann
 
 def _estimates(subject: Subject, frames: Sequence[Frame]) -> Iterator[Estimate]:
     start = time.perf_counter()
-    stages = [look(read_photograph(frame.path), frame.matrix, subject.world.camera) for frame in frames]
-    images = torch.from_numpy(np.stack([image for image, _ in stages])).permute(0, 3, 1, 2).contiguous()
+    crops = [_whole_frame(frame, subject.world.camera) for frame in frames]
+    images = torch.from_numpy(np.stack([crop.image for crop in crops])).permute(0, 3, 1, 2).contiguous()
     code = subject.predict(images)
     seconds = (time.perf_counter() - start) / len(frames)
-    for number, (frame, (_, canonical_from_cam), seen) in enumerate(zip(frames, stages, poses(code), strict=True)):
-        back = canonical_from_cam.T
+    for number, (frame, crop, seen) in enumerate(zip(frames, crops, poses(code), strict=True)):
+        cam_from_canonical = Pose(crop.canonical_from_cam.T, np.zeros(3))
         confidence = float(code[CONFIDENCE][number, 0]) if CONFIDENCE in code else 1.0
-        yield Estimate(frame, Pose(back @ seen.rotation, back @ seen.translation_m), confidence, seconds)
+        yield Estimate(frame, cam_from_canonical @ seen, confidence, seconds)
 
 
-def look(pixels: np.ndarray, matrix: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """A whole frame as the canonical camera sees it.
-
-    Args:
-        pixels: uint8 RGB [height, width, 3].
-        matrix: K of the frame.
-        camera: The canonical one.
-
-    Returns:
-        The image, uint8 [canonical height, canonical width, 3], and the rotation canonical_from_cam [3, 3].
+def _whole_frame(frame: Frame, camera: Camera) -> PinholeCrop:
+    """A frame as the canonical camera sees it.
 
     Raises:
-        UsageError: The canonical camera is none.
+        UsageError: The world has no camera.
+        DataError: The frame cannot be read, or K cannot be its camera's.
     """
     if camera.matrix is None:
-        raise UsageError("--data: this world is flat and has no camera to look at real frames through")
-    height, width = pixels.shape[:2]
-    scales = [camera.matrix[i, i] / matrix[i, i] for i in (0, 1)]
-    size = (min(width, round(width * scales[0])), min(height, round(height * scales[1])))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA) if size != (width, height) else pixels
-    small_matrix = scale_matrix(matrix, (width, height), size)
-    rotation = rotation_between(
-        _central_ray(matrix, width, height), _central_ray(camera.matrix, camera.width, camera.height)
-    )
-    turn = rotation.numpy()
-    view_to_small = small_matrix @ turn.T @ np.linalg.inv(camera.matrix)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    target = (camera.width, camera.height)
-    return cv2.warpPerspective(small, view_to_small, target, flags=flags, borderMode=cv2.BORDER_REPLICATE), turn
-
-
-def _central_ray(matrix: np.ndarray, width: int, height: int) -> torch.Tensor:
-    return torch.from_numpy(np.linalg.solve(matrix, [(width - 1) / 2, (height - 1) / 2, 1.0]))
+        raise UsageError("--data: this world is flat; expected one with a camera, to warp real frames to")
+    canonical = CanonicalCamera(camera.width, camera.height, camera.matrix)
+    try:
+        return PinholeFrame(read_photograph(frame.path), PinholeCamera(frame.matrix), canonical).crop()
+    except CameraError as exc:
+        raise DataError(f"{frame.path}: {exc}") from exc
 
 
 def _metrics(pairs: Pairs, points: np.ndarray, info: ModelInfo) -> dict[str, float]:
@@ -187,7 +166,7 @@ def _metrics(pairs: Pairs, points: np.ndarray, info: ModelInfo) -> dict[str, flo
 
 
 def _recall(name: str, pairs: Pairs, points: np.ndarray, info: ModelInfo) -> dict[str, float]:
-    """Share of poses found, with its interval under the same name."""
+    """Fraction of poses found, with its interval under the same name."""
     errors = add_errors([e.pose for e, _ in pairs], [target.pose for _, target in pairs], points, info)
     low, high = bootstrap_interval([float(error < ADD_THRESHOLD) for error in errors])
     return {name: recall(errors, ADD_THRESHOLD), f"{name}_low": low, f"{name}_high": high}

@@ -24,7 +24,7 @@ from curio_train.learning.runs.configuration import world_name
 from curio_train.learning.runs.progress import read_history
 from curio_train.learning.runs.provenance import RunSession, run_sessions
 from curio_train.metrics.images import dssim
-from curio_train.worlds.base import Split
+from curio_train.worlds.base import Split, novel_view
 
 REPORT_FILE = "report.html"
 _NUM_SAMPLES = 6
@@ -92,7 +92,7 @@ def _page(
     batch = source.batch(0, _NUM_SAMPLES if errors else _NUM_COMPARED)
     code = subject.predict((batch.images.clamp(0, 1) * 255).round().byte())
     rendered = world.render(code, batch.backgrounds).clamp(0, 1)
-    columns = (batch.images, rendered, world.novel_view(code).clamp(0, 1))
+    columns = (batch.images, rendered, novel_view(world, code).clamp(0, 1))
     shown = errors or {"image_dssim": dssim(rendered, batch.images)}
     made, judgement = run_sessions(run), judge(world, subject.predict)
     pages = Environment(loader=PackageLoader("curio_train.evaluation", ""), autoescape=True)
@@ -127,7 +127,7 @@ def _facts(subject: Subject, made: list[RunSession]) -> dict[str, str]:
         "images seen": f"{subject.images_seen:,}",
         "training time": f"{minutes:.1f} minutes, {rate:.0f} images/s",
         "started": made[0].started,
-        "last sitting": made[-1].started,
+        "last session": made[-1].started,
         "machine": made[-1].machine,
         "system": f"{platform.system()} {platform.release()}, Python {platform.python_version()}",
         "libraries": ", ".join(f"{name} {number}" for name, number in versions.items()),

@@ -20,7 +20,7 @@ from curio_train.evaluation.subject import load_subject
 from curio_train.refinement.multi_view import estimate_scale
 from curio_train.refinement.pseudo_labels import predict_and_refine
 from curio_train.refinement.render_and_compare import RenderAndCompare
-from curio_train.worlds.single_object.linemod import TwoStageLinemod
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 MOST_PHOTOGRAPHS = 100
 """More tell little more: what one object errs by is the same in all."""
@@ -35,7 +35,7 @@ def scale_by_objects(
 
     Args:
         structure: Of any scale.
-        models: Folder with a run or a model for each object, LineMOD's at two looks.
+        models: Folder with a run or a model for each object, LineMOD's in two stages.
         data: Data folder of exported models.
         tell: Called with a line after each object, which takes about a minute.
 
@@ -47,34 +47,34 @@ def scale_by_objects(
         ExportError: A model is broken.
         DataError: A photograph or the data cannot be read, or no object tells a scale.
     """
-    told = {}
+    scales = {}
     for candidate in candidates(models, "--objects", of_any_method=False):
-        scale = _told_by(candidate.path, data, structure)
+        scale = _scale_by(candidate.path, data, structure)
         tell(f"{candidate.name}: {'seen too seldom to tell' if scale is None else f'{scale:.4g} m a unit'}")
         if scale is not None:
-            told[candidate.name] = scale
-    if not told:
+            scales[candidate.name] = scale
+    if not scales:
         raise DataError(
             f"--objects {models}: none of the objects was read alike in enough photographs to tell how large the scene "
             "is; give networks of objects that it shows, or --distance-m"
         )
-    scale, line = mean_scale(told)
+    scale, line = mean_scale(scales)
     return scaled(structure, scale), line
 
 
-def mean_scale(told: Mapping[str, float]) -> tuple[float, str]:
+def mean_scale(scales: Mapping[str, float]) -> tuple[float, str]:
     """The geometric mean of what objects tell, and how far they are from it."""
-    logs = np.log(list(told.values()))
-    each = ", ".join(f"{name} {100 * off:+.1f} %" for name, off in zip(told, logs - logs.mean(), strict=True))
+    logs = np.log(list(scales.values()))
+    each = ", ".join(f"{name} {100 * off:+.1f} %" for name, off in zip(scales, logs - logs.mean(), strict=True))
     error = "" if len(logs) < 2 else f"; the mean is good to {100 * logs.std(ddof=1) / len(logs) ** 0.5:.1f} %"
     return float(np.exp(logs.mean())), f"scale by each object beside their mean: {each}{error}"
 
 
-def _told_by(path: Path, data: Path | None, structure: Structure) -> float | None:
+def _scale_by(path: Path, data: Path | None, structure: Structure) -> float | None:
     subject = load_subject(path, data)
     world = subject.world
-    if not isinstance(world, TwoStageLinemod):
-        raise UsageError(f"{path}: a network of one look (--no-gaze), expected one of two")
+    if not isinstance(world, TwoStageWorld):
+        raise UsageError(f"{path}: the paper's network (--one-stage), expected a two-stage detector")
     camera = world.object.camera
     if np.abs(camera.matrix - structure.camera.matrix).max() > _SAME_CAMERA * camera.matrix[0, 0]:
         raise UsageError(
@@ -84,8 +84,6 @@ def _told_by(path: Path, data: Path | None, structure: Structure) -> float | Non
     chosen = spread(structure.photographs, MOST_PHOTOGRAPHS)
     matrices = structure.cam_from_world[[structure.photographs.index(photograph) for photograph in chosen]]
     frames = torch.from_numpy(read_frames(chosen, camera, world.camera.width, world.camera.height))
-    refine = RenderAndCompare(world)
-    _, refined, taken = predict_and_refine(
-        refine, frames, lambda images: subject.predict((images * 255).round().byte())
-    )
-    return estimate_scale(CameraPoses(matrices), refined, taken, refine.diameter_m)
+    refiner = RenderAndCompare(world)
+    found = predict_and_refine(refiner, frames, lambda images: subject.predict((images * 255).round().byte()))
+    return estimate_scale(CameraPoses(matrices), found.refined, found.accepted, refiner.diameter_m)

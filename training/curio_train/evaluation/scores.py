@@ -13,7 +13,7 @@ from curio_train.metrics.assignment import each_parameter_error, scene_error
 from curio_train.metrics.images import dssim
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, recall, symmetry_poses
 from curio_train.scene_code import TRANSLATION, SceneCode, index
-from curio_train.worlds.base import World
+from curio_train.worlds.base import World, novel_view
 
 _MM = 1000.0
 _BATCH_SIZE = 50
@@ -59,11 +59,11 @@ def novel_view_dssim(world: World, predicted: SceneCode, true: SceneCode) -> Flo
     """The paper's image error: both scenes seen from a view that the network has not, compared by DSSIM."""
     starts = range(0, len(true[TRANSLATION]), _BATCH_SIZE)
     batches = [[index(code, slice(start, start + _BATCH_SIZE)) for code in (predicted, true)] for start in starts]
-    return torch.cat([dssim(*(world.novel_view(code).clamp(0, 1) for code in pair)) for pair in batches])
+    return torch.cat([dssim(*(novel_view(world, code).clamp(0, 1) for code in pair)) for pair in batches])
 
 
 def add_errors(estimates: Sequence[Pose], truths: Sequence[Pose], points: np.ndarray, info: ModelInfo) -> list[float]:
-    """ADD, or ADD-S of symmetric objects, as shares of the diameter."""
+    """ADD, or ADD-S of symmetric objects, as fractions of the diameter."""
     pairs = zip(estimates, truths, strict=True)
     return [add_or_add_s_m(estimate, truth, points, info) / info.diameter_m for estimate, truth in pairs]
 
@@ -78,7 +78,7 @@ def rotation_errors_deg(estimates: Sequence[Pose], truths: Sequence[Pose], info:
 def pose_scores(
     estimates: Sequence[Pose], truths: Sequence[Pose], points: np.ndarray, info: ModelInfo
 ) -> dict[str, float]:
-    """Share of poses found, with rotation and position errors beside.
+    """Fraction of poses found, with rotation and position errors beside.
 
     Of symmetric objects the rotation error is to the closest of the poses that look alike.
 

@@ -25,21 +25,18 @@ _SUPERVISION = {
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a version comes from.
-
-    Attributes:
-        run: The run folder.
-        config: What was learned and how.
-        sitting: The first sitting of training.
-        course: How far it came.
-        weights: How they are stored, and what that costs.
-    """
+    """Where a version comes from."""
 
     run: Path
+    """The run folder."""
     config: RunConfig
-    sitting: RunSession
-    course: TrainingProgress
+    """What was learned and how."""
+    session: RunSession
+    """The first session of training."""
+    progress: TrainingProgress
+    """How far it came."""
     weights: str
+    """How they are stored, and what that costs."""
 
 
 def card(
@@ -54,7 +51,7 @@ def card(
         objects: Of the world, for their attribution.
         made: Where it comes from.
     """
-    evaluation = read_evaluation(made.run, made.course.all_images)
+    evaluation = read_evaluation(made.run, made.progress.all_images)
     parts = [
         f"## Version {version}\n",
         _table(("", ""), _origin(version, spec, made)),
@@ -78,18 +75,18 @@ def read_evaluation(run: Path, images: int) -> dict[str, Any] | None:
 
 def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[str, str]]:
     terms = METHODS[made.config.method]
-    supervision = [text for term, text in _SUPERVISION.items() if term in terms] or ["none: images alone"]
+    supervision = [text for term, text in _SUPERVISION.items() if getattr(terms, term)] or ["none: images alone"]
     yield "world", spec.world
     yield "method", f"{made.config.method}, preset {made.config.preset}, seed {made.config.seed}"
     yield "supervision", "; ".join(supervision)
-    yield "training", f"`{portable(made.sitting.command)}`"
-    yield "commit", made.sitting.commit or "not from a git checkout"
-    before, course = made.config.init, made.course
-    since = f", {course.images:,} of them since it was {before.name}" if before else ""
-    yield "images seen", f"{course.all_images:,}{since}"
-    since = f", {course.seconds / 60:.1f} of them since it was {before.name}" if before else ""
-    yield "training time", f"{course.all_seconds / 60:.1f} minutes{since}"
-    yield "machine", made.sitting.machine
+    yield "training", f"`{portable(made.session.command)}`"
+    yield "commit", made.session.commit or "not from a git checkout"
+    before, progress = made.config.init, made.progress
+    since = f", {progress.images:,} of them since it was {before.name}" if before else ""
+    yield "images seen", f"{progress.all_images:,}{since}"
+    since = f", {progress.seconds / 60:.1f} of them since it was {before.name}" if before else ""
+    yield "training time", f"{progress.all_seconds / 60:.1f} minutes{since}"
+    yield "machine", made.session.machine
     yield "input", f"`image`, uint8 RGB [batch, {spec.camera.height}, {spec.camera.width}, 3]"
     yield "weights", made.weights
     yield "to train it further", f"`curio-train {spec.world} --init models/{spec.name}/{version}`, other flags as above"

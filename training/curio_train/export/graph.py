@@ -13,14 +13,17 @@ import torch
 import torch.nn.functional as F
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec, ObjectModel, Symmetry
 from curio_proto.v1.model_spec_pb2 import Field as FieldSpec
+from curio_serve.models.model_folder import GOLDEN_FILE, MODEL_FILE
+from curio_serve.models.spec import SCHEMA_VERSION
 from jaxtyping import Bool
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from curio_train.errors import ExportError
 from curio_train.export.card import Provenance, card
-from curio_train.export.folder import GOLDEN_FILE, MODEL_FILE, WEIGHTS_FILE, ModelFolder, triton_config
-from curio_train.export.onnx import SCHEMA_VERSION, OnnxModel, put_spec, store_half, to_onnx
+from curio_train.export.folder import ModelFolder, triton_config
+from curio_train.export.onnx import put_spec, store_half, to_onnx
+from curio_train.exported_model import WEIGHTS_FILE, ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
 from curio_train.learning.runs.initial import weights_file
@@ -37,24 +40,21 @@ _CHECK_SEED = (20_210,)
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
 _NUM_JITTERED = 16  # a tie is missed once in 2 to the power of this
-_LEAST_SETTLED = 0.25  # of the check images
+_LEAST_STABLE = 0.25  # of the check images
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What became of an export.
-
-    Attributes:
-        path: The version's folder.
-        parity_error: Largest absolute difference between the network, its weights rounded as stored, and onnxruntime.
-        rounding_error: Largest absolute difference between that network and the one that was trained; 0 in float32.
-        num_bytes: Of model.onnx.
-    """
+    """What became of an export."""
 
     path: Path
+    """The version's folder."""
     parity_error: float
+    """Largest absolute difference between the network, its weights rounded as stored, and onnxruntime."""
     rounding_error: float
+    """Largest absolute difference between that network and the one that was trained; 0 in float32."""
     num_bytes: int
+    """Of model.onnx."""
 
 
 class Graph(nn.Module):
@@ -75,7 +75,7 @@ class Graph(nn.Module):
 
     def read(self, pixels: Tensor) -> dict[str, Tensor]:
         """Of pixels [batch, 3, height, width] in [0, 1]."""
-        return self._world.exported(self.network(pixels))
+        return self._world.outputs.from_code(self.network(pixels))
 
 
 def export(run: Path, out: Path, name: str | None = None, *, half: bool = False) -> Exported:
@@ -115,18 +115,18 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     first = run_sessions(run)[0]
     spec.commit, spec.images_seen, spec.training_seconds = (
         first.commit,
-        state.course.all_images,
-        state.course.all_seconds,
+        state.progress.all_images,
+        state.progress.all_seconds,
     )
     put_spec(model, spec)
 
-    found = OnnxModel(model.SerializeToString(), "the exported graph")(images.numpy())
-    known = settled(deployed if half else trained, images)
+    found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
+    known = numerically_stable(deployed if half else trained, images)
     answers, found = ({name: v[known] for name, v in of.items()} for of in (expected if half else learned, found))
     spec.parity_max_abs_error = refuse_disparity(answers, found)
     put_spec(model, spec)
     version = target.next_version()
-    made = Provenance(run, folder.config, first, state.course, _weights(half, rounding_error))
+    made = Provenance(run, folder.config, first, state.progress, _weights(half, rounding_error))
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),
@@ -176,8 +176,9 @@ def _fold(layers: nn.Sequential) -> None:
 def check_images(world: World) -> Tensor:
     """Images that torch and onnxruntime have to agree on, uint8 [batch, height, width, 3]: over black, then over noise.
 
-    The noise is smooth and never without objects: a gaze that moves by the last digit sees something else between white
-    pixels, and where nothing is to be found the last digit decides between places that are equally unlikely.
+    The noise is smooth and never without objects: a two-stage network that moves by the last digit sees something else
+    between white pixels, and where nothing is to be found the last digit decides between places that are equally
+    unlikely.
     """
     code = world.sample(_NUM_CHECK_IMAGES, _CHECK_SEED)
     size = (world.camera.height, world.camera.width)
@@ -188,7 +189,7 @@ def check_images(world: World) -> Tensor:
 
 
 @torch.no_grad()
-def settled(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
+def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
     """Which images can tell whether a runtime computes the same: their last digits do not move the answer.
 
     Where the answer is a choice among equals (the likeliest cell, say, of a network that has learned next to nothing),
@@ -205,12 +206,12 @@ def settled(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
     answers, generator = graph.outputs(images), torch.Generator().manual_seed(*_CHECK_SEED)
     pixels = images.permute(0, 3, 1, 2).float() / 255
     known = torch.ones(len(images), dtype=torch.bool)
-    with _unsteady(graph.network, generator):
+    with _jittered_layers(graph.network, generator):
         for _ in range(_NUM_JITTERED):
             jittered = graph.read(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
             for name, values in answers.items():
                 known &= (values - jittered[name]).abs().flatten(1).amax(dim=1) <= LARGEST_PARITY_ERROR
-    if known.float().mean() < _LEAST_SETTLED:
+    if known.float().mean() < _LEAST_STABLE:
         raise ExportError(
             f"the network's answers to {int((~known).sum())} of {len(images)} check images change with their last "
             "digits or are not finite; nothing was written. Has the training diverged, or hardly begun?"
@@ -219,7 +220,7 @@ def settled(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
 
 
 @contextmanager
-def _unsteady(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
+def _jittered_layers(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
     """Within this, every layer is off by about as much as rounding in some other order can make it."""
 
     def off(_layer: nn.Module, _given: object, said: Tensor) -> Tensor:
@@ -270,7 +271,7 @@ def model_spec(world: World, name: str) -> ModelSpec:
         name=name,
         world=world.name,
         num_slots=world.layout.num_slots,
-        fields=[_field_spec(field) for field in world.exported_fields],
+        fields=[_field_spec(field) for field in world.outputs.fields],
         objects=[_object_model(kind) for kind in world.objects],
         camera=CanonicalCamera(
             width=camera.width, height=camera.height, camera_matrix=matrix, is_default=camera.is_default

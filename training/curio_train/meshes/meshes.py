@@ -29,24 +29,21 @@ _TRIMESH_DEFAULT_COLOR = (102, 102, 102)
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles with colours, in the object frame (the file's), metres.
-
-    Attributes:
-        vertices_m: [num_vertices, 3] float64, all of them used by a face.
-        faces: [num_faces, 3] int64.
-        vertex_colors_srgb: [num_vertices, 3] in [0, 1], or None: no colour is known, or ``texture`` has it.
-        uv: [num_vertices, 2] with v upwards from the texture's lower edge, or None. A vertex on a seam occurs once a
-            side, so vertices of equal position are common in textured meshes.
-        texture: [height, width, 3] uint8 sRGB, or None.
-        sha256: Of the file's bytes; of the arrays' bytes for a generated shape.
-    """
+    """Triangles with colours, in the object frame (the file's), metres."""
 
     vertices_m: np.ndarray
+    """[num_vertices, 3] float64, all of them used by a face."""
     faces: np.ndarray
+    """[num_faces, 3] int64."""
     vertex_colors_srgb: np.ndarray | None = None
+    """[num_vertices, 3] in [0, 1], or None: no colour is known, or ``texture`` has it."""
     uv: np.ndarray | None = None
+    """[num_vertices, 2] with v upwards from the texture's lower edge, or None. A vertex on a seam occurs once a side,
+    so vertices of equal position are common in textured meshes."""
     texture: np.ndarray | None = None
+    """[height, width, 3] uint8 sRGB, or None."""
     sha256: str = field(default="")
+    """Of the file's bytes; of the arrays' bytes for a generated shape."""
 
     def __post_init__(self) -> None:
         """Name generated shapes after their content."""

@@ -78,7 +78,7 @@ def painted(mesh: Mesh, darkest: float) -> Mesh:
     Capsules and cones look alike from all sides; paint makes their yaw something that can be seen.
     """
     z = mesh.vertices_m[:, 2]
-    share = (z - z.min()) / (z.max() - z.min())
-    grey = np.repeat((darkest + share * (1 - darkest))[:, None], 3, axis=1)
+    fraction = (z - z.min()) / (z.max() - z.min())
+    grey = np.repeat((darkest + fraction * (1 - darkest))[:, None], 3, axis=1)
     content = (mesh.sha256 + grey.astype("<f8").tobytes().hex()).encode()
     return replace(mesh, vertex_colors_srgb=grey, sha256=hashlib.sha256(content).hexdigest())

@@ -18,11 +18,11 @@ _WORTH_IT = 2
 _SAMPLES_A_FACE = 4  # of the simpler mesh: on large faces, points lie closer together than its vertices
 _NUM_NEAREST = 8
 _TORN = 1 / 6
-"""Share of a face's texture coordinates' spread by which their mean misses the face's centre at a seam.
+"""Fraction of a face's texture coordinates' spread by which their mean misses the face's centre at a seam.
 
 There the mean lies a third of the seam's jump away from either side; elsewhere both agree.
 """
-_NUM_CHECKED, _LOST_SHARE = 4096, 0.01
+_NUM_CHECKED, _LOST_FRACTION = 4096, 0.01
 
 
 def simplified(mesh: Mesh, max_faces: int) -> Mesh:
@@ -52,11 +52,11 @@ def simplified(mesh: Mesh, max_faces: int) -> Mesh:
 
 
 def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices in different places, and the faces that keep three of them."""
-    places, merged = np.unique(np.round(vertices, 5), axis=0, return_inverse=True)
+    """Vertices in different positions, and the faces that keep three of them."""
+    positions, merged = np.unique(np.round(vertices, 5), axis=0, return_inverse=True)
     faces = merged.reshape(-1)[faces]
     solid = (faces != np.roll(faces, 1, axis=1)).all(1)
-    return places, faces[solid]
+    return positions, faces[solid]
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def _even(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
 def _loses_parts(mesh: Mesh, simpler: Mesh, tolerance_m: float) -> bool:
     points_m, _ = _even(mesh, _NUM_CHECKED)
     surface = _Surface(simpler, _SAMPLES_A_FACE * len(simpler.faces))
-    return bool((surface.nearest(points_m).distance_m > tolerance_m).mean() > _LOST_SHARE)
+    return bool((surface.nearest(points_m).distance_m > tolerance_m).mean() > _LOST_FRACTION)
 
 
 def _dressed(simpler: Mesh, mesh: Mesh) -> Mesh:

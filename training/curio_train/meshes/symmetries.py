@@ -1,9 +1,10 @@
 """Rotations that carry a shape onto itself, found from the mesh and written as BOP's ``models_info.json`` has them.
 
-A rotation counts when, of points spread evenly over the turned surface, 95 % lie within :data:`TOLERANCE` of the
-surface and all within :data:`LARGEST_MISS`, both as shares of the diameter, after the turn was fitted. BOP's annotation
-of scanned objects allows such deviations, too: the two symmetric objects of LM-O miss by 1.7 % and 4.9 %, the closest
-of the others by 4.4 % and 11 %. Only geometry is looked at: paint may tell sides apart that this calls the same.
+A rotation counts as a symmetry when, of points spread evenly over the rotated surface, 95 % lie within
+:data:`TOLERANCE` of the surface and all within :data:`LARGEST_MISS`; both are fractions of the diameter, and the
+rotation is fitted first. BOP's annotation of scanned objects allows such deviations, too: the two symmetric objects of
+LM-O deviate by 1.7 % and 4.9 %, the closest of the others by 4.4 % and 11 %. Only geometry is compared: paint may tell
+sides apart that this module calls the same.
 """
 
 from collections.abc import Iterator
@@ -28,20 +29,17 @@ _FIT_STEPS = 25
 _NUM_DIRECTIONS = 700  # of a half sphere: one every 5°
 _SAME_DEG = 12.0  # turns of different symmetries are at least 30° apart, their axes 15°
 _DRIFT_DEG = 5.0  # of the angle, while the axis is fitted
-_PROBE_TURNS_DEG = (19.0, 47.0, 73.0, 101.0, 137.0, 163.0)  # multiples of no 360°/n up to the largest order
+_PROBE_ANGLES_DEG = (19.0, 47.0, 73.0, 101.0, 137.0, 163.0)  # multiples of no 360°/n up to the largest order
 
 
 @dataclass(frozen=True)
 class Symmetries:
-    """What leaves the shape as it is, beside doing nothing.
-
-    Attributes:
-        discrete: Each [4, 4], object frame, metres.
-        continuous: Each (unit axis [3], point on it in metres [3]); any turn about it counts.
-    """
+    """What leaves the shape as it is, beside doing nothing."""
 
     discrete: tuple[np.ndarray, ...]
+    """Each [4, 4], object frame, metres."""
     continuous: tuple[tuple[np.ndarray, np.ndarray], ...]
+    """Each (unit axis [3], point on it in metres [3]); any turn about it counts."""
 
     def as_bop(self) -> dict[str, list[object]]:
         """Fields ``symmetries_discrete`` and ``symmetries_continuous`` of BOP, in mm; none that would be empty."""
@@ -71,12 +69,12 @@ def find_symmetries(mesh: Mesh) -> Symmetries:
     continuous: list[np.ndarray] = []
     discrete: list[np.ndarray] = []
     for axis in surface.candidate_axes():
-        if (fitted := surface.axis_of_any_turn(axis)) is not None:
+        if (fitted := surface.continuous_axis(axis)) is not None:
             continuous += [fitted] * (not any(_same_line(fitted, known, _SAME_DEG) for known in continuous))
             if len(continuous) == 2:
                 return Symmetries((), tuple((axis, surface.centre) for axis in continuous))
         elif not (continuous and discrete):
-            discrete += [turn for turn in surface.turns_about(axis) if not _is_known(turn, discrete)]
+            discrete += [turn for turn in surface.rotations_about(axis) if not _is_known(turn, discrete)]
     if continuous:
         discrete = discrete[:1]
     return Symmetries(tuple(surface.clear_ones(discrete)), tuple((axis, surface.centre) for axis in continuous))
@@ -113,32 +111,32 @@ class _Surface:
             directions = np.cos(angles) * first + np.sin(angles) * second
         else:
             return
-        promise, looked_at = np.array([self._promise(axis) for axis in directions]), unique
-        for axis in directions[np.argsort(promise)][: int((promise < _COARSE * TOLERANCE).sum())]:
+        least_miss, looked_at = np.array([self._least_miss(axis) for axis in directions]), unique
+        for axis in directions[np.argsort(least_miss)][: int((least_miss < _COARSE * TOLERANCE).sum())]:
             if not any(_same_line(axis, other, _SAME_DEG) for other in looked_at):
                 looked_at.append(axis)
                 yield axis
 
-    def _promise(self, axis: np.ndarray) -> float:
+    def _least_miss(self, axis: np.ndarray) -> float:
         """Smallest miss of a turn of prime order about an axis: turns of every other order contain such turns."""
         distances = [self._tree.query(self._few @ _turn(axis, 2 * np.pi / order).T)[0] for order in (2, 3, 5, 7, 11)]
         return float(min(np.percentile(distance, 95) for distance in distances))
 
-    def axis_of_any_turn(self, axis: np.ndarray) -> np.ndarray | None:
+    def continuous_axis(self, axis: np.ndarray) -> np.ndarray | None:
         """The axis, fitted, where any turn about it leaves the surface in place."""
-        fitted = self._fitted(axis, np.radians(_PROBE_TURNS_DEG[0]))
+        fitted = self._fitted(axis, np.radians(_PROBE_ANGLES_DEG[0]))
         if fitted is None:
             return None
-        turns = (_turn(fitted, np.radians(degrees)) for degrees in _PROBE_TURNS_DEG)
+        turns = (_turn(fitted, np.radians(degrees)) for degrees in _PROBE_ANGLES_DEG)
         return fitted if all(self._carried_onto_itself(turn) for turn in turns) else None
 
-    def turns_about(self, axis: np.ndarray) -> list[np.ndarray]:
+    def rotations_about(self, axis: np.ndarray) -> list[np.ndarray]:
         """All turns [4, 4] (metres) about an axis by 360°/n and its multiples, for the largest n that fits.
 
         A slim shape misses itself by little after any turn about its long axis; so a turn must also miss by clearly
         less than those that are no symmetry.
         """
-        other = max(self._misses(_turn(axis, np.radians(degrees)), self._turned)[0] for degrees in _PROBE_TURNS_DEG)
+        other = max(self._misses(_turn(axis, np.radians(degrees)), self._turned)[0] for degrees in _PROBE_ANGLES_DEG)
         for order in range(LARGEST_ORDER, 1, -1):
             fitted = self._fitted(axis, 2 * np.pi / order)
             if fitted is None:

@@ -1,122 +1,141 @@
-"""What render-and-compare compares: a crop of a picture, the background behind the object, and scenes in its camera."""
+"""Crops of frames around pose estimates, for render-and-compare and pseudo-labels."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
+from curio_train.networks.two_stage.network import OVERSAMPLING
 from curio_train.refinement.inpainting import blurred
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 
-_SCALE = 0.09  # difference of sRGB colours at which a pixel pulls hardest
+_RESIDUAL_SCALE = 0.09  # difference of sRGB colours at which the gradient is strongest
 
 
-class Scene(NamedTuple):
-    """What a crop shows, in the camera of that crop.
+def crop_frames(
+    frames: Tensor,
+    matrix: Float[Tensor, "3 3"],
+    position_m: Float[Tensor, "batch 3"],
+    focal_px: Float[Tensor, " batch"],
+    side: int,
+) -> tuple[Float[Tensor, "batch 3 side side"], Float[Tensor, "batch 3 3"]]:
+    """Crops by virtual cameras that look at positions.
 
-    Attributes:
-        rotation: crop_from_obj, [batch, 3, 3].
-        translation_m: [batch, 3].
-        light: [batch, 3].
+    Args:
+        frames: uint8 sRGB [batch, 3, height, width].
+        matrix: K of the frames.
+        position_m: Camera frame; the middles of the crops.
+        focal_px: Of the crops, pixels.
+        side: Of the crops, pixels.
+
+    Returns:
+        Images in [0, 1], and crop_from_cam.
     """
-
-    rotation: Tensor
-    translation_m: Tensor
-    light: Tensor
-
-    def moved(self, moves: "Moves", diameter_m: float) -> "Scene":
-        """The same after moves."""
-        scale = moves.log_depth.exp()
-        across, depth = self.translation_m[:, :2] + moves.across * diameter_m, self.translation_m[:, 2:]
-        place = torch.cat([across * scale, depth * scale], dim=1)
-        return Scene(rotation_from_vector(moves.turn) @ self.rotation, place, self.light + moves.light)
+    matrices, fine_side = matrix.expand(len(position_m), 3, 3), OVERSAMPLING * side
+    camera = crop_camera_at(position_m, OVERSAMPLING * focal_px, fine_side, matrices)
+    grid = sampling_grid(camera, matrices, fine_side, frames.shape[3], frames.shape[2])
+    fine = F.grid_sample(frames.float() / 255, grid, padding_mode="border", align_corners=False)
+    return F.avg_pool2d(fine, OVERSAMPLING), camera.rotation
 
 
 @dataclass(frozen=True, eq=False)
-class Moves:
-    """What changes of a scene.
+class PoseUpdate:
+    """A change of pose and light, the parameters that render-and-compare optimises."""
 
-    Attributes:
-        across: [batch, 2], diameters.
-        log_depth: [batch, 1].
-        turn: [batch, 3], rotation vector, radians.
-        light: [batch, 3].
-    """
-
-    across: Tensor
-    log_depth: Tensor
-    turn: Tensor
-    light: Tensor
+    across: Float[Tensor, "batch 2"]
+    """Translation across the view, diameters."""
+    log_depth: Float[Tensor, "batch 1"]
+    """Logarithm of the factor on the distance."""
+    turn: Float[Tensor, "batch 3"]
+    """Rotation vector, radians."""
+    light: Float[Tensor, "batch 3"]
+    """Change of the light."""
 
     @staticmethod
-    def none(count: int) -> "Moves":
-        return Moves(*(torch.zeros(count, size, requires_grad=True) for size in (2, 1, 3, 3)))
+    def zero(count: int) -> "PoseUpdate":
+        """No change, with gradients."""
+        return PoseUpdate(*(torch.zeros(count, size, requires_grad=True) for size in (2, 1, 3, 3)))
+
+
+class PoseAndLight(NamedTuple):
+    """Pose and light in the frames of the crop cameras."""
+
+    rotation: Float[Tensor, "batch 3 3"]
+    """crop_from_obj."""
+    translation_m: Float[Tensor, "batch 3"]
+    """crop_from_obj."""
+    light: Float[Tensor, "batch 3"]
+    """Towards the light; its length is the strength."""
+
+    def updated(self, update: PoseUpdate, diameter_m: float) -> "PoseAndLight":
+        """After an update."""
+        scale = update.log_depth.exp()
+        across, depth = self.translation_m[:, :2] + update.across * diameter_m, self.translation_m[:, 2:]
+        translation_m = torch.cat([across * scale, depth * scale], dim=1)
+        return PoseAndLight(rotation_from_vector(update.turn) @ self.rotation, translation_m, self.light + update.light)
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """Crops, and how estimates lie in them.
+class Crops:
+    """A batch of crops around estimates, with the object's background inpainted."""
 
-    Attributes:
-        crops: [batch, 3, side, side].
-        behind: The same without the object.
-        region: [batch, 1, side, side], where they are compared: 1 inside and around the silhouette, else 0.
-        crop_from_cam: [batch, 3, 3].
-        matrices: K of each crop.
-        color: Of unpainted objects, [batch, 1, 3].
-        times_blurred: How often crops and backgrounds are.
-    """
+    images: Float[Tensor, "batch 3 side side"]
+    """The crops."""
+    backgrounds: Float[Tensor, "batch 3 side side"]
+    """The same without the object."""
+    mask: Float[Tensor, "batch 1 side side"]
+    """1 inside and around the silhouette, where crops and renderings are compared; else 0."""
+    crop_from_cam: Float[Tensor, "batch 3 3"]
+    """Rotations from the frame's camera to the crops'."""
+    matrices: Float[np.ndarray, "batch 3 3"]
+    """K of each crop."""
+    color: Float[Tensor, "batch 1 3"] | None
+    """Base colour of unpainted objects."""
+    times_blurred: int = 0
+    """How often images and backgrounds have been blurred."""
 
-    crops: Tensor
-    behind: Tensor
-    region: Tensor
-    crop_from_cam: Tensor
-    matrices: np.ndarray
-    color: Tensor | None
-    times_blurred: int
-
-    def scene(self, code: SceneCode) -> Scene:
-        """A code in the camera of the crop."""
+    def from_code(self, code: SceneCode) -> PoseAndLight:
+        """Pose and light of a scene code, from the frame's camera to the crops'."""
         rotation = self.crop_from_cam @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
-        place, light = (self.crop_from_cam @ of_frame[..., None] for of_frame in (code[TRANSLATION][:, 0], code[LIGHT]))
-        return Scene(rotation, place[..., 0], light[..., 0].float())
+        translation_m, light = (
+            (self.crop_from_cam @ vector[..., None])[..., 0] for vector in (code[TRANSLATION][:, 0], code[LIGHT])
+        )
+        return PoseAndLight(rotation, translation_m, light.float())
 
-    def code(self, scene: Scene) -> dict[str, Tensor]:
-        """A scene in the frame's camera."""
-        back = self.crop_from_cam.transpose(1, 2)
+    def to_code(self, estimate: PoseAndLight) -> dict[str, Tensor]:
+        """The entries of the scene code, in the frame's camera."""
+        cam_from_crop = self.crop_from_cam.transpose(1, 2)
         return {
-            TRANSLATION: (back @ scene.translation_m[..., None]).transpose(1, 2),
-            ROTATION_6D: rotation_6d_from_matrix(back @ scene.rotation)[:, None],
-            LIGHT: (back @ scene.light[..., None])[..., 0],
+            TRANSLATION: (cam_from_crop @ estimate.translation_m[..., None]).transpose(1, 2),
+            ROTATION_6D: rotation_6d_from_matrix(cam_from_crop @ estimate.rotation)[:, None],
+            LIGHT: (cam_from_crop @ estimate.light[..., None])[..., 0],
         }
 
-    def over(self, behind: Tensor, region: Tensor) -> "View":
-        """The same before another background."""
-        return View(**(vars(self) | {"behind": behind, "region": region}))
-
-    def blurred(self, times: int) -> "View":
+    def blurred(self, times: int) -> "Crops":
         """The same, blurred."""
-        crops, behind = self.crops, self.behind
+        images, backgrounds = self.images, self.backgrounds
         for _ in range(times):
-            crops, behind = blurred(crops), blurred(behind)
-        return View(**(vars(self) | {"crops": crops, "behind": behind, "times_blurred": times}))
+            images, backgrounds = blurred(images), blurred(backgrounds)
+        return replace(self, images=images, backgrounds=backgrounds, times_blurred=times)
 
-    def missed(self, images: Tensor) -> Float[Tensor, "batch 1 side side"]:
-        """Robust difference between images and crops, 0 to 1 a pixel; 0 outside the region."""
-        squared = ((images - self.crops) / _SCALE).square().sum(1, keepdim=True)
-        return squared / (squared + 1) * self.region
+    def residual(self, renderings: Float[Tensor, "batch 3 side side"]) -> Float[Tensor, "batch 1 side side"]:
+        """Robust photometric residual of each pixel, 0 to 1 (Geman and McClure 1987); 0 outside the mask."""
+        squared = ((renderings - self.images) / _RESIDUAL_SCALE).square().sum(1, keepdim=True)
+        return squared / (squared + 1) * self.mask
 
-    def explained(self, missed: Tensor) -> Float[Tensor, " batch"]:
-        """By how much less is missed than by the background alone, pixels."""
-        return (self.missed(self.behind) - missed).clamp(min=0).sum((1, 2, 3))
+    def mean_residual(self, residual: Float[Tensor, "batch 1 side side"]) -> Float[Tensor, " batch"]:
+        """Mean over the mask."""
+        return residual.sum((1, 2, 3)) / self.mask.sum((1, 2, 3)).clamp(min=1)
 
-    def share(self, missed: Tensor) -> Float[Tensor, " batch"]:
-        """Its mean over the region."""
-        return missed.sum((1, 2, 3)) / self.region.sum((1, 2, 3)).clamp(min=1)
+    def inlier_pixels(self, residual: Float[Tensor, "batch 1 side side"]) -> Float[Tensor, " batch"]:
+        """By how much the residual is smaller than that of the background alone, in pixels."""
+        return (self.residual(self.backgrounds) - residual).clamp(min=0).sum((1, 2, 3))
 
 
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -1,265 +1,280 @@
-"""Poses that photographs of one scene agree on: where it stands still while the camera moves.
+"""Multi-view consensus: poses in a static scene on which photographs by a moving camera agree.
 
-One photograph is read wrongly as often as rightly, but in its own way: a can whose spout points at the camera is taken
-for one that is turned away, and half of all errors lie in depth. Photographs from other sides know better. Where
-structure from motion tells how the camera moved, every reading becomes a pose in the scene, and readings of several
-photographs that agree there are right together (after Labbé et al. 2020, "CosyPose", section 3.2). What they agree on
-is then looked for in all photographs. Objects may be moved between photographs; each place is a pose of its own.
+A single photograph is misinterpreted as often as not, but each in its own way: a can whose spout points at the camera
+is taken for one that is rotated away, and half of all errors are in depth. Given the camera's motion (structure from
+motion), every prediction becomes a pose in the scene, and predictions of several photographs that agree there are right
+together (after Labbé et al. 2020, "CosyPose", section 3.2). Each consensus pose is then verified in all photographs.
+Objects may be moved between photographs; each position has a pose of its own.
 
-Nothing here knows a label: the scale of the scene, which structure from motion leaves open, comes from the readings.
-One object's readings err in depth all to one side, by some per cent, and with them its scale; several objects of one
-scene err each in its own way (decision 68). So the cameras may be given in metres.
+No label is used: the scale of the scene, which structure from motion leaves open, is estimated from the predictions.
+The predictions of one object err in depth all to one side, by some per cent, and so does its scale; several objects of
+one scene err independently (decision 68). Therefore camera poses may also be given in metres.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from curio_train.data.photographs import CameraPoses
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
-from curio_train.refinement.render_and_compare import LEAST_SEEN, RenderAndCompare
-from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode
+from curio_train.refinement.render_and_compare import MIN_INLIER_RATIO, RenderAndCompare
+from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode, index
 
-_FEWEST = 3  # photographs that a pose is agreed on by
-_FEWEST_READINGS = 4  # of a pose; a photograph has up to two, as read and refined
-_GROWTHS = 3  # times that a pose becomes the mean of the readings near it
-_LARGEST_TURN_DEG = 20.0
-_ACROSS, _IN_DEPTH, _MOVED = 0.04, 0.04, 0.03  # standard deviations: diameters, shares of the distance, diameters
-_LARGEST_DISTANCE = 11.3  # squared, in standard deviations: 99 of 100 readings of one position
-_FEWEST_PAIRS = 30  # that a scale is told from
-_LARGEST_GAP, _LEAST_BASELINE = 0.6, 0.5  # diameters: of pairs that tell of the scale
-_SAME_SCALE = 0.05  # logarithms so near vote for each other
-_CREDIBLE, _WEAKER = 0.3, 0.1  # of what a photograph's own reading explains of its silhouette
+_MIN_PHOTOGRAPHS = 3  # in a consensus
+_MIN_PREDICTIONS = 4  # in a consensus; a photograph has up to two, predicted and refined
+_MEAN_STEPS = 3  # times that a pose becomes the mean of the predictions near it
+_MAX_ANGLE_DEG = 20.0
+_ACROSS, _IN_DEPTH = 0.04, 0.04  # standard deviations of positions: diameters across the view, relative in depth
+_MOVED = 0.03  # standard deviation of movements in the scene, diameters
+_MAX_DISTANCE = 11.3  # squared Mahalanobis distance: 99 of 100 predictions of one position
+_MIN_PAIRS = 30  # of predictions, for a scale
+_MAX_GAP, _MIN_BASELINE = 0.6, 0.5  # diameters, of such pairs
+_SAME_SCALE = 0.05  # difference of logarithms within which scales support each other
+_CREDIBLE, _TOLERANCE = 0.3, 0.1  # inlier ratios of a photograph's own prediction
 _CONTRADICTION = 0.25  # diameters across the view
 
 
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """Poses of one object in photographs."""
+
+    predicted: SceneCode
+    """By the network."""
+    refined: SceneCode
+    """The same after render-and-compare."""
+    accepted: Bool[Tensor, " num"]
+    """Where render-and-compare accepted its result."""
+
+
 class _Predictions(NamedTuple):
-    """What was read, one a row.
+    """Some predictions, one a row."""
 
-    Attributes:
-        frame: Number of the photograph.
-        rotation: cam_from_obj, [n, 3, 3].
-        translation_m: cam_from_obj, [n, 3].
-    """
-
-    frame: np.ndarray
-    rotation: np.ndarray
-    translation_m: np.ndarray
+    frame: Int[np.ndarray, " n"]
+    """Number of the photograph."""
+    cam_from_obj: Pose[np.ndarray]
+    """[n, …]."""
 
 
-class _Scene(NamedTuple):
-    """Cameras in a still scene.
+class _StaticScene(NamedTuple):
+    """Cameras in a static scene."""
 
-    Attributes:
-        cam_from_world: Rigid, [num, 4, 4].
-        known: Of which photographs the camera is known, [num].
-        scale: Metres a unit of the scene.
-    """
+    cam_from_world: Pose[np.ndarray]
+    """[num, …], metres."""
+    known: Bool[np.ndarray, " num"]
+    """Photographs whose camera pose is known."""
 
-    cam_from_world: np.ndarray
-    known: np.ndarray
-    scale: float
-
-    def poses_of(self, readings: _Predictions) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations and positions, metres, in the scene's frame."""
-        turn, shift = self.cam_from_world[readings.frame, :3, :3], self.cam_from_world[readings.frame, :3, 3]
-        rotation = np.einsum("nji,njk->nik", turn, readings.rotation)
-        return rotation, np.einsum("nji,nj->ni", turn, readings.translation_m - self.scale * shift)
-
-    def seen_from(self, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations and positions, metres, in each camera's frame."""
-        turn, shift = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
-        return turn @ pose.rotation, turn @ pose.translation_m + self.scale * shift
+    def world_from_obj(self, predictions: _Predictions) -> Pose[np.ndarray]:
+        """Predictions in the scene's frame."""
+        return _rows(self.cam_from_world, predictions.frame).inverse() @ predictions.cam_from_obj
 
 
-def agreed(
-    refine: RenderAndCompare,
+def consensus_poses(
+    refiner: RenderAndCompare,
     frames: Tensor,
     cameras: CameraPoses,
-    read: SceneCode,
-    refined: tuple[SceneCode, Bool[Tensor, " num"]],
-    symmetries: Sequence[Pose],
+    estimates: Estimates,
+    symmetries: Sequence[Pose[np.ndarray]],
 ) -> tuple[dict[str, Tensor], Bool[Tensor, " num"]]:
-    """Poses that photographs agree on.
+    """Poses on which photographs agree.
 
     Args:
-        refine: Of the object; tells what of a photograph a pose explains.
+        refiner: Of the object; measures inlier ratios.
         frames: uint8 sRGB [num, 3, height, width].
-        cameras: That took them.
-        read: What was read in each.
-        refined: The same after render-and-compare, and where that found something better.
+        cameras: Their camera poses.
+        estimates: The poses in each.
         symmetries: Of the object.
 
     Returns:
-        The code with agreed positions and rotations, and which photographs show the object there.
+        The predicted code with consensus positions and rotations, and which photographs show the object so.
     """
-    better, taken = refined
-    known = cameras.known
-    sources = _predictions(read, known), _predictions(better, known & taken.numpy())
-    turns = np.stack([pose.rotation for pose in symmetries])
-    scales = [estimate_scale(cameras, code, taken, refine.diameter_m) for code in (read, better)]
+    known, accepted = cameras.known, estimates.accepted
+    sources = _predictions(estimates.predicted, known), _predictions(estimates.refined, known & accepted.numpy())
+    symmetry_rotations = np.stack([pose.rotation for pose in symmetries])
+    scales = [
+        estimate_scale(cameras, code, accepted, refiner.diameter_m) for code in (estimates.predicted, estimates.refined)
+    ]
     found = [scale for scale in scales if scale is not None]
     if not found:
-        return dict(read), torch.zeros(len(frames), dtype=torch.bool)
+        return dict(estimates.predicted), torch.zeros(len(frames), dtype=torch.bool)
     scale = 1.0 if cameras.in_metres else float(np.exp(np.mean(np.log(found))))
-    # Each kind of reading errs in depth in its own way, which its scale tells.
-    pairs = zip(sources, scales, strict=True)
-    level = [r._replace(translation_m=r.translation_m * scale / s) for r, s in pairs if s is not None]
-    every = _Predictions(*(np.concatenate(values) for values in zip(*level, strict=True)))
-    scene = _Scene(_without_gaps(cameras), known, scale)
-    poses = _clusters(scene, every, refine.diameter_m, turns)
-    return _looked_for(refine, frames, scene, poses, read, better, turns)
+    # Predicted and refined poses each have their own error in depth, which their scale shows.
+    corrected = [
+        (frame, pose.rotation, pose.translation_m * scale / own)
+        for (frame, pose), own in zip(sources, scales, strict=True)
+        if own is not None
+    ]
+    frame, rotation, translation_m = (np.concatenate(values) for values in zip(*corrected, strict=True))
+    cam_from_world = _known_or_identity(cameras)
+    scene = _StaticScene(Pose(cam_from_world.rotation, scale * cam_from_world.translation_m), known)
+    predictions = _Predictions(frame, Pose(rotation, translation_m))
+    poses = _clusters(scene, predictions, refiner.diameter_m, symmetry_rotations)
+    return _verified(refiner, frames, scene, poses, estimates, symmetry_rotations)
 
 
 def estimate_scale(
-    cameras: CameraPoses, code: SceneCode, taken: Bool[Tensor, " num"], diameter_m: float
+    cameras: CameraPoses, code: SceneCode, accepted: Bool[Tensor, " num"], diameter_m: float
 ) -> float | None:
-    """Metres a unit of the scene, by how far an object that was read moved before the camera.
+    """Metres a unit of the scene, from how far a predicted object moved relative to the camera.
 
     Args:
-        cameras: Of the photographs.
-        code: What was read in them.
-        taken: Readings that are better than others; these tell, if they are enough.
+        cameras: Camera poses of the photographs.
+        code: Predictions in them.
+        accepted: Predictions that are better than others; only these are used if they are enough.
         diameter_m: Of the object.
+
+    Returns:
+        None if too few pairs of predictions agree.
     """
-    matrices, known = _without_gaps(cameras), cameras.known
-    scale = _scale(matrices, _predictions(code, known & taken.numpy()), diameter_m)
-    return scale or _scale(matrices, _predictions(code, known), diameter_m)
+    cam_from_world, known = _known_or_identity(cameras), cameras.known
+    scale = _scale(cam_from_world, _predictions(code, known & accepted.numpy()), diameter_m)
+    return scale or _scale(cam_from_world, _predictions(code, known), diameter_m)
 
 
-def _without_gaps(cameras: CameraPoses) -> np.ndarray:
-    return np.where(cameras.known[:, None, None], cameras.cam_from_world, np.eye(4))
+def _known_or_identity(cameras: CameraPoses) -> Pose[np.ndarray]:
+    return Pose.from_matrix(np.where(cameras.known[:, None, None], cameras.cam_from_world, np.eye(4)))
 
 
-def _predictions(code: SceneCode, chosen: np.ndarray) -> _Predictions:
+def _rows(poses: Pose[np.ndarray], rows: np.ndarray) -> Pose[np.ndarray]:
+    return Pose(poses.rotation[rows], poses.translation_m[rows])
+
+
+def _predictions(code: SceneCode, chosen: Bool[np.ndarray, " num"]) -> _Predictions:
     rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0]).double().numpy()
     translation_m = code[TRANSLATION][:, 0].double().numpy()
-    return _Predictions(np.flatnonzero(chosen), rotation[chosen], translation_m[chosen])
+    return _Predictions(np.flatnonzero(chosen), Pose(rotation[chosen], translation_m[chosen]))
 
 
-def _scale(cameras: np.ndarray, readings: _Predictions, diameter_m: float) -> float | None:
-    """Metres a unit of the scene: what most pairs of photographs say, from how far the camera moved between them."""
-    turn, shift = cameras[readings.frame, :3, :3], cameras[readings.frame, :3, 3]
-    away = np.einsum("nji,nj->ni", turn, readings.translation_m)  # from the camera, in the scene's axes
-    centres = -np.einsum("nji,nj->ni", turn, shift)
-    first, second = np.triu_indices(len(away), 1)
-    moved, differ = centres[first] - centres[second], away[first] - away[second]
-    length = np.linalg.norm(moved, axis=1).clip(min=1e-9)
-    scale = -(moved * differ).sum(axis=1) / length**2
-    gap = np.linalg.norm(moved * scale[:, None] + differ, axis=1)
-    fits = (scale > 0) & (gap < _LARGEST_GAP * diameter_m) & (length * scale > _LEAST_BASELINE * diameter_m)
+def _scale(cameras: Pose[np.ndarray], predictions: _Predictions, diameter_m: float) -> float | None:
+    """Metres a unit of the scene: the mode over all pairs of photographs."""
+    world_from_cam = _rows(cameras, predictions.frame).inverse()
+    centres = world_from_cam.translation_m
+    rays_m = _rotated(world_from_cam.rotation, predictions.cam_from_obj.translation_m)  # in the scene's axes
+    first, second = np.triu_indices(len(rays_m), 1)
+    moved, difference_m = centres[first] - centres[second], rays_m[first] - rays_m[second]
+    baseline = np.linalg.norm(moved, axis=1).clip(min=1e-9)
+    scale = -(moved * difference_m).sum(axis=1) / baseline**2
+    gap_m = np.linalg.norm(moved * scale[:, None] + difference_m, axis=1)
+    fits = (scale > 0) & (gap_m < _MAX_GAP * diameter_m) & (baseline * scale > _MIN_BASELINE * diameter_m)
     logs = np.sort(np.log(scale[fits]))
-    if len(logs) < _FEWEST_PAIRS:
+    if len(logs) < _MIN_PAIRS:
         return None
-    alike = np.searchsorted(logs, logs + _SAME_SCALE) - np.searchsorted(logs, logs - _SAME_SCALE)
-    mode = logs[alike.argmax()]
-    near = np.abs(logs - mode) < _SAME_SCALE
-    return float(np.exp(np.median(logs[near]))) if near.sum() >= _FEWEST_PAIRS else None
+    support = np.searchsorted(logs, logs + _SAME_SCALE) - np.searchsorted(logs, logs - _SAME_SCALE)
+    near = np.abs(logs - logs[support.argmax()]) < _SAME_SCALE
+    return float(np.exp(np.median(logs[near]))) if near.sum() >= _MIN_PAIRS else None
 
 
-def _clusters(scene: _Scene, readings: _Predictions, diameter_m: float, turns: np.ndarray) -> list[Pose]:
-    """Poses in the scene that readings of several photographs agree on, those of most readings first."""
-    rotations, positions = scene.poses_of(readings)
-    spread = _spread(scene, readings, diameter_m)
-    gaps = positions[None] - positions[:, None]
-    alike = _distance(gaps, spread[:, None] + spread[None]) < _LARGEST_DISTANCE
-    alike &= _angles_deg(rotations[:, None], rotations, turns)[0] < _LARGEST_TURN_DEG
-    left, found = np.ones(len(positions), dtype=bool), []
+def _rotated(rotation: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    return np.einsum("nij,nj->ni", rotation, vectors)
+
+
+def _clusters(
+    scene: _StaticScene, predictions: _Predictions, diameter_m: float, symmetries: np.ndarray
+) -> list[Pose[np.ndarray]]:
+    """Poses world_from_obj on which predictions of several photographs agree, those of most predictions first."""
+    poses = scene.world_from_obj(predictions)
+    covariance = _covariance(scene, predictions, diameter_m)
+    gaps = poses.translation_m[None] - poses.translation_m[:, None]
+    agree = _mahalanobis(gaps, covariance[:, None] + covariance[None]) < _MAX_DISTANCE
+    agree &= _angles_deg(poses.rotation[:, None], poses.rotation, symmetries)[0] < _MAX_ANGLE_DEG
+    remaining, found = np.ones(len(agree), dtype=bool), []
     while True:
-        seed = int((alike & left & left[:, None]).sum(axis=1).argmax())
-        members = np.flatnonzero(alike[seed] & left)
-        if len(members) < _FEWEST_READINGS:
+        seed = int((agree & remaining & remaining[:, None]).sum(axis=1).argmax())
+        members = np.flatnonzero(agree[seed] & remaining)
+        if len(members) < _MIN_PREDICTIONS:
             break
-        for _ in range(_GROWTHS):
-            pose = _mean(rotations[members], positions[members], spread[members], turns)
-            near = _distance(positions - pose.translation_m, spread) < _LARGEST_DISTANCE
-            near &= _angles_deg(rotations, pose.rotation, turns)[0] < _LARGEST_TURN_DEG
-            if (near & left).sum() < _FEWEST_READINGS:
+        for _ in range(_MEAN_STEPS):
+            mean = _mean(_rows(poses, members), covariance[members], symmetries)
+            near = _mahalanobis(poses.translation_m - mean.translation_m, covariance) < _MAX_DISTANCE
+            near &= _angles_deg(poses.rotation, mean.rotation, symmetries)[0] < _MAX_ANGLE_DEG
+            if (near & remaining).sum() < _MIN_PREDICTIONS:
                 break
-            members = np.flatnonzero(near & left)
-        left[members] = False
-        if len(np.unique(readings.frame[members])) >= _FEWEST:
-            found.append(_mean(rotations[members], positions[members], spread[members], turns))
+            members = np.flatnonzero(near & remaining)
+        remaining[members] = False
+        if len(np.unique(predictions.frame[members])) >= _MIN_PHOTOGRAPHS:
+            found.append(_mean(_rows(poses, members), covariance[members], symmetries))
     return found
 
 
-def _spread(scene: _Scene, readings: _Predictions, diameter_m: float) -> Float[np.ndarray, "n 3 3"]:
-    """Covariance of each reading's position: what is across the view is known better than depth."""
-    ray = np.einsum("nji,nj->ni", scene.cam_from_world[readings.frame, :3, :3], readings.translation_m)
-    away = np.linalg.norm(ray, axis=1)
-    along = ray[:, :, None] * ray[:, None] / away[:, None, None] ** 2
+def _covariance(scene: _StaticScene, predictions: _Predictions, diameter_m: float) -> Float[np.ndarray, "n 3 3"]:
+    """Of each predicted position in the scene: it is more accurate across the view than in depth."""
+    rotation = _rows(scene.cam_from_world, predictions.frame).inverse().rotation
+    rays_m = _rotated(rotation, predictions.cam_from_obj.translation_m)
+    distance_m = np.linalg.norm(rays_m, axis=1)
+    along = rays_m[:, :, None] * rays_m[:, None] / distance_m[:, None, None] ** 2
     across = np.eye(3) - along
-    far = (_IN_DEPTH * away)[:, None, None] ** 2
-    covariance: np.ndarray = across * (_ACROSS * diameter_m) ** 2 + along * far + np.eye(3) * (_MOVED * diameter_m) ** 2
-    return covariance
+    depth = (_IN_DEPTH * distance_m)[:, None, None] ** 2
+    result: np.ndarray = across * (_ACROSS * diameter_m) ** 2 + along * depth + np.eye(3) * (_MOVED * diameter_m) ** 2
+    return result
 
 
-def _distance(gaps: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _mahalanobis(gaps: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Squared Mahalanobis distance."""
     result: np.ndarray = (gaps * np.linalg.solve(covariance, gaps[..., None])[..., 0]).sum(axis=-1)
     return result
 
 
-def _angles_deg(one: np.ndarray, other: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _angles_deg(one: np.ndarray, other: np.ndarray, symmetries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least angle over the symmetries between rotations [..., 3, 3], and the number of that symmetry."""
-    cosines = np.stack([(np.einsum("...ij,...ij->...", one @ turn, other) - 1) / 2 for turn in turns])
+    cosines = np.stack([(np.einsum("...ij,...ij->...", one @ rotation, other) - 1) / 2 for rotation in symmetries])
     return np.degrees(np.arccos(cosines.max(axis=0).clip(-1, 1))), cosines.argmax(axis=0)
 
 
-def _mean(rotations: np.ndarray, positions: np.ndarray, spread: np.ndarray, turns: np.ndarray) -> Pose:
-    _, symmetry = _angles_deg(rotations, rotations[0], turns)
-    rotation = Rotation.from_matrix(rotations @ turns[symmetry]).mean().as_matrix()
-    weight = np.linalg.inv(spread)
-    return Pose(rotation, np.linalg.solve(weight.sum(axis=0), np.einsum("nij,nj->i", weight, positions)))
+def _mean(poses: Pose[np.ndarray], covariance: np.ndarray, symmetries: np.ndarray) -> Pose[np.ndarray]:
+    """Of a batch of poses, positions weighted by their inverse covariance."""
+    _, symmetry = _angles_deg(poses.rotation, poses.rotation[0], symmetries)
+    rotation = Rotation.from_matrix(poses.rotation @ symmetries[symmetry]).mean().as_matrix()
+    weight = np.linalg.inv(covariance)
+    weighted = np.einsum("nij,nj->i", weight, poses.translation_m)
+    return Pose(rotation, np.linalg.solve(weight.sum(axis=0), weighted))
 
 
-def _looked_for(
-    refine: RenderAndCompare,
+def _verified(
+    refiner: RenderAndCompare,
     frames: Tensor,
-    scene: _Scene,
-    poses: list[Pose],
-    read: SceneCode,
-    better: SceneCode,
-    turns: np.ndarray,
-) -> tuple[dict[str, Tensor], Tensor]:
-    """The pose that explains most of each photograph, if what was read there does not speak against it.
+    scene: _StaticScene,
+    poses: list[Pose[np.ndarray]],
+    estimates: Estimates,
+    symmetries: np.ndarray,
+) -> tuple[dict[str, Tensor], Bool[Tensor, " num"]]:
+    """The consensus pose with the most inliers in each photograph, unless the photograph's own estimate contradicts it.
 
-    Where the photograph's own reading explains something, the pose is to lie there, too, and to explain nearly as much;
-    where it is turned otherwise, more.
+    If the own estimate has inliers, a consensus pose must be near its position and have nearly as many; if its rotation
+    differs, more.
     """
-    own = refine.explained(frames, better).numpy()
-    best, code = np.zeros(len(frames)), {name: value.clone() for name, value in read.items()}
-    _, read_rotation, read_m = _predictions(better, np.ones(len(frames), dtype=bool))
+    own_ratio = refiner.inlier_ratio(frames, estimates.refined).numpy()
+    own = _predictions(estimates.refined, np.ones(len(frames), dtype=bool)).cam_from_obj
+    best, code = np.zeros(len(frames)), {name: value.clone() for name, value in estimates.predicted.items()}
     for pose in poses:
-        rotation, translation_m = scene.seen_from(pose)
-        turned = _angles_deg(rotation, read_rotation, turns)[0] > 2 * _LARGEST_TURN_DEG
-        apart = np.linalg.norm(translation_m[:, :2] - read_m[:, :2] * (translation_m[:, 2:] / read_m[:, 2:]), axis=1)
-        elsewhere = (own > _CREDIBLE) & (apart > _CONTRADICTION * refine.diameter_m)
-        least = np.maximum(LEAST_SEEN, np.where(turned, own, own - _WEAKER))
-        chosen = torch.from_numpy(np.flatnonzero(scene.known & refine.in_view(translation_m) & ~elsewhere))
-        if len(chosen) == 0:
+        cam_from_obj = scene.cam_from_world @ pose
+        position_m = cam_from_obj.translation_m
+        rotated = _angles_deg(cam_from_obj.rotation, own.rotation, symmetries)[0] > 2 * _MAX_ANGLE_DEG
+        own_at_depth = own.translation_m[:, :2] * (position_m[:, 2:] / own.translation_m[:, 2:])
+        offset_m = np.linalg.norm(position_m[:, :2] - own_at_depth, axis=1)
+        elsewhere = (own_ratio > _CREDIBLE) & (offset_m > _CONTRADICTION * refiner.diameter_m)
+        required = np.maximum(MIN_INLIER_RATIO, np.where(rotated, own_ratio, own_ratio - _TOLERANCE))
+        candidates = torch.from_numpy(np.flatnonzero(scene.known & refiner.in_view(position_m) & ~elsewhere))
+        if len(candidates) == 0:
             continue
-        placed, explained = _placed(read, rotation, translation_m), np.zeros(len(frames))
-        parts = {name: value[chosen] for name, value in placed.items()}
-        explained[chosen.numpy()] = refine.explained(frames[chosen], parts).numpy()
-        wins = torch.from_numpy(explained > np.maximum(best, least))
-        best = np.where(wins.numpy(), explained, best)
-        code = {name: torch.where(_like(wins, value), placed[name], value) for name, value in code.items()}
+        posed, ratio = _with_pose(estimates.predicted, cam_from_obj), np.zeros(len(frames))
+        ratio[candidates.numpy()] = refiner.inlier_ratio(frames[candidates], index(posed, candidates)).numpy()
+        wins = ratio > np.maximum(best, required)
+        best = np.where(wins, ratio, best)
+        code = {
+            name: torch.where(torch.from_numpy(wins).view(-1, *[1] * (value.dim() - 1)), posed[name], value)
+            for name, value in code.items()
+        }
     return code, torch.from_numpy(best > 0)
 
 
-def _placed(code: SceneCode, rotation: np.ndarray, translation_m: np.ndarray) -> dict[str, Tensor]:
-    pose = {
-        TRANSLATION: torch.from_numpy(translation_m).float()[:, None],
-        ROTATION_6D: rotation_6d_from_matrix(torch.from_numpy(rotation).float())[:, None],
+def _with_pose(code: SceneCode, cam_from_obj: Pose[np.ndarray]) -> dict[str, Tensor]:
+    """The code with other poses."""
+    return dict(code) | {
+        TRANSLATION: torch.from_numpy(cam_from_obj.translation_m).float()[:, None],
+        ROTATION_6D: rotation_6d_from_matrix(torch.from_numpy(cam_from_obj.rotation).float())[:, None],
     }
-    return dict(code) | pose
-
-
-def _like(chosen: Tensor, value: Tensor) -> Tensor:
-    return chosen.view(-1, *[1] * (value.dim() - 1))

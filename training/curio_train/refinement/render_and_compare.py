@@ -1,19 +1,19 @@
-"""Render and compare: poses read by a network, moved until their renderings look like the picture.
+"""Render and compare: poses predicted by a network, optimised until their renderings look like the frame.
 
-A crop around each estimate is explained as the object over a background. No clean background exists, so it is filled in
-from around the silhouette: what lies between a silhouette and the true outline is then either object drawn where the
-picture shows background, or background where it shows the object, and both pull the outline to its place. Brightness
-and contrast are the picture's own (least squares inside the silhouette). The difference is robust and redescending
-(Geman and McClure 1987): things in front, and whatever the background was not, weigh nothing instead of pulling.
+A crop around each estimate is modelled as the object over a background. The background behind the object is unknown, so
+it is inpainted from around the silhouette. Between a silhouette and the true outline, either the object is rendered
+over background or background over the object; both give a gradient towards the true outline. The rendering's gain and
+offset are fitted to the crop (least squares inside the silhouette). The residual is robust and redescending (Geman and
+McClure 1987): occluders, and whatever the inpainted background gets wrong, have almost no gradient.
 
-Pose and light move by Adam, first on blurred pictures, then on sharp ones, all of a batch at once; before each round
-the background is filled in anew, closer and closer to the silhouette. An answer counts
-only if it explains the picture better than the estimate did, lies near the estimate, and enough of it can be seen: much
-of the silhouette must be what the background alone does not explain. Else the estimate stands.
+Adam optimises pose and light, first on blurred crops, then on sharp ones; before each round the background is inpainted
+anew, closer and closer to the silhouette. A result replaces the estimate only if its residual is smaller, it is near
+the estimate, and enough of the silhouette is inliers: pixels that the background alone does not explain.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,53 +22,50 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from curio_train.camera import crop_camera_at, sampling_grid
 from curio_train.errors import UsageError
 from curio_train.geometry import rotation_angle_deg
-from curio_train.refinement.crops import Moves, Scene, View
-from curio_train.refinement.inpainting import blurred, filled_in, grown
+from curio_train.refinement.crops import Crops, PoseAndLight, PoseUpdate, crop_frames
+from curio_train.refinement.inpainting import blurred, dilated, inpainted
 from curio_train.rendering.renderer import Renderer
-from curio_train.scene_code import COLOR, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
+from curio_train.scene_code import COLOR, LIGHT, ROTATION_6D, TRANSLATION, SceneCode, index
 from curio_train.worlds.base import World
+from curio_train.worlds.single_object.crop_pose_stage import crop_matrices
 from curio_train.worlds.single_object.viewpoints import AMBIENT
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 CROP_PX, FILL = 96, 0.6
-"""Side of the crop, and the share of it that the object's diameter spans."""
+"""Side of the crop, and the fraction of it that the object's diameter spans."""
 
-LARGEST_TURN_DEG, LARGEST_SHIFT, LARGEST_LOG_DEPTH = 25.0, 0.3, 0.15
-"""How far an answer may lie from the estimate: rotation, diameters across the view, logarithm of the depth."""
+MAX_ROTATION_DEG, MAX_OFFSET, MAX_LOG_DEPTH = 25.0, 0.3, 0.15
+"""How far a result may be from the estimate: rotation, diameters across the view, logarithm of the depth."""
+
+MIN_INLIER_RATIO = 0.3
+"""Of the silhouette: most renderings with the object have more (0.5 to 0.9), nine of ten of clutter alone have less."""
 
 
 class _Round(NamedTuple):
-    """How a round sees the picture.
-
-    Attributes:
-        times_blurred: As often.
-        margin_px: Around the silhouette of what the round begins with, where the background is filled in. What is
-            filled in is no true background: over clutter, drawing an object larger than it is costs less than drawing
-            it smaller, and what is read comes out too near, the more the wider the margin (decision 66).
-    """
+    """How a round sees the crops."""
 
     times_blurred: int
+    """How often crops and renderings are blurred."""
     margin_px: int
+    """The background is inpainted within this margin of the silhouette at the beginning of the round. Over clutter,
+    rendering an object too large costs less than too small, and poses come out too near, the more the wider the margin
+    (decision 66)."""
 
 
 _ROUNDS = (_Round(2, 2), _Round(1, 1), _Round(0, 1), _Round(0, 1))
 _STEPS = 12  # a round
 _LEARNING_RATES = {"across": 0.01, "log_depth": 0.015, "turn": 0.03, "light": 0.05}
 _BETAS = (0.8, 0.95)  # of Adam: there are few steps
-LEAST_SEEN = 0.3
-"""Of the silhouette: more in most renderings where the object is (0.5 to 0.9), less on nine of ten of clutter alone."""
-
-_GAINS = (0.4, 2.0)
-_EVEN_LIGHT = 0.0, -0.4, -0.5  # from above the camera, where nothing adapts the light that was read
-_AT_ONCE = 32  # images, where nothing is learned
-_FLAT = 0.002  # variance of colours below which contrast cannot be told
+_MIN_GAIN, _MAX_GAIN = 0.4, 2.0
+_MIN_VARIANCE = 0.002  # of colours below which gains are uncertain
+_DEFAULT_LIGHT = 0.0, -0.4, -0.5  # from above the camera, for poses that are not optimised
+_BATCH_SIZE = 32  # of poses that are not optimised
 
 
-def refined(predict: Callable[[Tensor], SceneCode], world: World) -> Callable[[Tensor], dict[str, Tensor]]:
-    """A reader whose poses are refined.
+def with_refinement(predict: Callable[[Tensor], SceneCode], world: World) -> Callable[[Tensor], dict[str, Tensor]]:
+    """Predictions with refined poses.
 
     Args:
         predict: uint8 images [batch, 3, height, width] of the world's camera to scene codes.
@@ -77,16 +74,15 @@ def refined(predict: Callable[[Tensor], SceneCode], world: World) -> Callable[[T
     Raises:
         UsageError: The world is another.
     """
-    refine = RenderAndCompare(world)
-    return lambda images: refine(images, predict(images))
+    refiner = RenderAndCompare(world)
+    return lambda images: refiner.refine(images, predict(images))[0]
 
 
 class RenderAndCompare:
-    """Refines poses of one object in pictures of a world's camera.
+    """Refines poses of one object in frames of a world's camera."""
 
-    Attributes:
-        diameter_m: Of the object.
-    """
+    diameter_m: float
+    """Of the object."""
 
     def __init__(self, world: World) -> None:
         """Build the renderer.
@@ -100,150 +96,144 @@ class RenderAndCompare:
                 "capture); leave it out"
             )
         self._camera = world.camera
-        self._matrix = torch.from_numpy(np.asarray(world.camera.matrix)).float()[None]
+        self._matrix = torch.from_numpy(np.asarray(world.camera.matrix)).float()
         self.diameter_m = world.object.kind.diameter_m
         self._renderer = Renderer([world.object.mesh], [0], CROP_PX, CROP_PX, ambient=AMBIENT)
 
-    def __call__(self, images: Tensor, code: SceneCode) -> dict[str, Tensor]:
-        """Better poses, where they are found; all else as in :meth:`judged`."""
-        return self.judged(images, code)[0]
-
-    def judged(self, images: Tensor, code: SceneCode) -> tuple[dict[str, Tensor], Bool[Tensor, " batch"]]:
-        """Better poses, and where they are found.
+    def refine(self, images: Tensor, code: SceneCode) -> tuple[dict[str, Tensor], Bool[Tensor, " batch"]]:
+        """Refine the poses of a batch, all at once.
 
         Args:
             images: uint8 sRGB [batch, 3, height, width].
-            code: What was read in them; metres and 6D rotation in the camera's frame.
+            code: Estimates for them; metres and 6D rotation in the camera frame.
 
         Returns:
-            The code with positions and rotations refined, everything else as it was; and which were.
+            The code with refined positions and rotations where the result was accepted, everything else as it was; and
+            where it was accepted.
         """
-        found = dict(code)
+        result = dict(code)
         for number in range(len(_ROUNDS)):
-            found |= self._round(images, found, number)
-        taken = self._accepted(images, code, found)
-        better = {
-            name: torch.where(taken[:, None, None], found[name], code[name]) for name in (TRANSLATION, ROTATION_6D)
+            result |= self._optimised(images, result, number)
+        accepted = self._accepted(images, code, result)
+        refined = {
+            name: torch.where(accepted[:, None, None], result[name], code[name]) for name in (TRANSLATION, ROTATION_6D)
         }
-        return dict(code) | better, taken
+        return dict(code) | refined, accepted
 
-    def _round(self, images: Tensor, code: SceneCode, number: int) -> dict[str, Tensor]:
+    @torch.no_grad()
+    def inlier_ratio(self, images: Tensor, code: SceneCode) -> Float[Tensor, " batch"]:
+        """Fraction of the silhouette that poses explain and the background alone does not, without optimising them.
+
+        Arguments are those of :meth:`refine`.
+        """
+        ratios = []
+        for first in range(0, len(images), _BATCH_SIZE):
+            rows = slice(first, first + _BATCH_SIZE)
+            part = index(code, rows)
+            part[LIGHT] = part[LIGHT].new_tensor(_DEFAULT_LIGHT).expand_as(part[LIGHT])
+            crops = self._crops(images[rows], part, _ROUNDS[0].margin_px).blurred(1)
+            estimate = crops.from_code(part)
+            residual = crops.residual(self._rendered(crops, estimate, self._gain_and_offset(crops, estimate)))
+            silhouette, _ = self._silhouette(crops, estimate)
+            ratios.append(crops.inlier_pixels(residual) / silhouette.sum((1, 2, 3)).clamp(min=1))
+        return torch.cat(ratios)
+
+    def in_view(self, translation_m: Float[np.ndarray, "num 3"]) -> Bool[np.ndarray, " num"]:
+        """Whether positions in the camera frame project into the frame, at more than a diameter's distance."""
+        depth = translation_m[:, 2:]
+        pixels = (translation_m @ self._matrix.double().numpy().T)[:, :2] / np.maximum(depth, 1e-6)
+        inside = (pixels >= 0).all(axis=1) & (pixels < [self._camera.width, self._camera.height]).all(axis=1)
+        visible: np.ndarray = inside & (depth[:, 0] > self.diameter_m)
+        return visible
+
+    def _optimised(self, images: Tensor, code: SceneCode, number: int) -> dict[str, Tensor]:
         """Pose and light after one of the rounds."""
         times, margin_px = _ROUNDS[number]
-        view = self._view(images, code, margin_px).blurred(times)
-        start = view.scene(code)
-        moves = Moves.none(len(images))
-        groups = [{"params": [value], "lr": _LEARNING_RATES[name]} for name, value in vars(moves).items()]
+        crops = self._crops(images, code, margin_px).blurred(times)
+        start, update = crops.from_code(code), PoseUpdate.zero(len(images))
+        groups = [{"params": [value], "lr": _LEARNING_RATES[name]} for name, value in vars(update).items()]
         optimizer = torch.optim.Adam(groups, betas=_BETAS)
         done = [(number * _STEPS + step) / (len(_ROUNDS) * _STEPS) for step in range(_STEPS + 1)]
         rates = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: (1 + math.cos(math.pi * done[step])) / 2)
-        response = self._response(view, start)
+        gain_and_offset = self._gain_and_offset(crops, start)
         for _ in range(_STEPS):
             optimizer.zero_grad()
-            scene = start.moved(moves, self.diameter_m)
-            view.share(view.missed(self._rendered(view, scene, response))).sum().backward()
+            estimate = start.updated(update, self.diameter_m)
+            residual = crops.residual(self._rendered(crops, estimate, gain_and_offset))
+            crops.mean_residual(residual).sum().backward()
             optimizer.step()
             rates.step()
         with torch.no_grad():
-            return view.code(start.moved(moves, self.diameter_m))
+            return crops.to_code(start.updated(update, self.diameter_m))
 
     @torch.no_grad()
-    def explained(self, images: Tensor, code: SceneCode) -> Float[Tensor, " batch"]:
-        """Share of the silhouettes that poses as they are explain, and the backgrounds alone do not.
+    def _crops(self, images: Tensor, code: SceneCode, margin_px: int) -> Crops:
+        """The crops around estimates, and the inpainted backgrounds."""
+        position_m = code[TRANSLATION][:, 0]
+        focal_px = FILL * CROP_PX * position_m.norm(dim=1) / self.diameter_m
+        found, crop_from_cam = crop_frames(images, self._matrix, position_m, focal_px, CROP_PX)
+        matrices = crop_matrices(focal_px.numpy(), CROP_PX)
+        crops = Crops(found, found, found.new_zeros(len(found), 1, 1, 1), crop_from_cam, matrices, code.get(COLOR))
+        silhouette, _ = self._silhouette(crops, crops.from_code(code))
+        masked = dilated(silhouette, margin_px) > 0.1
+        return replace(crops, backgrounds=inpainted(found, masked), mask=dilated(masked.float(), 2))
 
-        Arguments are those of :meth:`judged`.
-        """
-        shares = []
-        for first in range(0, len(images), _AT_ONCE):
-            part = {name: value[first : first + _AT_ONCE] for name, value in code.items()}
-            part[LIGHT] = part[LIGHT].new_tensor(_EVEN_LIGHT).expand_as(part[LIGHT])
-            view = self._view(images[first : first + _AT_ONCE], part, _ROUNDS[0].margin_px).blurred(1)
-            scene = view.scene(part)
-            missed = view.missed(self._rendered(view, scene, self._response(view, scene)))
-            silhouette, _ = self._object(view, scene)
-            shares.append(view.explained(missed) / silhouette.sum((1, 2, 3)).clamp(min=1))
-        return torch.cat(shares)
-
-    def in_view(self, translation_m: Float[np.ndarray, "num 3"]) -> Bool[np.ndarray, " num"]:
-        """Whether positions in the camera's frame are seen within the frame."""
-        depth = translation_m[:, 2:]
-        pixels = (translation_m @ self._matrix[0].double().numpy().T)[:, :2] / np.maximum(depth, 1e-6)
-        inside = (pixels >= 0).all(axis=1) & (pixels < [self._camera.width, self._camera.height]).all(axis=1)
-        seen: np.ndarray = inside & (depth[:, 0] > self.diameter_m)
-        return seen
-
-    @torch.no_grad()
-    def _view(self, images: Tensor, code: SceneCode, margin_px: int) -> View:
-        """The crops around the estimates, and the backgrounds behind them."""
-        place = code[TRANSLATION][:, 0]
-        depth, frames = place.norm(dim=1), self._matrix.expand(len(place), 3, 3)
-        focal = FILL * CROP_PX * depth / self.diameter_m
-        gaze = crop_camera_at(place, 2 * focal, 2 * CROP_PX, frames)  # two samples a pixel and side, then averaged
-        grid = sampling_grid(gaze, frames, 2 * CROP_PX, images.shape[3], images.shape[2])
-        fine = F.grid_sample(images.float() / 255, grid, padding_mode="border", align_corners=False)
-        crops = F.avg_pool2d(fine, 2)
-        matrices = np.zeros((len(place), 3, 3))
-        matrices[:, 0, 0] = matrices[:, 1, 1] = focal.numpy()
-        matrices[:, [0, 1], 2] = (CROP_PX - 1) / 2
-        matrices[:, 2, 2] = 1
-        view = View(crops, crops, torch.zeros(len(place), 1, 1, 1), gaze.rotation, matrices, code.get(COLOR), 0)
-        silhouette, _ = self._object(view, view.scene(code))
-        hidden = grown(silhouette, margin_px) > 0.1
-        return view.over(filled_in(crops, hidden), grown(hidden.float(), 2))
-
-    def _draw(self, view: View, scene: Scene, behind: Tensor) -> Tensor:
+    def _draw(self, crops: Crops, estimate: PoseAndLight, backgrounds: Tensor) -> Tensor:
         images: Tensor = self._renderer(
-            scene.rotation[:, None],
-            scene.translation_m[:, None],
-            camera_matrix=view.matrices,
-            backgrounds=behind,
-            light=scene.light,
-            color=view.color,
+            estimate.rotation[:, None],
+            estimate.translation_m[:, None],
+            camera_matrix=crops.matrices,
+            backgrounds=backgrounds,
+            light=estimate.light,
+            color=crops.color,
         )
         return images
 
     @torch.no_grad()
-    def _object(self, view: View, scene: Scene) -> tuple[Tensor, Tensor]:
-        """Its silhouette [batch, 1, side, side] and itself over black."""
-        black = torch.zeros_like(view.crops)
-        over_black, over_white = (self._draw(view, scene, behind) for behind in (black, black + 1))
+    def _silhouette(self, crops: Crops, estimate: PoseAndLight) -> tuple[Tensor, Tensor]:
+        """The object's silhouette [batch, 1, side, side], and the object over black."""
+        black = torch.zeros_like(crops.images)
+        over_black, over_white = (self._draw(crops, estimate, backgrounds) for backgrounds in (black, black + 1))
         return (1 - (over_white - over_black)).mean(1, keepdim=True).clamp(0, 1), over_black
 
     @torch.no_grad()
-    def _response(self, view: View, scene: Scene) -> tuple[Tensor, Tensor]:
-        """Contrast [batch, 1, 1, 1] and brightness [batch, 3, 1, 1] that make the rendering the picture.
+    def _gain_and_offset(self, crops: Crops, estimate: PoseAndLight) -> tuple[Tensor, Tensor]:
+        """Gain [batch, 1, 1, 1] and offset [batch, 3, 1, 1] that fit the rendering to the crop.
 
-        Least squares inside the silhouette, one contrast for all channels.
+        Least squares inside the silhouette, one gain for all channels.
         """
-        silhouette, drawn = self._object(view, scene)
+        silhouette, over_black = self._silhouette(crops, estimate)
         inside = (F.avg_pool2d(silhouette, 3, 1, 1) > 0.99).float()
-        share = inside / inside.sum((2, 3), keepdim=True).clamp(min=1)
-        means = [(image * share).sum((2, 3), keepdim=True) for image in (drawn, view.crops)]
-        rendered, seen = (image - mean for image, mean in zip((drawn, view.crops), means, strict=True))
-        together, own = ((rendered * other * share).sum((2, 3)).mean(1) for other in (seen, rendered))
-        contrast = ((together + _FLAT) / (own + _FLAT)).clamp(*_GAINS)[:, None, None, None]
-        return contrast, means[1] - contrast * means[0]
+        weight = inside / inside.sum((2, 3), keepdim=True).clamp(min=1)
+        means = [(image * weight).sum((2, 3), keepdim=True) for image in (over_black, crops.images)]
+        rendered, seen = (image - mean for image, mean in zip((over_black, crops.images), means, strict=True))
+        covariance, variance = ((rendered * other * weight).sum((2, 3)).mean(1) for other in (seen, rendered))
+        gain = ((covariance + _MIN_VARIANCE) / (variance + _MIN_VARIANCE)).clamp(_MIN_GAIN, _MAX_GAIN)
+        gain = gain[:, None, None, None]
+        return gain, means[1] - gain * means[0]
 
-    def _rendered(self, view: View, scene: Scene, response: tuple[Tensor, Tensor]) -> Tensor:
-        """What the crops should look like."""
-        contrast, brightness = response
-        # Dividing the response out of the background is the same as applying it to the object alone.
-        image = self._draw(view, scene, (view.behind - brightness) / contrast)
-        for _ in range(view.times_blurred):
+    def _rendered(self, crops: Crops, estimate: PoseAndLight, gain_and_offset: tuple[Tensor, Tensor]) -> Tensor:
+        """The object over the background, blurred like the crops."""
+        gain, offset = gain_and_offset
+        # Gain and offset apply to the object alone: the background goes through their inverse first.
+        image = self._draw(crops, estimate, (crops.backgrounds - offset) / gain)
+        for _ in range(crops.times_blurred):
             image = blurred(image)
-        return image * contrast + brightness
+        return image * gain + offset
 
     @torch.no_grad()
-    def _accepted(self, images: Tensor, code: SceneCode, found: SceneCode) -> Bool[Tensor, " batch"]:
-        """Which of the poses that were found may replace the estimates, both seen as the first round sees them."""
-        view = self._view(images, code, _ROUNDS[0].margin_px)
-        before, after = view.scene(code), view.scene(found)
-        missed = [view.missed(self._rendered(view, scene, self._response(view, scene))) for scene in (before, after)]
-        silhouette, _ = self._object(view, after)
-        depth = after.translation_m[:, 2:]
-        log_depth = (depth / before.translation_m[:, 2:]).log()[:, 0]
-        across = (after.translation_m[:, :2] / (self.diameter_m * log_depth.exp()[:, None])).norm(dim=1)
-        near = rotation_angle_deg(after.rotation, before.rotation) < LARGEST_TURN_DEG
-        near &= (across < LARGEST_SHIFT) & (log_depth.abs() < LARGEST_LOG_DEPTH)
-        near &= view.explained(missed[1]) > LEAST_SEEN * silhouette.sum((1, 2, 3))
-        return near & (view.share(missed[1]) < view.share(missed[0]))
+    def _accepted(self, images: Tensor, code: SceneCode, result: SceneCode) -> Bool[Tensor, " batch"]:
+        """Which results may replace the estimates, both judged on the crops of the first round."""
+        crops = self._crops(images, code, _ROUNDS[0].margin_px)
+        before, after = crops.from_code(code), crops.from_code(result)
+        residuals = [
+            crops.residual(self._rendered(crops, estimate, self._gain_and_offset(crops, estimate)))
+            for estimate in (before, after)
+        ]
+        silhouette, _ = self._silhouette(crops, after)
+        log_depth = (after.translation_m[:, 2:] / before.translation_m[:, 2:]).log()[:, 0]
+        offset = (after.translation_m[:, :2] / (self.diameter_m * log_depth.exp()[:, None])).norm(dim=1)
+        accepted = rotation_angle_deg(after.rotation, before.rotation) < MAX_ROTATION_DEG
+        accepted &= (offset < MAX_OFFSET) & (log_depth.abs() < MAX_LOG_DEPTH)
+        accepted &= crops.inlier_pixels(residuals[1]) > MIN_INLIER_RATIO * silhouette.sum((1, 2, 3))
+        return accepted & (crops.mean_residual(residuals[1]) < crops.mean_residual(residuals[0]))

@@ -25,25 +25,22 @@ def enclosing_polytope(vertices: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ImageBounds:
-    """What part of its image each row can touch.
-
-    Attributes:
-        low: float32 [rows, 8], smallest value of a·x + b·y over the object for each (a, b) in ``DIRECTIONS``; pixels.
-        high: float32 [rows, 8], largest.
-        rectangle: int64 [rows, 4], x0, y0, x1, y1 in pixels, the end exclusive; empty where nothing can be seen.
-    """
+    """What part of its image each instance can touch."""
 
     low: np.ndarray
+    """Float32 [instances, 8], smallest value of a·x + b·y over the object for each (a, b) in ``DIRECTIONS``; pixels."""
     high: np.ndarray
+    """Float32 [instances, 8], largest."""
     rectangle: np.ndarray
+    """Int64 [instances, 4], x0, y0, x1, y1 in pixels, the end exclusive; empty where nothing can be seen."""
 
     @property
     def num_pixels(self) -> np.ndarray:
-        """[rows], pixels of the rectangles, at least as many as are traced."""
+        """[instances], pixels of the rectangles, at least as many as are traced."""
         return np.prod(self.rectangle[:, 2:] - self.rectangle[:, :2], axis=1)
 
     def part(self, first: int, last: int) -> "ImageBounds":
-        """Some of the rows."""
+        """Some of the instances."""
         return ImageBounds(self.low[first:last], self.high[first:last], self.rectangle[first:last])
 
 
@@ -51,8 +48,8 @@ def project_bounds(corners_m: np.ndarray, intrinsics: np.ndarray, width: int, he
     """Bounds of convex bodies.
 
     Args:
-        corners_m: [rows, n, 3], camera frame, not necessarily finite.
-        intrinsics: [rows, 4]: fx, fy, cx, cy in pixels, pixel centres at integers.
+        corners_m: [instances, n, 3], camera frame, not necessarily finite.
+        intrinsics: [instances, 4]: fx, fy, cx, cy in pixels, pixel centres at integers.
         width: Of the image.
         height: Of the image.
 

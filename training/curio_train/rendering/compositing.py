@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Any
 
 from curio_train.rendering.instances import Instances
-from curio_train.rendering.pixels import Place
+from curio_train.rendering.pixels import ImageLocation
 
 
 class Occlusion:
@@ -21,37 +21,37 @@ class Occlusion:
         self.table: Any = None
         self.entry_of_group: Any = None
 
-    def build(self, place: Place, depth_m: Any, num_groups: int) -> None:
+    def build(self, location: ImageLocation, depth_m: Any, num_groups: int) -> None:
         """Enter hits at their depths."""
         mi, dr = self.mi, self.dr
-        group = place.sample // self.per_group
+        group = location.sample // self.per_group
         self.entry_of_group = dr.zeros(mi.UInt32, num_groups)
         dr.scatter(self.entry_of_group, mi.UInt32(1), group)
         used = dr.compress(self.entry_of_group > 0)
         dr.scatter(self.entry_of_group, dr.arange(mi.UInt32, len(used)), used)
         self.table = dr.full(mi.Float, dr.inf, len(used) * self.per_group * self.num_slots)
-        dr.scatter(self.table, depth_m, self._first_entry(place) + place.row % self.num_slots)
+        dr.scatter(self.table, depth_m, self._first_entry(location) + location.instance % self.num_slots)
         dr.eval(self.entry_of_group, self.table)
 
-    def weight(self, rows: Instances, place: Place, depth_m: Any) -> Any:
+    def weight(self, instances: Instances, location: ImageLocation, depth_m: Any) -> Any:
         """What a hit contributes to its sample: its confidence times what the nearer hits let through.
 
         Written without a sort: every slot is asked whether it is nearer (equal depths: the earlier slot), so the
         program does not depend on the data.
         """
-        weight = rows.confidence(place.row)
+        weight = instances.confidence(location.instance)
         if self.num_slots == 1:
             return weight
-        image = place.row // self.num_slots
-        own, first = place.row - image * self.num_slots, self._first_entry(place)
+        image = location.instance // self.num_slots
+        own, first = location.instance - image * self.num_slots, self._first_entry(location)
         for slot in range(self.num_slots):
             other = self.dr.gather(self.mi.Float, self.table, first + slot)
             nearer = (other < depth_m) | ((other == depth_m) & (slot < own))
-            confidence = rows.confidence(image * self.num_slots + slot)
+            confidence = instances.confidence(image * self.num_slots + slot)
             weight *= self.dr.select(nearer, 1 - confidence, 1)
         return weight
 
-    def _first_entry(self, place: Place) -> Any:
-        group = place.sample // self.per_group
+    def _first_entry(self, location: ImageLocation) -> Any:
+        group = location.sample // self.per_group
         entry = self.dr.gather(self.mi.UInt32, self.entry_of_group, group)
-        return (entry * self.per_group + place.sample - group * self.per_group) * self.num_slots
+        return (entry * self.per_group + location.sample - group * self.per_group) * self.num_slots

@@ -1,4 +1,4 @@
-"""Find the edges at which a camera sees an outline, for all rows at once: clusters first, then edges."""
+"""Find the edges at which a camera sees an outline, for all instances at once: clusters first, then edges."""
 
 from collections.abc import Sequence
 from types import ModuleType
@@ -29,35 +29,35 @@ class EdgeSearch:
         """Both ends of edges, scene frame."""
         return [self._point(name, edge) for name in ("start", "end")]
 
-    def find(self, rows: Instances, num_rows: int) -> tuple[Any, Any]:
-        """(row, edge) of every silhouette edge, rows ascending."""
+    def find(self, instances: Instances, num_instances: int) -> tuple[Any, Any]:
+        """(instance, edge) of every silhouette edge, instances ascending."""
         mi, dr = self.mi, self.dr
         if self.num_pairs == 0:
             return mi.UInt32(), mi.UInt32()
-        num_images = num_rows // self.num_slots
+        num_images = num_instances // self.num_slots
         lane = dr.arange(mi.UInt32, num_images * self.num_pairs)
         image = lane // self.num_pairs
         pair = lane - image * self.num_pairs
-        row = image * self.num_slots + dr.gather(mi.UInt32, self.slot_of_pair, pair)
+        instance = image * self.num_slots + dr.gather(mi.UInt32, self.slot_of_pair, pair)
         cluster = dr.gather(mi.UInt32, self.cluster_of_pair, pair)
-        kept = dr.compress(self._may_have_outline(rows, row, cluster))
-        row, cluster = dr.gather(mi.UInt32, row, kept), dr.gather(mi.UInt32, cluster, kept)
-        if len(row) == 0:
-            return row, cluster
-        dr.eval(row, cluster)
-        lane = dr.arange(mi.UInt32, len(row) * CLUSTER_SIZE)
+        kept = dr.compress(self._may_have_outline(instances, instance, cluster))
+        instance, cluster = dr.gather(mi.UInt32, instance, kept), dr.gather(mi.UInt32, cluster, kept)
+        if len(instance) == 0:
+            return instance, cluster
+        dr.eval(instance, cluster)
+        lane = dr.arange(mi.UInt32, len(instance) * CLUSTER_SIZE)
         source = lane // CLUSTER_SIZE
-        row = dr.gather(mi.UInt32, row, source)
+        instance = dr.gather(mi.UInt32, instance, source)
         edge = dr.gather(mi.UInt32, cluster, source) * CLUSTER_SIZE + (lane & (CLUSTER_SIZE - 1))
-        kept = dr.compress(self._is_outline(rows, row, edge))
-        row, edge = dr.gather(mi.UInt32, row, kept), dr.gather(mi.UInt32, edge, kept)
-        dr.eval(row, edge)
-        return row, edge
+        kept = dr.compress(self._is_outline(instances, instance, edge))
+        instance, edge = dr.gather(mi.UInt32, instance, kept), dr.gather(mi.UInt32, edge, kept)
+        dr.eval(instance, edge)
+        return instance, edge
 
-    def _may_have_outline(self, rows: Instances, row: Any, cluster: Any) -> Any:
+    def _may_have_outline(self, instances: Instances, instance: Any, cluster: Any) -> Any:
         """False only where every face of the cluster surely looks to the same side of the camera."""
         mi, dr = self.mi, self.dr
-        to_camera = rows.toward(row, self._point("center", cluster))
+        to_camera = instances.toward(instance, self._point("center", cluster))
         distance = dr.norm(to_camera)
         radius = dr.gather(mi.Float, self.edges["radius"], cluster)
         cosine = dr.dot(to_camera, self._point("axis", cluster)) / dr.maximum(distance, 1e-12)
@@ -69,10 +69,10 @@ class EdgeSearch:
         facing = dr.gather(mi.Float, self.edges["facing"], cluster)
         return dr.select(facing > 0, beyond, dr.abs(beyond)) <= spread
 
-    def _is_outline(self, rows: Instances, row: Any, edge: Any) -> Any:
+    def _is_outline(self, instances: Instances, instance: Any, edge: Any) -> Any:
         """One face towards the camera and one away, or an open border; at folds as many towards it as are needed."""
         dr = self.dr
-        to_camera = rows.toward(row, self._point("start", edge))
+        to_camera = instances.toward(instance, self._point("start", edge))
         a, b = (dr.dot(self._point(name, edge), to_camera) for name in ("normal_a", "normal_b"))
         facing = dr.gather(self.mi.Float, self.edges["facing"], edge // CLUSTER_SIZE)
         unknown = (a == 0) & (b == 0)

@@ -12,17 +12,14 @@ from curio_train.color import linear_from_srgb, srgb_from_linear
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """A plane as a camera above it sees it; it fills the whole image, also above the horizon.
-
-    Attributes:
-        up: Its unit normal [3], camera frame.
-        camera_height_m: How far below the camera it lies.
-        albedo_srgb: Grey, in [0, 1].
-    """
+    """A plane as a camera above it sees it; it fills the whole image, also above the horizon."""
 
     up: np.ndarray
+    """Its unit normal [3], camera frame."""
     camera_height_m: float
+    """How far below the camera it lies."""
     albedo_srgb: float
+    """Grey, in [0, 1]."""
 
     def image(
         self, ambient: float, light: Float[Tensor, "batch 3"], shadow: Float[Tensor, "batch 1 height width"]
@@ -32,7 +29,7 @@ class Ground:
         Args:
             ambient: Radiance from everywhere; it knows no shadows.
             light: Camera frame, towards the light; its length is the strength.
-            shadow: Share of each pixel that no light reaches.
+            shadow: Fraction of each pixel that no light reaches.
         """
         albedo = linear_from_srgb(light.new_tensor(self.albedo_srgb))
         sun = (light @ torch.as_tensor(self.up).to(light)).clamp(min=0)

@@ -9,62 +9,56 @@ from curio_train.rendering.bounds import ImageBounds
 from curio_train.rendering.compositing import Occlusion
 from curio_train.rendering.edge_sampling import OutlineSampler
 from curio_train.rendering.instances import Instances
-from curio_train.rendering.pixels import Place
+from curio_train.rendering.pixels import ImageLocation
 from curio_train.rendering.shadows import Blockers
 from curio_train.rendering.tracing import LayerTracer, RayQuery
 
-Places = Callable[[Any], tuple[Place, Any]]
+LocationsOfRays = Callable[[Any], tuple[ImageLocation, Any]]
 """From the numbers of rays to their places and whether they are inside the image."""
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """What all parts of all batches share.
-
-    Attributes:
-        mi: Mitsuba.
-        dr: Dr.Jit.
-        tracer: Traces and shades rays.
-        outlines: Finds and samples silhouettes.
-        width: Of the images, pixels.
-        height: Of the images, pixels.
-        num_slots: Objects an image.
-        samples_per_pixel: Rays a pixel and slot.
-        outline_samples: Points on each object's outline.
-        object_shadows: Whether objects stand in each other's light.
-    """
+    """What all parts of all batches share."""
 
     mi: ModuleType
+    """Mitsuba."""
     dr: ModuleType
+    """Dr.Jit."""
     tracer: LayerTracer
+    """Traces and shades rays."""
     outlines: OutlineSampler
+    """Finds and samples silhouettes."""
     width: int
+    """Of the images, pixels."""
     height: int
+    """Of the images, pixels."""
     num_slots: int
+    """Objects an image."""
     samples_per_pixel: int
+    """Rays a pixel and slot."""
     outline_samples: int
+    """Points on each object's outline."""
     object_shadows: bool
+    """Whether objects stand in each other's light."""
 
 
 @dataclass(frozen=True)
 class View:
-    """The part of a batch that is traced at once.
-
-    Attributes:
-        images: First and last + 1 image.
-        sight: What is looked for.
-        bounds: Of the part's rows.
-        camera: Float, see :class:`Instances`.
-        key: Of all random numbers of the batch, UInt32.
-        finish: Float, see :class:`Instances`, or None.
-    """
+    """The part of a batch that is traced at once."""
 
     images: tuple[int, int]
-    sight: RayQuery
+    """First and last + 1 image."""
+    query: RayQuery
+    """What the rays look for."""
     bounds: ImageBounds
+    """Of the part's instances."""
     camera: Any
+    """Float, see :class:`Instances`."""
     key: Any
-    finish: Any = None
+    """Of all random numbers of the batch, UInt32."""
+    appearance: Any = None
+    """Float, see :class:`Instances`, or None."""
 
     @property
     def num_images(self) -> int:
@@ -74,38 +68,37 @@ class View:
 
 @dataclass(frozen=True)
 class Hits:
-    """Rays that hit their object.
-
-    Attributes:
-        lane: Which rays.
-        at: Where they pass.
-        record: Faces hit, Mitsuba's preliminary intersections.
-        occlusion: Of the samples that the rays belong to.
-        blockers: What keeps the light from the hits, or None.
-    """
+    """Rays that hit their object."""
 
     lane: Any
-    at: Places
+    """Which rays."""
+    at: LocationsOfRays
+    """Where they pass."""
     record: Any
+    """Faces hit, Mitsuba's preliminary intersections."""
     occlusion: Occlusion
+    """Of the samples that the rays belong to."""
     blockers: Blockers | None
+    """What keeps the light from the hits, or None."""
 
 
 class Launch:
     """Rays over one part of a batch, in front of its backgrounds (flat [b, c, h, w])."""
 
-    def __init__(self, setting: RenderSettings, view: View, background: Any) -> None:
-        self.set, self.view, self.background = setting, view, background
-        self.mi, self.dr = setting.mi, setting.dr
+    def __init__(self, settings: RenderSettings, view: View, background: Any) -> None:
+        self.set, self.view, self.background = settings, view, background
+        self.mi, self.dr = settings.mi, settings.dr
 
-    def trace(self, rows: Instances, lane: Any, at: Places, per_group: int, num_groups: int) -> Hits | None:
+    def trace(
+        self, instances: Instances, lane: Any, at: LocationsOfRays, per_group: int, num_groups: int
+    ) -> Hits | None:
         """Trace rays and keep those that hit; None where none does. Samples come in groups, see :class:`Occlusion`."""
         mi, dr, tracer = self.mi, self.dr, self.set.tracer
         if len(lane) == 0:
             return None
-        place, inside = at(lane)
-        ray = rows.ray(place.row, place.x, place.y)
-        record = tracer.intersect(rows, place.row, ray, inside, self.view.sight.reach_from_m)
+        location, inside = at(lane)
+        ray = instances.ray(location.instance, location.x, location.y)
+        record = tracer.intersect(instances, location.instance, ray, inside, self.view.query.reach_from_m)
         dr.eval(record)
         hit = dr.compress(record.is_valid())
         if len(hit) == 0:
@@ -115,36 +108,36 @@ class Launch:
         occlusion = Occlusion(mi, dr, self.set.num_slots, per_group)
         if self.set.num_slots > 1:
             occlusion.build(at(lane)[0], record.t, num_groups)
-        return Hits(lane, at, record, occlusion, self._blockers(rows, at(lane)[0], record.t))
+        return Hits(lane, at, record, occlusion, self._blockers(instances, at(lane)[0], record.t))
 
-    def _blockers(self, rows: Instances, place: Place, depth_m: Any) -> Blockers | None:
-        if not self.set.object_shadows or self.set.num_slots == 1 or not self.view.sight.shaded:
+    def _blockers(self, instances: Instances, location: ImageLocation, depth_m: Any) -> Blockers | None:
+        if not self.set.object_shadows or self.set.num_slots == 1 or not self.view.query.shaded:
             return None
         blockers = Blockers(self.mi, self.dr, self.set.tracer, self.set.num_slots)
-        blockers.find(rows.detached(), place, depth_m)
+        blockers.find(instances.detached(), location, depth_m)
         return blockers
 
-    def contributions(self, rows: Instances, hits: Hits) -> tuple[Place, list[Any]]:
+    def contributions(self, instances: Instances, hits: Hits) -> tuple[ImageLocation, list[Any]]:
         """What each hit adds to the colour of its sample: weight · (color − background), one array a channel."""
-        place, _ = hits.at(hits.lane)
-        lit = hits.blockers.lit(rows, place) if hits.blockers else 1.0
-        colors = self.view.sight.colors(self.set.tracer, rows, place, hits.record, lit)
-        weight = hits.occlusion.weight(rows, place, hits.record.t)
-        behind = self.look(self.background, place.pixel)
-        return place, [weight * (color - under) for color, under in zip(colors, behind, strict=True)]
+        location, _ = hits.at(hits.lane)
+        lit = hits.blockers.lit(instances, location) if hits.blockers else 1.0
+        colors = self.view.query.colors(self.set.tracer, instances, location, hits.record, lit)
+        weight = hits.occlusion.weight(instances, location, hits.record.t)
+        behind = self.channels_at(self.background, location.pixel)
+        return location, [weight * (color - under) for color, under in zip(colors, behind, strict=True)]
 
-    def weighed(self, rows: Instances, hits: Hits, adjoint: Any) -> tuple[Place, Any]:
+    def weighed(self, instances: Instances, hits: Hits, adjoint: Any) -> tuple[ImageLocation, Any]:
         """The contributions' scalar product with the adjoint at their pixels."""
-        place, colors = self.contributions(rows, hits)
-        return place, sum(c * w for c, w in zip(colors, self.look(adjoint, place.pixel), strict=True))
+        location, colors = self.contributions(instances, hits)
+        return location, sum(c * w for c, w in zip(colors, self.channels_at(adjoint, location.pixel), strict=True))
 
-    def look(self, flat: Any, pixel: Any) -> list[Any]:
+    def channels_at(self, flat: Any, pixel: Any) -> list[Any]:
         """The channels of a flat [b, c, h, w] array at pixels."""
         return [self.dr.gather(self.mi.Float, flat, i) for i in self.planes(pixel)]
 
     def planes(self, pixel: Any) -> list[Any]:
         """Where a pixel's channels are in a flat [b, c, h, w] array."""
-        area, channels = self.set.width * self.set.height, self.view.sight.channels
+        area, channels = self.set.width * self.set.height, self.view.query.channels
         first = pixel + (pixel // area) * ((channels - 1) * area)
         return [first + channel * area for channel in range(channels)]
 

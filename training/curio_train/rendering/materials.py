@@ -46,7 +46,7 @@ def finishes(
         ambient: [count, 1], what the renderer's ambient radiance is multiplied by.
         gloss: [count, 1], strength of the light's reflection.
         sharpness: [count, 1], exponent of its fall-off.
-        shadow: [count, 1], share of the light that the object keeps from itself.
+        shadow: [count, 1], fraction of the light that the object keeps from itself.
         grain: [count, 1], amplitude of the logarithm of what waves do to the albedo.
         bumps: [count, 1], by how much waves tilt the normal.
         waves: [count, NUM_WAVES, 4], their vectors in radians a radius of the object, and their phases.
@@ -75,10 +75,10 @@ def random_appearances(count: int, random: np.random.Generator) -> Float[Tensor,
     )
 
 
-def in_object_frame(finish: Tensor, rotation: Float[Tensor, "batch slots 3 3"]) -> Tensor:
+def in_object_frame(appearance: Tensor, rotation: Float[Tensor, "batch slots 3 3"]) -> Tensor:
     """Finishes whose fill light is turned from the camera's frame to the objects'."""
-    fill = (rotation.transpose(-1, -2) @ finish[..., :3, None])[..., 0]
-    return torch.cat([fill, finish[..., 3:]], dim=-1)
+    fill = (rotation.transpose(-1, -2) @ appearance[..., :3, None])[..., 0]
+    return torch.cat([fill, appearance[..., 3:]], dim=-1)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -92,28 +92,25 @@ def log_uniform(low: float, high: float, shape: tuple[int, ...], random: np.rand
 
 @dataclass(frozen=True)
 class Appearance:
-    """The finishes of the rows that hits belong to; see :func:`finishes`.
-
-    Attributes:
-        mi: Mitsuba.
-        dr: Dr.Jit.
-        scene: In which surfaces shade themselves.
-        fill: Vector of the second light, in the objects' frames.
-        ambient, gloss, sharpness, shadow, grain, bumps: One value a hit.
-        waves: Vector and phase of each.
-    """
+    """The appearances of the rows that hits belong to; see :func:`finishes`."""
 
     mi: ModuleType
+    """Mitsuba."""
     dr: ModuleType
+    """Dr.Jit."""
     scene: Any
+    """In which surfaces shade themselves."""
     fill: Any
+    """Vector of the second light, in the objects' frames."""
     ambient: Any
     gloss: Any
     sharpness: Any
     shadow: Any
     grain: Any
     bumps: Any
+    """One value a hit."""
     waves: list[tuple[Any, Any]]
+    """Vector and phase of each."""
 
     @staticmethod
     def of_values(mi: ModuleType, dr: ModuleType, scene: Any, values: list[Any]) -> "Appearance":

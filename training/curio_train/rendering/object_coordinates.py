@@ -51,9 +51,9 @@ class ObjectCoordinateMap:
             little that is; where it is not seen they mean nothing. And where it fills half of a patch or more.
         """
         over_black, over_white = (self._draw(rotation, translation_m, matrices, shade) for shade in (0.0, 1.0))
-        share = (1 - (over_white - over_black).mean(dim=1, keepdim=True)).clamp(min=1e-3)
-        linear = linear_from_srgb((over_black / share).clamp(0, 1))
-        return (linear - _MIDDLE) / _REACH, share[:, 0] >= _LEAST_SEEN
+        alpha = (1 - (over_white - over_black).mean(dim=1, keepdim=True)).clamp(min=1e-3)
+        linear = linear_from_srgb((over_black / alpha).clamp(0, 1))
+        return (linear - _MIDDLE) / _REACH, alpha[:, 0] >= _LEAST_SEEN
 
     def _draw(self, rotation: Tensor, translation_m: Tensor, matrices: np.ndarray, shade: float) -> Tensor:
         count = len(rotation)

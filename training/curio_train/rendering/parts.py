@@ -36,20 +36,17 @@ class Placement:
 
 @dataclass(frozen=True)
 class StaticScene:
-    """What the renderer traces.
-
-    Attributes:
-        scene: The ``mitsuba.Scene``.
-        placements: One a kind.
-        edges: Silhouette candidates of all kinds, in scene coordinates.
-    """
+    """What the renderer traces."""
 
     scene: Any
+    """The ``mitsuba.Scene``."""
     placements: tuple[Placement, ...]
+    """One a kind."""
     edges: EdgeTable
+    """Silhouette candidates of all kinds, in scene coordinates."""
 
 
-def place(meshes: Sequence[Mesh]) -> tuple[Placement, ...]:
+def location(meshes: Sequence[Mesh]) -> tuple[Placement, ...]:
     """Unit size and a place of its own for each mesh."""
     placements = []
     for kind, mesh in enumerate(meshes):
@@ -71,7 +68,7 @@ def build_scene(mitsuba: Any, meshes: Sequence[Mesh]) -> StaticScene:
     """
     if not meshes:
         raise RendererError("no mesh to render")
-    placements = place(meshes)
+    placements = location(meshes)
     shapes, edges = {}, []
     for kind, (mesh, placement) in enumerate(zip(meshes, placements, strict=True)):
         unit = (mesh.vertices_m - placement.center_m) / placement.radius_m

@@ -12,31 +12,31 @@ from curio_train.rendering.pixels import PixelSamples
 class Pass:
     """One view: what was hit in the forward pass is kept for the backward pass."""
 
-    def __init__(self, setting: RenderSettings, view: View) -> None:
-        self.set, self.view = setting, view
-        self.mi, self.dr = setting.mi, setting.dr
+    def __init__(self, settings: RenderSettings, view: View) -> None:
+        self.set, self.view = settings, view
+        self.mi, self.dr = settings.mi, settings.dr
         self.hits: Hits | None = None
 
     def image(self, values: Any, background: Any) -> Any:
         """The flat [b, c, h, w] image; keeps what was hit."""
-        dr, rows, launch = self.dr, self._rows(values), Launch(self.set, self.view, background)
-        self.hits = self._trace_pixels(launch, rows)
+        dr, instances, launch = self.dr, self._instances(values), Launch(self.set, self.view, background)
+        self.hits = self._trace_pixels(launch, instances)
         out = dr.opaque(background)  # memory of its own: the background's belongs to torch
         if self.hits:
-            place, colors = launch.contributions(rows, self.hits)
-            for color, where in zip(colors, launch.planes(place.pixel), strict=True):
+            location, colors = launch.contributions(instances, self.hits)
+            for color, where in zip(colors, launch.planes(location.pixel), strict=True):
                 dr.scatter_add(out, color / self.set.samples_per_pixel, where, mode=dr.ReduceMode.Local)
         dr.eval(out)
         return out
 
     def gradient(self, values: Any, background: Any, image: Any, adjoint: Any) -> Any:
         """Gradient by ``values`` of the scalar product of ``image`` (as :meth:`image` gave it) and ``adjoint``."""
-        dr, rows = self.dr, self._rows(values)
+        dr, instances = self.dr, self._instances(values)
         dr.enable_grad(values)
         if self.hits:
-            _, value = Launch(self.set, self.view, background).weighed(rows, self.hits, adjoint)
+            _, value = Launch(self.set, self.view, background).weighed(instances, self.hits, adjoint)
             dr.backward(value / self.set.samples_per_pixel)
-        moved = Outlines(self.set, self.view, background).displacement(rows, image, adjoint)
+        moved = Outlines(self.set, self.view, background).displacement(instances, image, adjoint)
         if moved is not None:
             dr.backward(moved)
         gradient = dr.grad(values)
@@ -49,21 +49,23 @@ class Pass:
         dr, launch = self.dr, Launch(self.set, self.view, background)
         through = dr.opaque(adjoint)
         if self.hits:
-            place, _ = self.hits.at(self.hits.lane)
-            hidden = self.hits.occlusion.weight(self._rows(values), place, self.hits.record.t)
+            location, _ = self.hits.at(self.hits.lane)
+            hidden = self.hits.occlusion.weight(self._instances(values), location, self.hits.record.t)
             hidden /= self.set.samples_per_pixel
-            for weight, where in zip(launch.look(adjoint, place.pixel), launch.planes(place.pixel), strict=True):
+            for weight, where in zip(
+                launch.channels_at(adjoint, location.pixel), launch.planes(location.pixel), strict=True
+            ):
                 dr.scatter_add(through, -hidden * weight, where, mode=dr.ReduceMode.Local)
         dr.eval(through)
         return through
 
-    def _rows(self, values: Any) -> Instances:
-        return replace(self.view.sight.rows(values, self.view.camera), finish=self.view.finish)
+    def _instances(self, values: Any) -> Instances:
+        return replace(self.view.query.instances(values, self.view.camera), appearance=self.view.appearance)
 
-    def _trace_pixels(self, launch: Launch, rows: Instances) -> Hits | None:
-        setting, view = self.set, self.view
-        size, area = (setting.width, setting.height), setting.width * setting.height
+    def _trace_pixels(self, launch: Launch, instances: Instances) -> Hits | None:
+        settings, view = self.set, self.view
+        size, area = (settings.width, settings.height), settings.width * settings.height
         key = view.key + self.dr.opaque(self.mi.UInt32, view.images[0] * area)
-        samples = PixelSamples(self.mi, self.dr, view.bounds, setting.num_slots, size, setting.samples_per_pixel, key)
+        samples = PixelSamples(self.mi, self.dr, view.bounds, settings.num_slots, size, settings.samples_per_pixel, key)
         lane = self.dr.arange(self.mi.UInt32, len(samples))
-        return launch.trace(rows, lane, samples.at, setting.samples_per_pixel, view.num_images * area)
+        return launch.trace(instances, lane, samples.at, settings.samples_per_pixel, view.num_images * area)

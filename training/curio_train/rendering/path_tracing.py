@@ -77,10 +77,10 @@ def path_traced(
 def ground_disk(mitsuba: Any, ground: Ground) -> dict[str, Any]:
     """Mitsuba's unit disk, brought below the camera."""
     up = np.asarray(ground.up, dtype=np.float64)
-    place, linear = -ground.camera_height_m * up, float(linear_from_srgb(np.array(ground.albedo_srgb)))
+    location, linear = -ground.camera_height_m * up, float(linear_from_srgb(np.array(ground.albedo_srgb)))
     transform = mitsuba.ScalarTransform4f
     side = np.eye(3)[np.argmin(np.abs(up))]
-    to_world = transform().look_at(origin=place.tolist(), target=(place + up).tolist(), up=side.tolist())
+    to_world = transform().look_at(origin=location.tolist(), target=(location + up).tolist(), up=side.tolist())
     reflectance = {"type": "rgb", "value": linear}
     return {
         "type": "disk",

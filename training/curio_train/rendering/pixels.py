@@ -1,4 +1,4 @@
-"""Which pixels each row traces, in tiles of 2x2, and where in a pixel each of its samples lies."""
+"""Which pixels each instance traces, in tiles of 2x2, and where in a pixel each of its samples lies."""
 
 import math
 from dataclasses import dataclass
@@ -14,21 +14,18 @@ TILE_AREA = TILE * TILE
 
 
 @dataclass(frozen=True)
-class Place:
-    """Points in images, with one entry a ray.
+class ImageLocation:
+    """Points in images, with one entry a ray."""
 
-    Attributes:
-        row: Object and image.
-        pixel: (image · height + line) · width + column.
-        sample: Which of its image's samples this is; samples with equal numbers are the same point.
-        x, y: Position in pixels, centres at integers.
-    """
-
-    row: Any
+    instance: Any
+    """Number of the instance."""
     pixel: Any
+    """(image · height + line) · width + column."""
     sample: Any
+    """Which of its image's samples this is; samples with equal numbers are the same point."""
     x: Any
     y: Any
+    """Position in pixels, centres at integers."""
 
 
 class PixelSamples:
@@ -49,21 +46,21 @@ class PixelSamples:
         Args:
             mi: Mitsuba.
             dr: Dr.Jit.
-            bounds: Of each row.
-            num_slots: Rows an image.
+            bounds: Of each instance.
+            num_slots: Instances an image.
             size: Width and height of the images.
-            samples_per_pixel: Rays a pixel and row.
+            samples_per_pixel: Rays a pixel and instance.
             key: UInt32, added to the pixel's number to draw the jitter: depends on seed and place in the batch alone.
         """
         self.mi, self.dr = mi, dr
         self.num_slots, self.size, self.samples_per_pixel, self.key = num_slots, size, samples_per_pixel, key
-        self.tile_row, self.tile_corner = self._list_tiles(bounds)
+        self.tile_instance, self.tile_corner = self._list_tiles(bounds)
 
     def __len__(self) -> int:
-        return len(self.tile_row) * TILE_AREA * self.samples_per_pixel
+        return len(self.tile_instance) * TILE_AREA * self.samples_per_pixel
 
     def _list_tiles(self, bounds: ImageBounds) -> tuple[Any, Any]:
-        """Row and corner (line · width + column) of each tile that the bounds touch."""
+        """Instance and corner (line · width + column) of each tile that the bounds touch."""
         mi, dr = self.mi, self.dr
         x0, y0, x1, y1 = bounds.rectangle.T
         x0, y0 = x0 // TILE, y0 // TILE
@@ -71,20 +68,20 @@ class PixelSamples:
         counts = np.where((x1 > x0 * TILE) & (y1 > y0 * TILE), across * down, 0)
         if counts.sum() == 0:
             return mi.UInt32(), mi.UInt32()
-        row = mi.UInt32(np.repeat(np.arange(len(counts), dtype=np.uint32), counts))
+        instance = mi.UInt32(np.repeat(np.arange(len(counts), dtype=np.uint32), counts))
         start, x0, y0, across = (mi.UInt32(v.astype(np.uint32)) for v in (np.cumsum(counts) - counts, x0, y0, across))
-        local = dr.arange(mi.UInt32, len(row)) - dr.gather(mi.UInt32, start, row)
+        local = dr.arange(mi.UInt32, len(instance)) - dr.gather(mi.UInt32, start, instance)
         # Also the lanes beside the last one divide, and those gather zeros.
-        across = dr.maximum(dr.gather(mi.UInt32, across, row), 1)
+        across = dr.maximum(dr.gather(mi.UInt32, across, instance), 1)
         line = local // across
-        column = (dr.gather(mi.UInt32, x0, row) + local - line * across) * TILE
-        line = (dr.gather(mi.UInt32, y0, row) + line) * TILE
-        kept = dr.compress(self._touched(bounds, row, column, line))
-        row, corner = (dr.gather(mi.UInt32, v, kept) for v in (row, line * self.size[0] + column))
-        dr.eval(row, corner)
-        return row, corner
+        column = (dr.gather(mi.UInt32, x0, instance) + local - line * across) * TILE
+        line = (dr.gather(mi.UInt32, y0, instance) + line) * TILE
+        kept = dr.compress(self._touched(bounds, instance, column, line))
+        instance, corner = (dr.gather(mi.UInt32, v, kept) for v in (instance, line * self.size[0] + column))
+        dr.eval(instance, corner)
+        return instance, corner
 
-    def _touched(self, bounds: ImageBounds, row: Any, column: Any, line: Any) -> Any:
+    def _touched(self, bounds: ImageBounds, instance: Any, column: Any, line: Any) -> Any:
         """Whether the object's bounds, seen from each direction, overlap the tile."""
         mi, dr = self.mi, self.dr
         low, high = mi.Float(bounds.low.ravel()), mi.Float(bounds.high.ravel())
@@ -92,28 +89,30 @@ class PixelSamples:
         touched = mi.Bool(True)
         for i, (a, b) in enumerate(DIRECTIONS):
             middle, half = a * x + b * y, (abs(a) + abs(b)) * TILE / 2
-            at = row * len(DIRECTIONS) + i
+            at = instance * len(DIRECTIONS) + i
             touched &= dr.gather(mi.Float, low, at) <= middle + half
             touched &= dr.gather(mi.Float, high, at) >= middle - half
         return touched
 
-    def at(self, lane: Any) -> tuple[Place, Any]:
+    def at(self, lane: Any) -> tuple[ImageLocation, Any]:
         """Where a ray passes, and whether that is inside the image (sizes may be odd)."""
         mi, dr, spp, (width, height) = self.mi, self.dr, self.samples_per_pixel, self.size
         entry = lane // spp
         tile = entry // TILE_AREA
         within = entry - tile * TILE_AREA
-        row, corner = dr.gather(mi.UInt32, self.tile_row, tile), dr.gather(mi.UInt32, self.tile_corner, tile)
+        instance, corner = dr.gather(mi.UInt32, self.tile_instance, tile), dr.gather(mi.UInt32, self.tile_corner, tile)
         line = corner // width
         column = corner - line * width + within % TILE
         line += within // TILE
-        pixel = (row // self.num_slots * height + line) * width + column
+        pixel = (instance // self.num_slots * height + line) * width + column
         dx, dy = self._jitter(pixel, lane - entry * spp)
-        place = Place(row, pixel, pixel * spp + lane - entry * spp, mi.Float(column) + dx, mi.Float(line) + dy)
-        return place, (column < width) & (line < height)
+        location = ImageLocation(
+            instance, pixel, pixel * spp + lane - entry * spp, mi.Float(column) + dx, mi.Float(line) + dy
+        )
+        return location, (column < width) & (line < height)
 
     def _jitter(self, pixel: Any, sample: Any) -> tuple[Any, Any]:
-        """Offset from the pixel's centre in [−0.5, 0.5), the same for all rows of an image.
+        """Offset from the pixel's centre in [−0.5, 0.5), the same for all instances of an image.
 
         With n² samples a pixel, each has its own cell of n x n, its own column of n² and its own row of n² (the
         canonical arrangement of multi-jittered sampling, Chiu et al. 1994), rotated at random in each pixel.

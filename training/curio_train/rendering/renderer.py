@@ -15,7 +15,7 @@ from curio_train.meshes.simplification import simplified
 from curio_train.rendering.bounds import project_bounds
 from curio_train.rendering.edge_sampling import OutlineSampler
 from curio_train.rendering.ground import Ground
-from curio_train.rendering.instances import INSTANCE_SIZE
+from curio_train.rendering.instances import INSTANCE_SIZE, VALUES
 from curio_train.rendering.launch import RenderSettings, View
 from curio_train.rendering.materials import in_object_frame
 from curio_train.rendering.parts import build_scene
@@ -34,7 +34,7 @@ class Renderer:
     """Renders batches of posed meshes over backgrounds, differentiably.
 
     Shading is albedo · (ambient + max(0, n·l)) in linear colour; samples are encoded to sRGB and composited. The
-    gradient of everything that moves has an interior and a silhouette part (see silhouettes.py).
+    gradient of everything that moves has an interior and a silhouette part (see edge_gradients.py).
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Renderer:
         static = build_scene(mitsuba, [simplified(mesh, max(MIN_FACES, width * height)) for mesh in meshes])
         if not kind_of_slot or not all(0 <= k < len(meshes) for k in kind_of_slot):
             raise RendererError(f"kind_of_slot is {list(kind_of_slot)}; every slot needs one of {len(meshes)} meshes")
-        self.setting = RenderSettings(
+        self.settings = RenderSettings(
             mitsuba,
             drjit,
             LayerTracer(mitsuba, drjit, static.scene, ambient),
@@ -100,7 +100,7 @@ class Renderer:
         light: Float[Tensor, "batch 3"],
         color: Float[Tensor, "batch slots 3"] | None = None,
         confidence: Float[Tensor, "batch slots"] | None = None,
-        finish: Float[Tensor, "batch slots size"] | None = None,
+        appearance: Float[Tensor, "batch slots size"] | None = None,
         seed: int = 0,
     ) -> Float[Tensor, "batch 3 height width"]:
         """Render a batch.
@@ -113,7 +113,7 @@ class Renderer:
             light: Camera frame, towards the light; its length is the strength.
             color: sRGB albedo that multiplies the mesh's own; None: 1.
             confidence: In [0, 1]; None: 1.
-            finish: Of the surfaces, see finish.py; None: all are dull and smooth.
+            appearance: Of the surfaces, see materials.py; None: all are dull and smooth.
             seed: Of the jitter within pixels and along outlines.
 
         Returns:
@@ -122,20 +122,20 @@ class Renderer:
         Raises:
             RendererError: The camera matrix has skew or the shapes differ.
         """
-        setting = self.setting
-        expected = (rotation.shape[0], 3, setting.height, setting.width)
-        if tuple(backgrounds.shape) != expected or rotation.shape[1] != setting.num_slots:
+        settings = self.settings
+        expected = (rotation.shape[0], 3, settings.height, settings.width)
+        if tuple(backgrounds.shape) != expected or rotation.shape[1] != settings.num_slots:
             raise RendererError(
                 f"rotations {tuple(rotation.shape)} and backgrounds {tuple(backgrounds.shape)} do not fit a renderer "
-                f"of {setting.num_slots} slots and {setting.width}x{setting.height} pixels"
+                f"of {settings.num_slots} slots and {settings.width}x{settings.height} pixels"
             )
         device = rotation.device
         rotation, translation_m, light, color, confidence = _on_host(rotation, translation_m, light, color, confidence)
-        rows = self._pack(rotation, translation_m, light, color, confidence)
+        instances = self._pack(rotation, translation_m, light, color, confidence)
         corners_m, intrinsics = self._corners(rotation, translation_m), _intrinsics(camera_matrix, len(rotation))
-        turned = None if finish is None else in_object_frame(finish.cpu(), rotation.detach())
-        views = self._views(corners_m, intrinsics, Objects(setting.mi, setting.dr), seed, turned)
-        return _Render.apply(rows, backgrounds.cpu(), setting, views).to(device)
+        turned = None if appearance is None else in_object_frame(appearance.cpu(), rotation.detach())
+        views = self._views(corners_m, intrinsics, Objects(settings.mi, settings.dr), seed, turned)
+        return _Render.apply(instances, backgrounds.cpu(), settings, views).to(device)
 
     def shadows(
         self,
@@ -148,7 +148,7 @@ class Renderer:
         confidence: Float[Tensor, "batch slots"] | None = None,
         seed: int = 0,
     ) -> Float[Tensor, "batch 1 height width"]:
-        """Share of the light that the objects keep from the ground seen in each pixel, see shadows.py.
+        """Fraction of the light that the objects keep from the ground seen in each pixel, see shadows.py.
 
         Arguments are those of a call; gradients flow to pose, light and confidence. Light from below the ground's
         horizon throws no shadow.
@@ -156,15 +156,15 @@ class Renderer:
         Raises:
             RendererError: The camera matrix has skew.
         """
-        setting, device = self.setting, rotation.device
+        settings, device = self.settings, rotation.device
         rotation, translation_m, light, confidence = _on_host(rotation, translation_m, light, confidence)
-        rows = self._pack(rotation, translation_m, light, None, confidence)
-        towards = np.repeat(light.detach().numpy(), setting.num_slots, axis=0)
+        instances = self._pack(rotation, translation_m, light, None, confidence)
+        towards = np.repeat(light.detach().numpy(), settings.num_slots, axis=0)
         corners_m = fallen(self._corners(rotation, translation_m), towards, ground)
-        sight = GroundShadows(setting.mi, setting.dr, ground)
-        views = self._views(corners_m, _intrinsics(camera_matrix, len(rotation)), sight, seed)
-        unshaded = torch.zeros(len(rotation), 1, setting.height, setting.width)
-        return _Render.apply(rows, unshaded, setting, views).to(device)
+        query = GroundShadows(settings.mi, settings.dr, ground)
+        views = self._views(corners_m, _intrinsics(camera_matrix, len(rotation)), query, seed)
+        unshaded = torch.zeros(len(rotation), 1, settings.height, settings.width)
+        return _Render.apply(instances, unshaded, settings, views).to(device)
 
     def _corners(self, rotation: Tensor, translation_m: Tensor) -> np.ndarray:
         """[batch · slots, n, 3], of polytopes around the objects, camera frame."""
@@ -176,7 +176,7 @@ class Renderer:
     def _pack(
         self, rotation: Tensor, translation_m: Tensor, light: Tensor, color: Tensor | None, confidence: Tensor | None
     ) -> Tensor:
-        """[batch · slots, 19], the columns of :class:`Instances`."""
+        """[batch · slots, INSTANCE_SIZE], in the order of :data:`~curio_train.rendering.instances.VALUES`."""
         batch, slots = rotation.shape[:2]
         transposed = rotation.transpose(-1, -2)
         turned = (transposed @ translation_m[..., None])[..., 0]
@@ -185,25 +185,36 @@ class Renderer:
         light_in_object = (transposed @ light[:, None, :, None])[..., 0]
         albedo = linear_from_srgb(color) if color is not None else torch.ones(batch, slots, 3)
         confidence = confidence if confidence is not None else torch.ones(batch, slots)
-        parts = [origin, matrix.flatten(2), light_in_object, albedo, confidence[..., None]]
-        return torch.cat(parts, dim=-1).reshape(-1, INSTANCE_SIZE)
+        parts = {
+            "origin": origin,
+            "matrix": matrix.flatten(2),
+            "light": light_in_object,
+            "albedo": albedo,
+            "confidence": confidence[..., None],
+        }
+        return torch.cat([parts[name] for name in VALUES], dim=-1).reshape(-1, INSTANCE_SIZE)
 
     def _views(
-        self, corners_m: np.ndarray, intrinsics: np.ndarray, sight: RayQuery, seed: int, finish: Tensor | None = None
+        self,
+        corners_m: np.ndarray,
+        intrinsics: np.ndarray,
+        query: RayQuery,
+        seed: int,
+        appearance: Tensor | None = None,
     ) -> list[View]:
-        setting, n = self.setting, self.setting.num_slots
-        per_row = np.repeat(intrinsics, n, axis=0)
-        bounds = project_bounds(corners_m, per_row, setting.width, setting.height)
-        camera = np.hstack([per_row, np.tile(self._offset.numpy(), (len(intrinsics), 1))])
-        key = setting.dr.opaque(setting.mi.UInt32, seed * 2654435761 & 0xFFFFFFFF)
-        num_rays = bounds.num_pixels.reshape(-1, n).sum(1) * setting.samples_per_pixel
+        settings, n = self.settings, self.settings.num_slots
+        per_instance = np.repeat(intrinsics, n, axis=0)
+        bounds = project_bounds(corners_m, per_instance, settings.width, settings.height)
+        camera = np.hstack([per_instance, np.tile(self._offset.numpy(), (len(intrinsics), 1))])
+        key = settings.dr.opaque(settings.mi.UInt32, seed * 2654435761 & 0xFFFFFFFF)
+        num_rays = bounds.num_pixels.reshape(-1, n).sum(1) * settings.samples_per_pixel
         views, first = [], 0
         while first < len(intrinsics):
             last = first + max(1, int(np.searchsorted(np.cumsum(num_rays[first:]), MAX_RAYS, side="right")))
             low, high = first * n, last * n
-            part = setting.mi.Float(camera[low:high].ravel())
-            own = None if finish is None else setting.mi.Float(finish.flatten(0, 1)[low:high].numpy().ravel())
-            views.append(View((first, last), sight, bounds.part(low, high), part, key, own))
+            part = settings.mi.Float(camera[low:high].ravel())
+            own = None if appearance is None else settings.mi.Float(appearance.flatten(0, 1)[low:high].numpy().ravel())
+            views.append(View((first, last), query, bounds.part(low, high), part, key, own))
             first = last
         return views
 
@@ -212,35 +223,37 @@ class _Render(torch.autograd.Function):
     """The bridge between torch and Dr.Jit: whole arrays of the host, once each way a view."""
 
     @staticmethod
-    def forward(ctx: Any, rows: Tensor, backgrounds: Tensor, setting: RenderSettings, views: list[View]) -> Tensor:
-        ctx.setting, ctx.passes = setting, [Pass(setting, view) for view in views]
+    def forward(
+        ctx: Any, instances: Tensor, backgrounds: Tensor, settings: RenderSettings, views: list[View]
+    ) -> Tensor:
+        ctx.settings, ctx.passes = settings, [Pass(settings, view) for view in views]
         parts = []
-        for part, (values, background) in zip(ctx.passes, _parts(ctx, rows, backgrounds), strict=True):
+        for part, (values, background) in zip(ctx.passes, _parts(ctx, instances, backgrounds), strict=True):
             parts.append(_tensor(part.image(values, background), (-1, *backgrounds.shape[1:])))
         images = torch.cat(parts) if len(parts) > 1 else parts[0]
-        ctx.save_for_backward(rows, backgrounds, images)
+        ctx.save_for_backward(instances, backgrounds, images)
         return images
 
     @staticmethod
     def backward(ctx: Any, adjoint: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
-        rows, *images = ctx.saved_tensors
+        instances, *images = ctx.saved_tensors
         gradients, behind = [], []
-        for part, arrays in zip(ctx.passes, _parts(ctx, rows, *images, adjoint), strict=True):
+        for part, arrays in zip(ctx.passes, _parts(ctx, instances, *images, adjoint), strict=True):
             gradients.append(_tensor(part.gradient(*arrays), (-1, INSTANCE_SIZE)))
             if ctx.needs_input_grad[1]:
                 values, background, _, weights = arrays
                 through = part.gradient_of_background(values, background, weights)
                 behind.append(_tensor(through, (-1, *adjoint.shape[1:])))
-        return torch.cat(gradients).to(rows), torch.cat(behind).to(adjoint) if behind else None, None, None
+        return torch.cat(gradients).to(instances), torch.cat(behind).to(adjoint) if behind else None, None, None
 
 
-def _parts(ctx: Any, rows: Tensor, *images: Tensor) -> Iterator[list[Any]]:
-    """Each view's rows and images as flat Dr.Jit arrays."""
+def _parts(ctx: Any, instances: Tensor, *images: Tensor) -> Iterator[list[Any]]:
+    """Each view's instances and images as flat Dr.Jit arrays."""
     for part in ctx.passes:
         first, last = part.view.images
-        n = ctx.setting.num_slots
-        tensors = [rows[first * n : last * n], *(image[first:last] for image in images)]
-        yield [ctx.setting.mi.Float(t.detach().float().contiguous().view(-1)) for t in tensors]
+        n = ctx.settings.num_slots
+        tensors = [instances[first * n : last * n], *(image[first:last] for image in images)]
+        yield [ctx.settings.mi.Float(t.detach().float().contiguous().view(-1)) for t in tensors]
 
 
 def _tensor(array: Any, shape: tuple[int, ...]) -> Tensor:

@@ -17,7 +17,7 @@ import numpy as np
 
 from curio_train.rendering.ground import Ground
 from curio_train.rendering.instances import Instances
-from curio_train.rendering.pixels import Place
+from curio_train.rendering.pixels import ImageLocation
 from curio_train.rendering.tracing import LayerTracer, RayQuery
 
 _LOWEST_SUN = 1e-3
@@ -27,11 +27,11 @@ _FAR = 1e6  # where parallel light comes from, in radii of the objects
 
 
 def fallen(corners_m: np.ndarray, light: np.ndarray, ground: Ground) -> np.ndarray:
-    """Where points [rows, n, 3] throw their shadows on the ground, camera frame; NaN without light from above.
+    """Where points [instances, n, 3] throw their shadows on the ground, camera frame; NaN without light from above.
 
     Args:
         corners_m: Camera frame.
-        light: [rows, 3], towards the light, camera frame.
+        light: [instances, 3], towards the light, camera frame.
         ground: The plane.
     """
     up = np.asarray(ground.up, dtype=light.dtype)
@@ -44,34 +44,31 @@ def fallen(corners_m: np.ndarray, light: np.ndarray, ground: Ground) -> np.ndarr
 
 @dataclass(frozen=True)
 class ShadowRows(Instances):
-    """Rows as the ground sees them along the light.
-
-    Attributes:
-        plane: The ground's normal in the camera frame, and the camera's height above it, 4 opaque floats.
-    """
+    """Rows as the ground sees them along the light."""
 
     plane: Any = None
+    """The ground's normal in the camera frame, and the camera's height above it, 4 opaque floats."""
 
-    def ray(self, row: Any, x: Any, y: Any) -> Any:
+    def ray(self, instance: Any, x: Any, y: Any) -> Any:
         """From the ground's point that is seen at pixel (x, y) towards the light; nowhere above the horizon."""
         dr, (*up, height) = self.dr, self.plane
-        seen = self.mi.Vector3f(*self.direction(row, x, y))
+        seen = self.mi.Vector3f(*self.direction(instance, x, y))
         fall = -(up[0] * seen.x + up[1] * seen.y + up[2] * seen.z)
         point = seen * dr.select(fall > 0, height / dr.maximum(fall, 1e-9), dr.nan)
-        return self.mi.Ray3f(self.origin(row) + self.turned(row, point), self.light(row))
+        return self.mi.Ray3f(self.origin(instance) + self.turned(instance, point), self.light(instance))
 
-    def toward(self, row: Any, point: Any) -> Any:
+    def toward(self, instance: Any, point: Any) -> Any:
         """Direction from a point to the light, which is far away."""
-        return self.dr.normalize(self.light(row)) * _FAR
+        return self.dr.normalize(self.light(instance)) * _FAR
 
-    def to_camera(self, row: Any, point: Any) -> Any:
+    def to_camera(self, instance: Any, point: Any) -> Any:
         """Scene frame to camera frame, carried along the light to the ground; behind the camera where no light is."""
         dr, (*up, height) = self.dr, self.plane
-        place, light = super().to_camera(row, point), self.direction_to_camera(row, self.light(row))
+        location, light = super().to_camera(instance, point), self.direction_to_camera(instance, self.light(instance))
         climb = up[0] * light.x + up[1] * light.y + up[2] * light.z
         lit = climb > _LOWEST_SUN * dr.norm(light)
-        along = (up[0] * place.x + up[1] * place.y + up[2] * place.z + height) / dr.select(lit, climb, 1)
-        return dr.select(lit, place - along * light, self.mi.Vector3f(0, 0, -1))
+        along = (up[0] * location.x + up[1] * location.y + up[2] * location.z + height) / dr.select(lit, climb, 1)
+        return dr.select(lit, location - along * light, self.mi.Vector3f(0, 0, -1))
 
 
 class GroundShadows(RayQuery):
@@ -85,11 +82,13 @@ class GroundShadows(RayQuery):
         self.mi, self.dr = mi, dr
         self.plane = [dr.opaque(mi.Float, float(v)) for v in (*ground.up, ground.camera_height_m)]
 
-    def rows(self, values: Any, camera: Any) -> ShadowRows:
+    def instances(self, values: Any, camera: Any) -> ShadowRows:
         """Rows in the light of this ground."""
         return ShadowRows(self.mi, self.dr, values, camera, plane=self.plane)
 
-    def colors(self, tracer: LayerTracer, rows: Instances, place: Place, hit: Any, lit: Any) -> list[Any]:
+    def colors(
+        self, tracer: LayerTracer, instances: Instances, location: ImageLocation, hit: Any, lit: Any
+    ) -> list[Any]:
         """All of it, whatever was hit."""
         return [1.0]
 
@@ -101,36 +100,38 @@ class Blockers:
         self.mi, self.dr, self.tracer, self.num_slots = mi, dr, tracer, num_slots
         self.table: Any = None
 
-    def find(self, rows: Instances, place: Place, depth_m: Any) -> None:
+    def find(self, instances: Instances, location: ImageLocation, depth_m: Any) -> None:
         """Trace a ray from every hit through every other slot whose bounding sphere it passes."""
         mi, dr, n = self.mi, self.dr, self.num_slots
         num_hits = len(depth_m)
         lane = dr.arange(mi.UInt32, num_hits * n)
-        row, ray = self._ray(rows, place, depth_m, lane)
-        own = row == dr.gather(mi.UInt32, place.row, lane // n)
-        kept = dr.compress(~own & self.tracer.near(rows, row, ray))
+        instance, ray = self._ray(instances, location, depth_m, lane)
+        own = instance == dr.gather(mi.UInt32, location.instance, lane // n)
+        kept = dr.compress(~own & self.tracer.near(instances, instance, ray))
         self.table = dr.zeros(mi.Float, num_hits * n)
         if len(kept) > 0:
-            row, ray = self._ray(rows, place, depth_m, kept)
-            record = self.tracer.intersect(rows, row, ray, mi.Bool(True), 0.0)
+            instance, ray = self._ray(instances, location, depth_m, kept)
+            record = self.tracer.intersect(instances, instance, ray, mi.Bool(True), 0.0)
             dr.scatter(self.table, dr.select(record.is_valid(), mi.Float(1), 0), kept)
         dr.eval(self.table)
 
-    def lit(self, rows: Instances, place: Place) -> Any:
-        """Share of the light that reaches each hit: what the confidences of all that is in between let through."""
+    def lit(self, instances: Instances, location: ImageLocation) -> Any:
+        """Fraction of the light that reaches each hit: what the confidences of all that is in between let through."""
         mi, dr, n = self.mi, self.dr, self.num_slots
-        first, image = dr.arange(mi.UInt32, len(self.table) // n) * n, place.row // n
+        first, image = dr.arange(mi.UInt32, len(self.table) // n) * n, location.instance // n
         lit = mi.Float(1)
         for slot in range(n):
-            lit *= 1 - rows.confidence(image * n + slot) * dr.gather(mi.Float, self.table, first + slot)
+            lit *= 1 - instances.confidence(image * n + slot) * dr.gather(mi.Float, self.table, first + slot)
         return lit
 
-    def _ray(self, rows: Instances, place: Place, depth_m: Any, lane: Any) -> tuple[Any, Any]:
+    def _ray(self, instances: Instances, location: ImageLocation, depth_m: Any, lane: Any) -> tuple[Any, Any]:
         """Row and ray of a lane (hit, slot), in that slot's frame."""
         mi, dr, n = self.mi, self.dr, self.num_slots
         hit = lane // n
-        owner = dr.gather(mi.UInt32, place.row, hit)
-        row = owner // n * n + lane - hit * n
-        x, y, depth = (dr.gather(mi.Float, v, hit) for v in (place.x, place.y, depth_m))
-        point = mi.Vector3f(*rows.direction(owner, x, y)) * depth
-        return row, mi.Ray3f(rows.origin(row) + rows.turned(row, point), rows.light(row))
+        owner = dr.gather(mi.UInt32, location.instance, hit)
+        instance = owner // n * n + lane - hit * n
+        x, y, depth = (dr.gather(mi.Float, v, hit) for v in (location.x, location.y, depth_m))
+        point = mi.Vector3f(*instances.direction(owner, x, y)) * depth
+        return instance, mi.Ray3f(
+            instances.origin(instance) + instances.turned(instance, point), instances.light(instance)
+        )

@@ -1,8 +1,9 @@
 """Silhouette candidates of a mesh: its edges with the two faces beside each, grouped for quick rejection (numpy).
 
 An edge can be a silhouette where its two faces look to different sides of the camera, or where a face is missing; at a
-fold, shading jumps too. Edges are grouped into clusters of like position and direction; a cluster whose faces all look
-to one side of the camera is passed over as a whole, so the search does not grow as the number of faces does.
+fold, shading changes abruptly, too. Edges are grouped into clusters of like position and direction; a cluster whose
+faces all look to one side of the camera is passed over as a whole, so the search does not grow as the number of faces
+does.
 """
 
 from collections.abc import Sequence
@@ -17,32 +18,29 @@ CLUSTER_SIZE = 64
 
 @dataclass(frozen=True)
 class EdgeTable:
-    """Edges of all kinds, cluster after cluster, kind after kind; scene coordinates.
-
-    Attributes:
-        start: float32 [edges, 3], one end.
-        end: float32 [edges, 3], the other.
-        normal_a: float32 [edges, 3], unit normal of one face; zero where the edge is always a candidate.
-        normal_b: float32 [edges, 3], of the other.
-        center: float32 [clusters, 3], of the sphere that holds the cluster's edges.
-        radius: float32 [clusters].
-        axis: float32 [clusters, 3], of the cone that holds the cluster's normals.
-        angle: float32 [clusters], its half-angle in radians; π where the cluster may never be passed over.
-        facing: float32 [clusters], how many faces of an edge must look at the camera: 1 or 2 at folds, where shading
-            jumps too; 0 for exactly one.
-        first_cluster: int64 [kinds + 1], where each kind's clusters begin.
-    """
+    """Edges of all kinds, cluster after cluster, kind after kind; scene coordinates."""
 
     start: np.ndarray
+    """Float32 [edges, 3], one end."""
     end: np.ndarray
+    """Float32 [edges, 3], the other."""
     normal_a: np.ndarray
+    """Float32 [edges, 3], unit normal of one face; zero where the edge is always a candidate."""
     normal_b: np.ndarray
+    """Float32 [edges, 3], of the other."""
     center: np.ndarray
+    """Float32 [clusters, 3], of the sphere that holds the cluster's edges."""
     radius: np.ndarray
+    """Float32 [clusters]."""
     axis: np.ndarray
+    """Float32 [clusters, 3], of the cone that holds the cluster's normals."""
     angle: np.ndarray
+    """Float32 [clusters], its half-angle in radians; π where the cluster may never be passed over."""
     facing: np.ndarray
+    """Float32 [clusters], how many faces of an edge must look at the camera: 1 or 2 at folds, where shading changes
+    abruptly, too; 0 for exactly one."""
     first_cluster: np.ndarray
+    """Int64 [kinds + 1], where each kind's clusters begin."""
 
 
 def build_edges(meshes: Sequence[tuple[np.ndarray, Adjacency]]) -> EdgeTable:

@@ -19,21 +19,18 @@ OPENCV_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 @dataclass(frozen=True)
 class PosedMesh:
-    """An object before the camera.
-
-    Attributes:
-        mesh: In its own frame.
-        rotation: cam_from_obj, [3, 3].
-        translation_m: cam_from_obj, [3].
-        color_srgb: Albedo [3] that multiplies the mesh's own.
-        opacity: In [0, 1], seen from both sides; None: solid, and its inside is black, as Mitsuba has it by default.
-    """
+    """An object before the camera."""
 
     mesh: Mesh
+    """In its own frame."""
     rotation: np.ndarray
+    """Cam_from_obj, [3, 3]."""
     translation_m: np.ndarray
+    """Cam_from_obj, [3]."""
     color_srgb: tuple[float, ...] = (1.0, 1.0, 1.0)
+    """Albedo [3] that multiplies the mesh's own."""
     opacity: float | None = None
+    """In [0, 1], seen from both sides; None: solid, and its inside is black, as Mitsuba has it by default."""
 
 
 def sensor(mitsuba: Any, camera_matrix: np.ndarray, width: int, height: int, samples_per_pixel: int) -> dict[str, Any]:

@@ -16,25 +16,22 @@ colours there as 0/0, and one such pixel ends a training."""
 
 @dataclass(frozen=True)
 class Adjacency:
-    """Edges of a mesh, vertices in the same place taken as one, faces without area and slivers left out.
-
-    Attributes:
-        faces: int [f, 3], the other faces.
-        face_normals: [f, 3], unit length.
-        first: int [e], half-edge (3 · face + corner, from that corner to the next) of one face at each edge.
-        second: int [e], half-edge of another face; meaningless where not ``paired``.
-        paired: bool [e], exactly two faces meet.
-        sign: [e], −1 where the two are wound against each other.
-        cosine: [e], between the two normals (after ``sign``).
-    """
+    """Edges of a mesh, vertices in the same place taken as one, faces without area and slivers left out."""
 
     faces: np.ndarray
+    """Int [f, 3], the other faces."""
     face_normals: np.ndarray
+    """[f, 3], unit length."""
     first: np.ndarray
+    """Int [e], half-edge (3 · face + corner, from that corner to the next) of one face at each edge."""
     second: np.ndarray
+    """Int [e], half-edge of another face; meaningless where not ``paired``."""
     paired: np.ndarray
+    """Bool [e], exactly two faces meet."""
     sign: np.ndarray
+    """[e], −1 where the two are wound against each other."""
     cosine: np.ndarray
+    """[e], between the two normals (after ``sign``)."""
 
     @property
     def crease(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Layers: what the rays of one row see of their object, through the static scene, shaded by the mesh's own BSDF."""
+"""Traces rays against their instance's object in the static scene and shades hits by the mesh's own BSDF."""
 
 from abc import ABC, abstractmethod
 from types import ModuleType
@@ -7,7 +7,7 @@ from typing import Any
 from curio_train.rendering.bounds import NEAR_M
 from curio_train.rendering.instances import Instances
 from curio_train.rendering.materials import APPEARANCE_SIZE, Appearance
-from curio_train.rendering.pixels import Place
+from curio_train.rendering.pixels import ImageLocation
 
 SPHERE = 1.001
 """Radius of the objects' bounding spheres in the static scene, with room for rounding."""
@@ -22,14 +22,14 @@ class LayerTracer:
         shapes = scene.shapes()
         self.only_shape = shapes[0] if len(shapes) == 1 else None
 
-    def near(self, rows: Instances, row: Any, ray: Any) -> Any:
-        """Whether rays pass the rows' bounding spheres."""
+    def near(self, instances: Instances, instance: Any, ray: Any) -> Any:
+        """Whether rays pass the instances' bounding spheres."""
         dr = self.dr
-        arm = rows.sphere_center(row) - ray.o
+        arm = instances.sphere_center(instance) - ray.o
         return dr.squared_norm(arm) - dr.square(dr.dot(arm, ray.d)) / dr.squared_norm(ray.d) <= SPHERE * SPHERE
 
-    def intersect(self, rows: Instances, row: Any, ray: Any, active: Any, nearest: float) -> Any:
-        """The detached preliminary intersection with the row's own object: which face, where on it, at which depth.
+    def intersect(self, instances: Instances, instance: Any, ray: Any, active: Any, nearest: float) -> Any:
+        """Detached preliminary intersection with the instance's object: which face, where on it, at which depth.
 
         Only the part of the ray within the object's bounding sphere is traced. The other objects of the static scene
         are then out of reach, and float32 is spent on the object instead of on the way there. Nothing before the ray
@@ -39,7 +39,7 @@ class LayerTracer:
         with dr.suspend_grad():
             origin, direction = dr.detach(ray.o), dr.detach(ray.d)
             inverse = dr.rcp(dr.squared_norm(direction))
-            middle = dr.dot(rows.sphere_center(row) - origin, direction) * inverse
+            middle = dr.dot(instances.sphere_center(instance) - origin, direction) * inverse
             reach = SPHERE * dr.sqrt(inverse)
             start = dr.maximum(middle - reach, nearest)
             part = self.mi.Ray3f(dr.fma(direction, start, origin), direction)
@@ -48,22 +48,27 @@ class LayerTracer:
             hit.t += start
             return hit
 
-    def shade(self, rows: Instances, row: Any, ray: Any, hit: Any, lit: Any) -> list[Any]:
+    def shade(self, instances: Instances, instance: Any, ray: Any, hit: Any, lit: Any) -> list[Any]:
         """Colour of hits in sRGB, 3 arrays: albedo · (ambient + lit · max(0, n·l)), encoded."""
         mi, dr = self.mi, self.dr
         surface, bsdf = self._surface(ray, hit)
         normal = mi.Normal3f(surface.sh_frame.n)
         # Meshes wound inside out or open show their back: both sides shade alike.
         normal = dr.select(dr.dot(surface.n, ray.d) > 0, -normal, normal)
-        own, light = bsdf.eval_diffuse_reflectance(surface), rows.light(row)
-        if rows.finish is None:
+        own, light = bsdf.eval_diffuse_reflectance(surface), instances.light(instance)
+        if instances.appearance is None:
             radiance, shine = self.ambient + lit * dr.maximum(0, dr.dot(normal, light)), 0.0
         else:
-            finish = Appearance.of_values(mi, dr, self.scene, rows.finish_values(row, APPEARANCE_SIZE))
-            grain, normal = finish.roughened(surface.p - rows.sphere_center(row), normal)
-            radiance, lit = finish.radiance(self.ambient, lit, surface, normal, light)
-            radiance, shine = grain * radiance, finish.highlight(lit, -ray.d, normal, light)
-        return [srgb_from_linear(dr, own[i] * albedo * radiance + shine) for i, albedo in enumerate(rows.albedo(row))]
+            appearance = Appearance.of_values(
+                mi, dr, self.scene, instances.appearance_values(instance, APPEARANCE_SIZE)
+            )
+            grain, normal = appearance.roughened(surface.p - instances.sphere_center(instance), normal)
+            radiance, lit = appearance.radiance(self.ambient, lit, surface, normal, light)
+            radiance, shine = grain * radiance, appearance.highlight(lit, -ray.d, normal, light)
+        return [
+            srgb_from_linear(dr, own[i] * albedo * radiance + shine)
+            for i, albedo in enumerate(instances.albedo(instance))
+        ]
 
     def _surface(self, ray: Any, hit: Any) -> tuple[Any, Any]:
         """Where rays hit, and the BSDF there; a single shape is asked itself, which saves looking up whose it is."""
@@ -75,25 +80,24 @@ class LayerTracer:
 
 
 class RayQuery(ABC):
-    """What rays through pixels look for, and what they show of it.
-
-    Attributes:
-        channels: Of the image.
-        reach_from_m: Nothing nearer to the rays' origins is seen.
-        shaded: Whether light matters to what is shown.
-    """
+    """What rays through pixels look for, and what they show of it."""
 
     channels: int
+    """Of the image."""
     shaded: bool
+    """Whether light matters to what is shown."""
     reach_from_m: float
+    """Nothing nearer to the rays' origins is seen."""
 
     @abstractmethod
-    def rows(self, values: Any, camera: Any) -> Instances:
-        """Rows as they are looked at, of packed values."""
+    def instances(self, values: Any, camera: Any) -> Instances:
+        """Instances as they are looked at, of packed values."""
 
     @abstractmethod
-    def colors(self, tracer: LayerTracer, rows: Instances, place: Place, hit: Any, lit: Any) -> list[Any]:
-        """What hits look like, one array a channel; ``lit`` is the share of the light that reaches them."""
+    def colors(
+        self, tracer: LayerTracer, instances: Instances, location: ImageLocation, hit: Any, lit: Any
+    ) -> list[Any]:
+        """What hits look like, one array a channel; ``lit`` is the fraction of the light that reaches them."""
 
 
 class Objects(RayQuery):
@@ -106,13 +110,17 @@ class Objects(RayQuery):
     def __init__(self, mi: ModuleType, dr: ModuleType) -> None:
         self.mi, self.dr = mi, dr
 
-    def rows(self, values: Any, camera: Any) -> Instances:
+    def instances(self, values: Any, camera: Any) -> Instances:
         """Seen by the camera."""
         return Instances(self.mi, self.dr, values, camera)
 
-    def colors(self, tracer: LayerTracer, rows: Instances, place: Place, hit: Any, lit: Any) -> list[Any]:
+    def colors(
+        self, tracer: LayerTracer, instances: Instances, location: ImageLocation, hit: Any, lit: Any
+    ) -> list[Any]:
         """Shaded by the mesh's own BSDF."""
-        return tracer.shade(rows, place.row, rows.ray(place.row, place.x, place.y), hit, lit)
+        return tracer.shade(
+            instances, location.instance, instances.ray(location.instance, location.x, location.y), hit, lit
+        )
 
 
 def srgb_from_linear(dr: ModuleType, linear: Any) -> Any:

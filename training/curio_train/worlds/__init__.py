@@ -1,7 +1,8 @@
 """The registry of worlds.
 
-A new world is a module with a function ``build(options) -> World``, a class of options in ``worlds/options.py``, and a
-line here. The module of a world is imported only when that world is built, so that listing the worlds costs no torch.
+A new world is three things: a module with a function ``build(options) -> World``, a class of options in
+``worlds/options.py``, and a line here. Listing the worlds imports no torch; a world's module is imported when it is
+built.
 """
 
 from __future__ import annotations
@@ -10,45 +11,28 @@ import importlib
 from typing import TYPE_CHECKING
 
 from curio_train.config import WorldOptions
-from curio_train.worlds.options import (
-    CaptureOptions,
-    ChairsOptions,
-    CirclesOptions,
-    LightOptions,
-    LinemodOptions,
-    MultiOptions,
-    SpheresOptions,
-    VariedOptions,
-)
+from curio_train.worlds import options as _options
 
 if TYPE_CHECKING:
     from curio_train.worlds.base import World
 
-_MODULES = {
-    "circles": "generated.circles",
-    "spheres": "generated.spheres",
-    "chairs": "generated.chairs",
-    "varied": "generated.varied",
-    "multi": "generated.multi",
-    "light": "generated.light",
-    "linemod": "single_object.linemod",
-    "capture": "single_object.capture",
+_REGISTRY: dict[str, tuple[type[WorldOptions], str]] = {
+    "circles": (_options.CirclesOptions, "generated.circles"),
+    "spheres": (_options.SpheresOptions, "generated.spheres"),
+    "chairs": (_options.ChairsOptions, "generated.chairs"),
+    "varied": (_options.VariedOptions, "generated.varied"),
+    "multi": (_options.MultiOptions, "generated.multi"),
+    "light": (_options.LightOptions, "generated.light"),
+    "linemod": (_options.LinemodOptions, "single_object.linemod"),
+    "capture": (_options.CaptureOptions, "single_object.capture"),
 }
 
-WORLDS: dict[str, type[WorldOptions]] = {
-    "circles": CirclesOptions,
-    "spheres": SpheresOptions,
-    "chairs": ChairsOptions,
-    "varied": VariedOptions,
-    "multi": MultiOptions,
-    "light": LightOptions,
-    "linemod": LinemodOptions,
-    "capture": CaptureOptions,
-}
+WORLDS: dict[str, type[WorldOptions]] = {name: kind for name, (kind, _) in _REGISTRY.items()}
+"""Class of options by name of the world."""
 
 
 def build(options: WorldOptions) -> World:
     """The world that these options describe."""
-    name = next(name for name, kind in WORLDS.items() if isinstance(options, kind))
-    world: World = importlib.import_module(f"curio_train.worlds.{_MODULES[name]}").build(options)
+    module = next(module for kind, module in _REGISTRY.values() if isinstance(options, kind))
+    world: World = importlib.import_module(f"curio_train.worlds.{module}").build(options)
     return world

@@ -21,62 +21,72 @@ from torch import Tensor
 
 from curio_train.errors import DataError, UsageError
 from curio_train.scene_code import SceneCode, index
-from curio_train.worlds.base import Batch, ImageSource, Split, World
+from curio_train.worlds.base import SPLITS, Batch, ImageSource, Split, World
 
 NUM_IMAGES: Mapping[Split, int] = {"train": 2000, "validation": 500, "test": 500}  # paper, section "Analysis"
 _CHUNK = 100
-_SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 
 
 class StoredImages(ImageSource):
-    """A finite image set in memory; shuffled anew every epoch when ``shuffle`` is on.
+    """A finite image set in memory."""
 
-    Attributes:
-        images: uint8 [num, 3, height, width].
-        code: The true codes of all images, or None.
-        behind: uint8 [num, 3, height, width], what is behind the objects of each image; None: the world knows.
-    """
+    images: Tensor
+    """uint8 [num, 3, height, width]."""
+    code: SceneCode | None
+    """The true codes of all images, or None."""
 
     def __init__(
-        self, images: Tensor, code: SceneCode | None, *, seed: int, shuffle: bool, behind: Tensor | None = None
+        self, images: Tensor, code: SceneCode | None, *, seed: int, shuffle: bool, backgrounds: Tensor | None = None
     ) -> None:
-        self.images = images
-        self.code = code
-        self.behind = behind
-        self._seed = seed
-        self._shuffle = shuffle
+        """Hold the images.
+
+        Args:
+            images: uint8 [num, 3, height, width].
+            code: The true codes of all images, or None.
+            seed: Of the shuffling.
+            shuffle: Give each epoch its own order.
+            backgrounds: uint8 [num, 3, height, width], the background of each image; None: the world's own.
+        """
+        self.images, self.code = images, code
+        self._seed, self._shuffle, self._backgrounds = seed, shuffle, backgrounds
 
     def __len__(self) -> int:
         return len(self.images)
 
-    def subset(self, share: float) -> "StoredImages":
-        """The first ``share`` of the images alone."""
-        count = round(share * len(self))
+    def subset(self, fraction: float) -> "StoredImages":
+        """The first images of the set.
+
+        Raises:
+            UsageError: No image is left, or there are not so many.
+        """
+        count = round(fraction * len(self))
         if not 0 < count <= len(self):
-            raise UsageError(f"a share of {share} of {len(self)} images is {count} images, expected 1 to {len(self)}")
+            raise UsageError(
+                f"a fraction of {fraction} of {len(self)} images is {count} images, expected 1 to {len(self)}"
+            )
         code = None if self.code is None else index(self.code, slice(count))
-        behind = None if self.behind is None else self.behind[:count]
-        return StoredImages(self.images[:count], code, seed=self._seed, shuffle=self._shuffle, behind=behind)
+        backgrounds = None if self._backgrounds is None else self._backgrounds[:count]
+        return StoredImages(self.images[:count], code, seed=self._seed, shuffle=self._shuffle, backgrounds=backgrounds)
 
     def batch(self, step: int, size: int) -> Batch:
         """Images ``step * size`` to ``(step + 1) * size`` of the endless sequence of epochs."""
         rows = self._rows(np.arange(step * size, (step + 1) * size))
         images = self.images[rows].float() / 255
-        behind = None if self.behind is None else self.behind[rows].float() / 255
-        return Batch(images, behind, None if self.code is None else index(self.code, rows))
+        backgrounds = None if self._backgrounds is None else self._backgrounds[rows].float() / 255
+        return Batch(images, backgrounds, None if self.code is None else index(self.code, rows))
 
     def _rows(self, positions: np.ndarray) -> Tensor:
-        epochs, places = np.divmod(positions, len(self))
+        epochs, rows = np.divmod(positions, len(self))
         if self._shuffle:
             orders = {
                 epoch: np.random.default_rng((self._seed, epoch)).permutation(len(self))
                 for epoch in set(epochs.tolist())
             }
-            places = np.array([orders[epoch][place] for epoch, place in zip(epochs.tolist(), places, strict=True)])
-        return torch.from_numpy(places)
+            rows = np.array([orders[epoch][row] for epoch, row in zip(epochs.tolist(), rows, strict=True)])
+        return torch.from_numpy(rows)
 
 
-def stored(
+def stored_images(
     world: World, recipe: Mapping[str, Any], split: Split, seed: int, *, with_code: bool, cache: Path
 ) -> StoredImages:
     """A split of a world, drawn and rendered on first use.
@@ -103,7 +113,7 @@ def stored(
 
 @torch.no_grad()
 def _draw(world: World, split: Split, images: Path, codes: Path) -> None:
-    code = world.sample(NUM_IMAGES[split], (_SPLITS.index(split),))
+    code = world.sample(NUM_IMAGES[split], (SPLITS.index(split),))
     chunks = [world.render(index(code, slice(start, start + _CHUNK))) for start in range(0, NUM_IMAGES[split], _CHUNK)]
     pixels = (torch.cat(chunks).clamp(0, 1) * 255).round().byte()
     _save(codes, {name: value.numpy() for name, value in code.items()})
@@ -119,7 +129,7 @@ def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
             os.chmod(file.name, 0o644)
             os.link(file.name, path)
     except FileExistsError:
-        return  # another process was quicker with the same images
+        return  # another process has written the same images
     except OSError as exc:
         raise DataError(
             f"cannot write {path}: {exc.strerror}; name a writable folder with enough space: --cache"

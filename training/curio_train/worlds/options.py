@@ -1,4 +1,4 @@
-"""What a user may choose about each world, as plain data without torch: the command line's flags."""
+"""Options of each world, as plain data without torch: flags of the command line and keys of ``config.json``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
+from tyro.conf import FlagCreatePairsOff
 
-from curio_train.config import Method, WorldOptions
+from curio_train.config import MethodName, WorldOptions
 from curio_train.errors import UsageError
 
 _TWO_STAGE_RECIPE: Mapping[str, Any] = {
@@ -21,7 +22,7 @@ _TWO_STAGE_RECIPE: Mapping[str, Any] = {
 
 
 def _make_absolute(options: WorldOptions, *names: str) -> None:
-    """A run is evaluated and exported from other folders than it was started in."""
+    """Because a run may be evaluated and exported from other folders than it was started in."""
     for name in names:
         if isinstance(path := getattr(options, name), Path):
             object.__setattr__(options, name, path.absolute())
@@ -61,36 +62,42 @@ class LightOptions(WorldOptions):
 
 @dataclass(frozen=True)
 class LinemodOptions(WorldOptions):
-    """One object of the LineMOD data set in six degrees of freedom, over cluttered backgrounds.
+    """One object of the LineMOD data set in six degrees of freedom, over cluttered backgrounds."""
 
-    Attributes:
-        class_name: ape, benchvise, can, cat, …: the object.
-        data: Folder in BOP's layout (lm or lmo) with models, models_info.json and camera.json.
-        download: Without --data, fetch LineMOD from BOP's repository into the cache folder, once; some gigabytes.
-        backgrounds: Folder of photographs to see the object in front of; clutter is rendered where none is given.
-        photos: Folder of unlabelled frames of the data set's camera, from which a gaze learns towards the end, with the
-            poses that it reads there itself (--self-training). Frames that show one scene from several sides, in the
-            order of their names, correct each other. None are used unless given.
-        views: File with where the camera of --photos stood, in metres, as capture --calibrate --views-out writes it.
-            Found from the photographs unless given, and their scale from what is read in them.
-        gaze: Look twice: at the whole frame for the place, at a crop around it for the rest. The other way, the paper's
-            one encoder sees the frame squeezed to 128x128.
-    """
-
-    default_method: ClassVar[Method] = "sleep"
+    default_method: ClassVar[MethodName] = "sleep"
     default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     class_name: Annotated[str, tyro.conf.arg(name="class")]
+    """The object: ape, benchvise, can, cat, …"""
     data: Path | None = None
+    """Folder in BOP's layout (lm or lmo) with models, models_info.json and camera.json."""
     backgrounds: Path | None = None
+    """Folder of photographs for backgrounds; without it clutter is rendered."""
     photos: Path | None = None
+    """Folder of unlabelled frames of the data set's camera. Towards the end of training the two-stage detector learns
+    from them, with the poses that it estimates there itself (--self-training). Frames of one scene from several
+    viewpoints, in the order of their names, correct each other."""
     views: Path | None = None
-    gaze: tyro.conf.FlagCreatePairsOff[bool] = True
-    download: tyro.conf.FlagCreatePairsOff[bool] = False
+    """File with the camera poses of --photos, in metres, as capture --calibrate --views-out writes it. Without it they
+    are recovered from the photographs, and their scale from the estimated object poses."""
+    gaze: Annotated[
+        FlagCreatePairsOff[bool],
+        tyro.conf.arg(aliases=["--one-stage"], help_behavior_hint="(default: the two-stage detector)"),
+    ] = True
+    """Train the paper's network, whose one encoder sees the frame squeezed to 128x128, instead of the two-stage
+    detector: localisation in the whole frame, then pose in a crop around the object."""
+    download: FlagCreatePairsOff[bool] = False
+    """Without --data, fetch LineMOD from BOP's repository into the cache folder, once; some gigabytes."""
 
     def __post_init__(self) -> None:
-        """Make paths absolute."""
+        """Make paths absolute, and refuse what contradicts itself."""
         _make_absolute(self, "data", "backgrounds", "photos", "views")
+        if self.views is not None and self.photos is None:
+            raise UsageError(f"--views {self.views}: found no photographs that these poses are of; expected --photos")
+        if not self.gaze and self.photos is not None:
+            raise UsageError(
+                f"--photos {self.photos}: only the two-stage detector learns from them; leave out --one-stage"
+            )
 
 
 @dataclass(frozen=True)
@@ -98,117 +105,117 @@ class CaptureOptions(WorldOptions):
     """A part of your own, from its CAD file, in six degrees of freedom. With --calibrate: find out its camera instead.
 
     With --plane: one or more parts on a table or floor, learned from the photographs.
-
-    Attributes:
-        mesh: Mesh file: STL, OBJ, PLY, GLB, glTF or OFF; on a plane as many as there are kinds of parts.
-        camera: Camera file of the photographs: camera JSON, or BOP's camera.json.
-        photos: Folder of unlabelled photographs. They are checked against the camera, tell the part's colour, and the
-            report shows what was found in them. Towards the end of training they are learned from, with the poses that
-            the network itself reads in them (--self-training); on a plane from the beginning.
-        mesh_unit: Unit of the mesh file's coordinates; the file's own, or metres, unless given.
-        background: Photograph of the empty scene, taken as the others were.
-        backgrounds: Folder of photographs to see the part in front of, where the scene changes; clutter is rendered
-            where neither is given.
-        paint: Colour of a part whose mesh has none, sRGB, such as '#8a6f4c'. Found where the photographs differ from
-            --background unless given; where neither tells it, the part is learned in any colour.
-        near_m: Least distance of the part's origin along the optical axis, metres.
-        far_m: Largest.
-        upright: The part is only seen from above (z of the mesh is up, rolled by up to 45 degrees), not from any side.
-        plane: JSON file with cam_from_world of the plate --background, y up, in metres, as --calibrate --views-out
-            writes it: parts lie on the plane y = 0.
-        counts: On a plane, how many there are of each mesh, or from how many to how many: --counts 3 or --counts 0-4
-            1-2. One of each unless given.
-        up: Axis of the meshes that points up on the plane.
-        lying: Parts lie on the plane any way, not upright and turned about --up alone.
-        held_out: Folder of further photographs on the plane, to judge by instead of --photos.
-        second: Folder of photographs of those same scenes, under the same names, from a second camera of the same kind:
-            what was learned is judged by them.
-        second_background: The empty scene from there; --plane has its cam_from_world, too.
-        blur_px: On a plane, side of the Gaussian filter over images and renderings where they are compared (paper: 9);
-            1 compares them as they are.
     """
 
-    default_method: ClassVar[Method] = "sleep"
+    default_method: ClassVar[MethodName] = "sleep"
     default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     mesh: tuple[Path, ...]
+    """Mesh file: STL, OBJ, PLY, GLB, glTF or OFF; with --plane one for each kind of part."""
     camera: Path
+    """Camera file of the photographs: camera JSON, or BOP's camera.json."""
     photos: Path
+    """Folder of unlabelled photographs. They are checked against the camera, show the part's colour, and the report
+    draws the estimated poses over them. Towards the end of training the network learns from them, with the poses that
+    it estimates there itself (--self-training); with --plane from the beginning."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
+    """Unit of the mesh file's coordinates; the file's own, or metres, unless given."""
     background: Path | None = None
+    """Photograph of the empty scene, taken as the others were."""
     backgrounds: Path | None = None
+    """Folder of photographs for backgrounds, if the scene changes; without it and --background clutter is rendered."""
     paint: str | None = None
+    """Colour of a part whose mesh has none, sRGB, such as '#8a6f4c'. Unless given, it is estimated where the
+    photographs differ from --background; if it cannot be, the part is learned in any colour."""
     near_m: float = 0.3
+    """Smallest distance of the part's origin along the optical axis, metres."""
     far_m: float = 1.0
-    upright: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Largest such distance, metres."""
+    upright: FlagCreatePairsOff[bool] = False
+    """The part is only seen from above (z of the mesh is up, camera rolled by up to 45 degrees), not from any side."""
     plane: Path | None = None
+    """JSON file with cam_from_world of --background, y up, in metres, as --calibrate --views-out writes it: parts lie
+    on the plane y = 0."""
     counts: tuple[str, ...] = ()
+    """With --plane, how many there are of each mesh, or from how many to how many: --counts 3 or --counts 0-4 1-2. One
+    of each unless given."""
     up: Literal["x", "y", "z"] = "z"
-    lying: tyro.conf.FlagCreatePairsOff[bool] = False
+    """With --plane, axis of the meshes that points up."""
+    lying: FlagCreatePairsOff[bool] = False
+    """With --plane, parts lie any way, not upright and rotated about --up alone."""
     held_out: Path | None = None
+    """With --plane, folder of further photographs to judge by instead of --photos."""
     second: Path | None = None
+    """With --plane, folder of photographs of those same scenes, under the same names, by a second camera of the same
+    kind; the model is judged by them, too."""
     second_background: Path | None = None
+    """Photograph of the empty scene by the second camera; the --plane file has its cam_from_world, too."""
     blur_px: int = 9
+    """With --plane, side of the Gaussian filter over images and renderings before they are compared (paper: 9); 1
+    compares them as they are."""
 
     def __post_init__(self) -> None:
         """Make paths absolute, and refuse what contradicts itself."""
         _make_absolute(self, "mesh", "camera", "photos", "background", "backgrounds", "plane", "held_out")
         _make_absolute(self, "second", "second_background")
         if self.background is not None and self.backgrounds is not None:
-            raise UsageError("--background and --backgrounds exclude each other: a plate, or a folder of other scenes")
+            raise UsageError(
+                "--background and --backgrounds exclude each other: one photograph of the empty scene, or a folder of "
+                "other scenes"
+            )
         if not 0 < self.near_m < self.far_m:
             raise UsageError(
                 f"found --near-m {self.near_m:g} and --far-m {self.far_m:g}, expected 0 < near < far, in metres"
             )
         if self.plane is None:
-            self._refuse_without_plane()
+            self._check_without_plane()
         else:
-            self._refuse_with_plane()
+            self._check_with_plane(self.plane)
 
     @property
-    def amounts(self) -> list[tuple[int, int]]:
-        """The fewest and the most there are of each mesh.
+    def count_ranges(self) -> list[tuple[int, int]]:
+        """Minimum and maximum number of each mesh.
 
         Raises:
-            UsageError: They are no numbers, or not as many as meshes.
+            UsageError: They are not numbers, or not as many as meshes.
         """
         counts = self.counts or ("1",) * len(self.mesh)
         if len(counts) != len(self.mesh):
             raise UsageError(f"found {len(counts)} --counts for {len(self.mesh)} meshes, expected one each")
-        return [_amount(count) for count in counts]
+        return [_count_range(count) for count in counts]
 
-    def _refuse_without_plane(self) -> None:
+    def _check_without_plane(self) -> None:
         names = ("counts", "up", "lying", "held_out", "second", "second_background", "blur_px")
-        if flags := self._flags_of(names):
-            raise UsageError(f"{flags}: for parts on a plane, which --plane has to say; expected it as well")
+        if flags := self._given_flags(names):
+            raise UsageError(f"{flags}: for parts on a plane; expected --plane as well")
         if isinstance(self.mesh, tuple) and len(self.mesh) != 1:
             raise UsageError(
                 f"--mesh names {len(self.mesh)} files; several parts are learned on a plane alone: give --plane, or "
                 "train a model for each"
             )
 
-    def _flags_of(self, names: tuple[str, ...]) -> str:
-        """Those of the flags that were given another value than the usual one."""
+    def _given_flags(self, names: tuple[str, ...]) -> str:
+        """Those flags whose value is not the default."""
         given = [name for name in names if getattr(self, name) != getattr(CaptureOptions, name)]
         return ", ".join(f"--{name.replace('_', '-')}" for name in given)
 
-    def _refuse_with_plane(self) -> None:
+    def _check_with_plane(self, plane: Path) -> None:
         if self.background is None:
-            raise UsageError(f"--plane {self.plane}: expected --background, a photograph of it without parts, as well")
-        if flags := self._flags_of(("backgrounds", "paint", "upright", "near_m", "far_m")):
-            raise UsageError(f"{flags}: for a part in free space; leave it out, or --plane {self.plane}")
+            raise UsageError(f"--plane {plane}: expected --background, a photograph of it without parts, as well")
+        if flags := self._given_flags(("backgrounds", "paint", "upright", "near_m", "far_m")):
+            raise UsageError(f"{flags}: for a part in free space; leave it out, or --plane {plane}")
         if len({file.stem for file in self.mesh}) < len(self.mesh):
             raise UsageError(f"--mesh {' '.join(map(str, self.mesh))}: parts are named after their files: rename one")
         if (self.second is None) != (self.second_background is None):
             raise UsageError("--second and --second-background belong together: expected both, or neither")
         if self.blur_px < 1 or self.blur_px % 2 == 0:
             raise UsageError(f"--blur-px {self.blur_px}: expected an odd number of pixels, 1 for none")
-        if max(most for _, most in self.amounts) < 1:
-            raise UsageError(f"--counts {' '.join(self.counts)}: there is never anything; expected a part or more")
+        if max(most for _, most in self.count_ranges) < 1:
+            raise UsageError(f"--counts {' '.join(self.counts)}: all scenes are empty; expected one part or more")
 
 
-def _amount(text: str) -> tuple[int, int]:
-    fewest, dash, most = text.partition("-")
-    if not (fewest.isdigit() and (most.isdigit() or not dash)) or (dash and int(most) < int(fewest)):
-        raise UsageError(f"--counts {text}: expected a number such as 3, or the fewest and the most, such as 0-4")
-    return int(fewest), int(most or fewest)
+def _count_range(text: str) -> tuple[int, int]:
+    least, dash, most = text.partition("-")
+    if not (least.isdigit() and (most.isdigit() or not dash)) or (dash and int(most) < int(least)):
+        raise UsageError(f"--counts {text}: expected a number such as 3, or a range such as 0-4")
+    return int(least), int(most or least)

@@ -1,11 +1,12 @@
-"""One sitting of training: from a configuration to a run folder, new or resumed."""
+"""One session of training: from a configuration to a run folder, new or resumed."""
 
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Literal
 
 from curio_train.config import RunConfig
-from curio_train.learning.loop import Outcome, Trainer, train
+from curio_train.learning.hardware import choose_threads
+from curio_train.learning.loop import Outcome, train
 from curio_train.learning.parallel import ranks
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.initial import begin_with
@@ -13,8 +14,9 @@ from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.progress import reporting
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress
-from curio_train.learning.threads import choose_threads
+from curio_train.learning.trainer import Trainer
 from curio_train.worlds import build
+from curio_train.worlds.base import StagedWorld, stages_of
 
 
 def learn(
@@ -33,22 +35,23 @@ def learn(
         config: What to learn; of a resumed run, its own (see ``configuration.refuse_other``).
         path: The run folder.
         interruption: How signals arrive.
-        resume: Go on from the folder's last checkpoint instead of starting a run.
-        cache: Where worlds keep the image sets they draw once.
+        resume: Continue from the folder's last checkpoint instead of starting a run.
+        cache: Folder of the image sets that worlds draw once.
         device: See ``parallel.ranks``.
         checkpoint_minutes: Minutes of training between checkpoints.
 
     Returns:
-        Why training ended, and how far it came.
+        Why training ended, and the run's progress.
 
     Raises:
         CurioError: Any of this package's errors; checkpoints that were written stay.
     """
     with ranks(device) as here:
-        # The world comes first: what is wrong with its data shows before a run folder is there.
+        # The world comes first, so that an error in its data leaves no run folder behind.
         world = build(config.world)
-        labelled = "label" in config.terms
-        sources = [look.source("train", config.seed, with_code=labelled, cache=cache) for look in world.stages]
+        sources = [
+            stage.source("train", config.seed, with_code=config.terms.label, cache=cache) for stage in stages_of(world)
+        ]
         if config.labels < 1:
             sources = [source.subset(config.labels) for source in sources]
         run = RunFolder(path, config)
@@ -57,19 +60,24 @@ def learn(
             record_session(path)
         trainer = Trainer(config, world, sources, here)
         if here.device.type == "cpu":
-            # A run that only sleeps draws its images in a thread of its own.
-            choose_threads(trainer.warm_up, reserved=int(config.terms == {"sleep"}))
+            # The thread that renders synthetic batches ahead needs a core of its own.
+            choose_threads(trainer.warm_up, reserved=int(not config.terms.reads_images))
         if resume and run.checkpoints():
             run.restore(trainer.state)
         elif config.init is not None:
             begin_with(trainer.state, config.init)
-        with reporting(path, trainer.state.course) if here.leads else nullcontext() as reporter:
+
+        def finish() -> None:
+            if isinstance(world, StagedWorld):
+                world.calibrate_confidence(trainer.state.pose.network, cache)
+
+        with reporting(path, trainer.state.progress) if here.leads else nullcontext() as reporter:
             outcome = train(
                 trainer,
                 run,
                 interruption,
                 reporter,
                 checkpoint_minutes,
-                finish=lambda: world.finish(trainer.state.pose.network, cache),
+                finish=finish,
             )
-        return outcome, trainer.state.course
+        return outcome, trainer.state.progress

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from curio_train.scene_code import TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Camera, ObjectKind, Split, World
-from curio_train.worlds.image_sets import StoredImages, stored
+from curio_train.worlds.image_sets import StoredImages, stored_images
 from curio_train.worlds.options import CirclesOptions
 
 SIDE_PX = 128
@@ -71,11 +71,11 @@ class Circles(World):
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> StoredImages:
         """2,000, 500 and 500 images, the paper's numbers."""
         recipe = {"radius": RADIUS, "reach": REACH, "side": SIDE_PX, "color": COLOR_SRGB}
-        return stored(self, recipe, split, seed, with_code=with_code, cache=cache)
+        return stored_images(self, recipe, split, seed, with_code=with_code, cache=cache)
 
 
 def coverage(centre: Float[Tensor, "batch 2"]) -> Float[Tensor, "batch height width"]:
-    """Share of each pixel that the circle covers.
+    """Fraction of each pixel that the circle covers.
 
     A pixel whose centre is d pixels inside the edge is covered by d + 1/2, within 0 and 1: exact for a straight edge
     along the pixel grid, 0.04 off at worst for a slanted one. The derivative is that of the same ramp, one pixel wide,
@@ -89,5 +89,5 @@ def coverage(centre: Float[Tensor, "batch 2"]) -> Float[Tensor, "batch height wi
 
 
 def build(options: CirclesOptions) -> Circles:
-    """The only circles there are."""
+    """The world of one circle."""
     return Circles()

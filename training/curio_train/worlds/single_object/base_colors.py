@@ -1,24 +1,37 @@
-"""Colours drawn for an unpainted part of which photographs, or the user, say what colour it has."""
+"""Base-colour priors of unpainted objects: any colour, or colours near one that photographs or the user name."""
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.errors import UsageError
-from curio_train.worlds.single_object.world import BaseColorPrior, any_base_color
+from curio_train.worlds.placement import random_colors
 
-ANY_SHARE = 0.15
-"""Of images in which the part has any colour, so that a colour that was wrongly found is not fatal."""
+BaseColorPrior = Callable[[int, np.random.Generator], Float[Tensor, "count 1 3"]]
+"""Draws sRGB base colours."""
 
-_LEAST_FACTOR, _LARGEST_FACTOR = 0.6, 1.5  # of the value: how strong the light is remains unknown
-_LEAST_VALUE = 0.05
-_TINT = 0.06  # standard deviation of each channel, as a share of the largest: light of other things, white balance
+MIN_BASE_VALUE = 0.1
+"""HSV value of base colours; their saturation may be anything: black, white, grey or any colour between."""
+
+ANY_COLOR_FRACTION = 0.15
+"""Of images in which the object has any colour, so that a wrong named colour is not fatal."""
+
+_MIN_FACTOR, _MAX_FACTOR = 0.6, 1.5  # of the value, because the light's strength is unknown
+_MIN_NEAR_VALUE = 0.05
+_TINT = 0.06  # standard deviation of each channel, relative to the largest: coloured light, white balance
+
+
+def any_base_color(count: int, random: np.random.Generator) -> Float[Tensor, "count 1 3"]:
+    """Base colours of an object of which nothing is known."""
+    return random_colors(count, 1, random, 0.0, MIN_BASE_VALUE)
 
 
 def base_colors_near(color: str) -> BaseColorPrior:
-    """Draws colours about one given as #rrggbb, sRGB.
+    """The prior around a colour given as #rrggbb, sRGB.
 
     Raises:
         UsageError: It is not written so.
@@ -30,13 +43,13 @@ def base_colors_near(color: str) -> BaseColorPrior:
         channels = b""
     if len(channels) != 3 or len(digits) != 6:
         raise UsageError(f"--paint {color}: expected a colour in sRGB such as '#8a6f4c'")
-    return partial(_paints, np.frombuffer(channels, np.uint8) / 255)
+    return partial(_base_colors, np.frombuffer(channels, np.uint8) / 255)
 
 
-def _paints(srgb: np.ndarray, count: int, random: np.random.Generator) -> Tensor:
-    value = max(float(srgb.max()), _LEAST_VALUE)
+def _base_colors(srgb: np.ndarray, count: int, random: np.random.Generator) -> Tensor:
+    value = max(float(srgb.max()), _MIN_NEAR_VALUE)
     tints = srgb / value + _TINT * random.normal(size=(count, 1, 3))
-    factors = np.exp(random.uniform(np.log(_LEAST_FACTOR), np.log(_LARGEST_FACTOR), (count, 1, 1)))
-    near = torch.from_numpy(tints.clip(0, 1) * (value * factors).clip(_LEAST_VALUE, 1)).float()
-    anything = torch.from_numpy(random.random((count, 1, 1)) < ANY_SHARE)
-    return torch.where(anything, any_base_color(count, random), near)
+    factors = np.exp(random.uniform(np.log(_MIN_FACTOR), np.log(_MAX_FACTOR), (count, 1, 1)))
+    near = torch.from_numpy(tints.clip(0, 1) * (value * factors).clip(_MIN_NEAR_VALUE, 1)).float()
+    is_any = torch.from_numpy(random.random((count, 1, 1)) < ANY_COLOR_FRACTION)
+    return torch.where(is_any, any_base_color(count, random), near)

@@ -1,13 +1,15 @@
-"""A part of one's own: one mesh, one camera, six degrees of freedom, no labels. Parts on a plane: ``table.py``.
+"""A part of your own in free space: one mesh, one camera, six degrees of freedom, no labels.
 
-Images are rendered without end, as for LineMOD; what a data set's authors publish there is asked for or found out here:
+Images are rendered without end, as for LineMOD. What a data set's authors publish there is given or found out here:
 
 * distances are given (0.3 to 1 m unless said otherwise), the part's origin is anywhere in the frame;
 * it is seen from all sides alike, or from above alone;
 * its symmetries are found from its shape; poses that differ by one count as equal, whatever is painted on it;
-* a mesh without colours has another colour in each image, which is read with the pose: about the one that the part
-  has in the photographs where a plate shows what is not the part, else of any saturation;
+* a mesh without colours has another base colour in each image, which the code has, too: near the part's colour in the
+  photographs where they differ from the background image, or any colour without one;
 * light is that of LineMOD: from the camera's half space, over an ambient radiance of 0.4.
+
+Parts on a plane are the world of ``tabletop``.
 """
 
 from collections.abc import Sequence
@@ -27,50 +29,70 @@ from curio_train.errors import UsageError
 from curio_train.geometry import random_rotations
 from curio_train.meshes.meshes import Mesh, load_mesh
 from curio_train.meshes.symmetries import find_symmetries
-from curio_train.worlds.base import ObjectKind, World
+from curio_train.worlds.base import Camera, ObjectKind, World
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object.base_colors import base_colors_near
-from curio_train.worlds.single_object.two_stage import LARGEST_LOG_SCALE, TwoStageWorld
-from curio_train.worlds.single_object.viewpoints import upper_views
-from curio_train.worlds.single_object.world import Object, any_base_color
-from curio_train.worlds.tabletop.files import build_table
+from curio_train.worlds.single_object.base_colors import any_base_color, base_colors_near
+from curio_train.worlds.single_object.crop_pose_stage import MAX_LOG_SCALE
+from curio_train.worlds.single_object.two_stage import TwoStageWorld, frame_camera
+from curio_train.worlds.single_object.viewpoints import upper_hemisphere_rotations
+from curio_train.worlds.single_object.world import Object
+from curio_train.worlds.tabletop.files import build_tabletop
 
 NUM_JUDGED = 40
-"""Photographs that a model is judged by, and that it therefore never learns from; of fewer than twice as many it learns
-from none."""
+"""Photographs that a model is judged by, and that it therefore never learns from; with fewer than twice as many it
+learns from none."""
 
 
-class Capture(TwoStageWorld):
-    """One part before the camera that took a folder of photographs."""
+class CapturePhotographs:
+    """The user's photographs of a part, without the lens's distortion, in the size of the world's camera."""
 
-    def __init__(self, thing: Object, images: Path, background: Path | None = None) -> None:
-        """Nothing of the photographs is read before they are asked for."""
-        super().__init__("capture", thing)
-        self._images, self._background = images, background
+    def __init__(self, folder: Path, background: Path | None, intrinsics: Intrinsics, camera: Camera) -> None:
+        """Read nothing yet.
 
-    def photographs(self, count: int) -> Tensor:
-        """Those that teach nothing, without the lens's distortion, in the canonical size."""
-        return self._read(spread(self._divided[0], count)).float() / 255
+        Args:
+            folder: Of the photographs.
+            background: Photograph of the empty scene.
+            intrinsics: The camera that took them.
+            camera: The world's.
+        """
+        self._folder, self._background, self._intrinsics, self._camera = folder, background, intrinsics, camera
+
+    def judged(self, count: int) -> Tensor:
+        """At most ``count`` of those that the model never learns from, [num, 3, height, width] in [0, 1].
+
+        Raises:
+            DataError: One cannot be read, or is not of the camera's size.
+        """
+        return self._read(spread(self._split[0], count))
 
     def unlabelled(self) -> UnlabelledPhotographs:
-        """The photographs that the model is not judged by."""
-        return UnlabelledPhotographs(spread(self._divided[1], MAX_UNLABELLED))
+        """The others, for self-training.
 
-    def plate(self) -> Tensor | None:
-        """What ``--background`` shows, as the photographs come."""
-        return None if self._background is None else self._read([self._background])[0].float() / 255
+        Raises:
+            DataError: The folder cannot be read.
+        """
+        return UnlabelledPhotographs(spread(self._split[1], MAX_UNLABELLED))
+
+    def background_image(self) -> Tensor | None:
+        """The empty scene, [3, height, width] in [0, 1], if there is a photograph of it.
+
+        Raises:
+            DataError: It cannot be read, or is not of the camera's size.
+        """
+        return None if self._background is None else self._read([self._background])[0]
 
     @property
-    def _divided(self) -> tuple[list[Path], list[Path]]:
-        """Photographs to judge by, and the others; of a few the model is judged by all."""
-        paths = list(Photographs(self._images).paths)
+    def _split(self) -> tuple[list[Path], list[Path]]:
+        """Photographs to judge by, and the others; a model is judged by all if they are few."""
+        paths = list(Photographs(self._folder).paths)
         if len(paths) < 2 * NUM_JUDGED:
             return paths, []
         judged = spread(paths, NUM_JUDGED)
         return judged, sorted(set(paths).difference(judged))
 
     def _read(self, paths: Sequence[Path]) -> Tensor:
-        return torch.from_numpy(read_frames(paths, self.object.camera, self.camera.width, self.camera.height))
+        frames = read_frames(paths, self._intrinsics, self._camera.width, self._camera.height)
+        return torch.from_numpy(frames).float() / 255
 
 
 def build(options: CaptureOptions) -> World:
@@ -79,11 +101,11 @@ def build(options: CaptureOptions) -> World:
     Raises:
         UsageError: The part would reach into the camera, or has two colours.
         MeshError: The mesh is missing or broken.
-        CameraError: The camera file is missing or describes no camera.
-        DataError: Of a plane, photographs, plates or its file cannot be used.
+        CameraError: The camera file is missing or describes no camera, or the file of the plane cannot be used.
+        DataError: Photographs or background images of a plane cannot be used.
     """
     if options.plane is not None:
-        return build_table(options)
+        return build_tabletop(options)
     (file,) = options.mesh
     mesh, camera = load_mesh(file, options.mesh_unit), load_intrinsics(options.camera)
     _refuse_collision(options, mesh)
@@ -93,25 +115,26 @@ def build(options: CaptureOptions) -> World:
     kind = ObjectKind(
         file.stem, (0,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous
     )
-    thing = Object(
+    object_ = Object(
         kind,
         mesh,
         camera,
         options.near_m,
         options.far_m,
         partial(_backgrounds, options, camera),
-        upper_views if options.upright else random_rotations,
-        painted=is_unpainted(mesh),
-        paints=any_base_color if options.paint is None else base_colors_near(options.paint),
+        upper_hemisphere_rotations if options.upright else random_rotations,
+        unpainted=is_unpainted(mesh),
+        base_colors=any_base_color if options.paint is None else base_colors_near(options.paint),
         known_scene=options.background is not None,
     )
-    return Capture(thing, options.photos, options.background)
+    photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera))
+    return TwoStageWorld("capture", object_, photographs)
 
 
 def _refuse_collision(options: CaptureOptions, mesh: Mesh) -> None:
-    """The nearest that a crop may have to be thought at is nearer than the nearest place by the first look's error."""
+    """The crop-pose stage sees objects nearer than the nearest, by the largest error of the localisation stage."""
     reach = float(np.linalg.norm(mesh.vertices_m, axis=1).max())
-    least = reach * float(np.exp(LARGEST_LOG_SCALE))
+    least = reach * float(np.exp(MAX_LOG_SCALE))
     if options.near_m > least:
         return
     raise UsageError(
@@ -122,7 +145,7 @@ def _refuse_collision(options: CaptureOptions, mesh: Mesh) -> None:
 
 
 def _backgrounds(options: CaptureOptions, camera: Intrinsics, cache: Path) -> Backgrounds:
-    """The plate mixed with clutter, photographs, or clutter alone.
+    """The background image mixed with clutter, photographs, or clutter alone.
 
     Raises:
         DataError: A photograph is missing, broken or of another size, or the cache cannot be written.
@@ -131,5 +154,5 @@ def _backgrounds(options: CaptureOptions, camera: Intrinsics, cache: Path) -> Ba
         return PhotographBackgrounds(Photographs(options.backgrounds))
     if options.background is None:
         return ClutterBackgrounds.cached(cache)
-    plate = BackgroundImages.read(options.background, camera)  # before half a minute is spent on clutter
-    return MixedBackgrounds(plate, ClutterBackgrounds.cached(cache), BACKGROUND_IMAGE_FRACTION)
+    background_image = BackgroundImages.read(options.background, camera)  # before half a minute is spent on clutter
+    return MixedBackgrounds(background_image, ClutterBackgrounds.cached(cache), BACKGROUND_IMAGE_FRACTION)

@@ -1,49 +1,54 @@
-"""A gaze's confidence as a probability, set by its own renderings when training is done."""
+"""Calibration of a two-stage detector's confidence, on renderings after training."""
 
 from itertools import repeat
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from curio_train.metrics.certainty import calibration
+from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.networks.two_stage.network import CalibrationFeatures, TwoStageNetwork
 from curio_train.scene_code import poses
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _NUM_FRAMES, _BATCH_SIZE = 300, 25
-_NUM_POINTS = 500  # vertices that ADD is measured at, about
+_NUM_POINTS = 500  # about so many vertices for ADD
 
 
 @torch.no_grad()
-def calibrate(network: nn.Module, world: SingleObjectWorld, cache: Path) -> None:
-    """Make the confidence of a gaze the probability of a right pose, by whole frames that nothing was learned from.
+def calibrate(network: TwoStageNetwork, world: SingleObjectWorld, cache: Path) -> None:
+    """Make the network's confidence the probability of a correct pose, in place.
 
-    Rightness is judged where the object is; as many empty frames tell what it looks like to the network if it is not.
+    Frames with the object calibrate the probability that the pose is correct if it is present; as many frames without
+    it calibrate the probability that it is present.
+
+    Args:
+        network: With both stages.
+        world: Renders the frames; those of its validation split, which no network is trained with.
+        cache: Of backgrounds.
     """
-    assert isinstance(network, TwoStageNetwork)
     source, kind = world.source("validation", 0, with_code=True, cache=cache), world.object.kind
-    points = world.object.mesh.vertices_m[:: max(1, len(world.object.mesh.vertices_m) // _NUM_POINTS)]
+    vertices = world.object.mesh.vertices_m
+    points = vertices[:: max(1, len(vertices) // _NUM_POINTS)]
     network.eval()
     steps = _NUM_FRAMES // _BATCH_SIZE
-    full: list[CalibrationFeatures] = []
-    empty: list[CalibrationFeatures] = []
-    right: list[bool] = []
+    with_object: list[CalibrationFeatures] = []
+    without: list[CalibrationFeatures] = []
+    correct: list[bool] = []
     for step in range(steps):
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
-        code, signs = network.read(batch.images.clamp(0, 1))
+        code, features = network.uncalibrated(batch.images.clamp(0, 1))
         errors = map(add_or_add_s_m, poses(code), poses(batch.code), repeat(points), repeat(kind.info))
-        right += [error < ADD_THRESHOLD * kind.diameter_m for error in errors]
-        full.append(signs)
-        behind = source.backgrounds(steps + step, _BATCH_SIZE)
-        assert behind is not None  # of a gaze's world there always are
-        empty.append(network.read(behind.clamp(0, 1))[1])
-    network.rightness.copy_(_fit([signs.right for signs in full], right))
-    there = [True] * _NUM_FRAMES + [False] * _NUM_FRAMES
-    network.presence.copy_(_fit([signs.there for signs in (*full, *empty)], there))
+        correct += [error < ADD_THRESHOLD * kind.diameter_m for error in errors]
+        with_object.append(features)
+        empty = source.backgrounds(steps + step, _BATCH_SIZE)
+        without.append(network.uncalibrated(empty.clamp(0, 1))[1])
+    network.rightness.copy_(_fit([features.pose_correct for features in with_object], correct))
+    present = [True] * _NUM_FRAMES + [False] * _NUM_FRAMES
+    network.presence.copy_(_fit([features.presence for features in (*with_object, *without)], present))
 
 
-def _fit(signs: list[Tensor], is_so: list[bool]) -> Tensor:
-    return torch.tensor(calibration(torch.cat(signs).cpu().numpy(), is_so))
+def _fit(features: list[Tensor], correct: list[bool]) -> Tensor:
+    return torch.tensor(fit_calibration(torch.cat(features).cpu().numpy(), correct))

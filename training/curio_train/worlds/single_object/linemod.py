@@ -8,14 +8,16 @@ Constants fixed before any training:
 
 * depth 0.5 to 1.5 m; the object's centre anywhere in the frame;
 * light from the camera's half space, of strength 0.2 to 2 over an ambient radiance of 0.4; the object's own colours
-  0.3 to 1.25 times as bright, and tinted, in crops; 0.5 to 1.25 times, and a little tinted, in frames read by a gaze.
+  0.3 to 1.25 times as bright, and tinted, in crops; 0.5 to 1.25 times, and a little tinted, in whole frames.
 """
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from curio_train.camera import Intrinsics
 from curio_train.capture.plane import CameraPoseFile
 from curio_train.capture.structure import recover
 from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
@@ -33,66 +35,54 @@ NEAR_M, FAR_M = 0.5, 1.5
 _log = logging.getLogger(__name__)
 
 
-class Linemod(SingleObjectWorld):
-    """One LineMOD object in the whole frame, squeezed into 128x128 pixels and read at one look as in the paper."""
+class LinemodPhotographs:
+    """Frames of the data set's camera, opened without labels."""
 
-    name = "linemod"
-
-    def __init__(self, thing: Object) -> None:
-        super().__init__(thing, squeezed(thing.camera, SIDE_PX), pose_layout(position_field(thing), confidence=False))
-
-
-class TwoStageLinemod(TwoStageWorld):
-    """One LineMOD object read at two looks, in frames of which some may be there without labels."""
-
-    def __init__(self, thing: Object, photographs: Path | None, views: Path | None = None) -> None:
-        """Nothing of the photographs is read before they are asked for.
+    def __init__(self, folder: Path, camera: Intrinsics, views: Path | None = None) -> None:
+        """Read nothing yet.
 
         Args:
-            thing: The object.
-            photographs: Their folder.
-            views: File with where their camera stood.
+            folder: Of the frames.
+            camera: That took them.
+            views: File with the camera's poses; they are recovered from the frames without it.
         """
-        super().__init__(Linemod.name, thing)
-        self._folder, self._views = photographs, views
-        self._placed: UnlabelledPhotographs | None = None
+        self._folder, self._camera, self._views = folder, camera, views
+        self._unlabelled: UnlabelledPhotographs | None = None
 
     def unlabelled(self) -> UnlabelledPhotographs:
-        """The photographs of the given folder; the poses of their cameras are found once."""
-        if self._folder is None:
-            return UnlabelledPhotographs(())
-        paths = spread(Photographs(self._folder).paths, MAX_UNLABELLED)
-        if self._placed is None or self._placed.paths != paths:
-            self._placed = UnlabelledPhotographs(paths, self.cameras(paths))
-        return self._placed
-
-    def cameras(self, paths: list[Path]) -> CameraPoses | None:
-        """Where the camera stood; None if it is known of no photograph.
+        """The frames; the poses of their cameras are recovered once.
 
         Raises:
-            CameraError: There is a file that should say it, and it does not do.
+            DataError: The folder cannot be read.
+            CameraError: The file of camera poses cannot be used.
         """
+        paths = spread(Photographs(self._folder).paths, MAX_UNLABELLED)
+        if self._unlabelled is None or self._unlabelled.paths != paths:
+            self._unlabelled = UnlabelledPhotographs(paths, self._camera_poses(paths))
+        return self._unlabelled
+
+    def _camera_poses(self, paths: Sequence[Path]) -> CameraPoses | None:
         if self._views is not None:
             return read_camera_poses(self._views, paths)
         try:
-            structure = recover(paths, self.object.camera)
+            structure = recover(paths, self._camera)
         except CurioError as exc:
-            _log.warning("photographs teach one by one, because their cameras cannot be placed: %s", exc)
+            _log.warning("photographs get pseudo-labels one by one, because no camera poses were recovered: %s", exc)
             return None
         matrices = np.full((len(paths), 4, 4), np.nan)
         matrices[[paths.index(path) for path in structure.photographs]] = structure.cam_from_world
         return CameraPoses(matrices)
 
 
-def read_camera_poses(file: Path, paths: list[Path]) -> CameraPoses:
-    """Where photographs were taken, in metres, by a file of ``--views-out``.
+def read_camera_poses(file: Path, paths: Sequence[Path]) -> CameraPoses:
+    """Camera poses of photographs, in metres, from a file of ``--views-out``.
 
     Raises:
-        CameraError: It cannot be read, says nothing of these photographs in metres, or a place is none.
+        CameraError: The file cannot be read, has no pose of these photographs in metres, or a pose is not rigid.
     """
-    places = CameraPoseFile.read(file, "--views")
+    poses = CameraPoseFile.read(file, "--views")
     unknown = np.full((4, 4), np.nan)
-    matrices = [places.anywhere(path) if places.in_metres(path) else unknown for path in paths]
+    matrices = [poses.cam_from_world(path) if poses.in_metres(path) else unknown for path in paths]
     cameras = CameraPoses(np.stack(matrices), in_metres=True)
     if not cameras.known.any():
         raise CameraError(
@@ -103,10 +93,10 @@ def read_camera_poses(file: Path, paths: list[Path]) -> CameraPoses:
 
 
 def build(options: LinemodOptions) -> SingleObjectWorld:
-    """The world of one LineMOD class, to be read at two looks or at one.
+    """The world of one LineMOD class, for a two-stage detector or for the paper's network.
 
     Raises:
-        UsageError: Unknown class, no data, or photographs without a gaze.
+        UsageError: Unknown class or no data.
         DataError: The folder is not a BOP data set, or lacks the class.
         MeshError: The mesh is broken.
     """
@@ -135,11 +125,11 @@ def build(options: LinemodOptions) -> SingleObjectWorld:
         others = [dataset.mesh(other) for other in dataset.classes if other != name]
         return ClutterBackgrounds.cached(cache, others)
 
-    thing = Object(kind, mesh, dataset.camera, NEAR_M, FAR_M, backgrounds)
-    if options.views is not None and options.photos is None:
-        raise UsageError(f"--views {options.views}: they say where photographs were taken; give these, too: --photos")
+    object_ = Object(kind, mesh, dataset.camera, NEAR_M, FAR_M, backgrounds)
     if not options.gaze:
-        if options.photos is not None:
-            raise UsageError(f"--photos {options.photos}: they teach the second look of a gaze; leave out --no-gaze")
-        return Linemod(thing)
-    return TwoStageLinemod(thing, options.photos, options.views)
+        layout = pose_layout(position_field(object_), confidence=False)
+        return SingleObjectWorld("linemod", object_, squeezed(dataset.camera, SIDE_PX), layout)
+    photographs = None
+    if options.photos is not None:
+        photographs = LinemodPhotographs(options.photos, dataset.camera, options.views)
+    return TwoStageWorld("linemod", object_, photographs)

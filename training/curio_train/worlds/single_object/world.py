@@ -1,4 +1,4 @@
-"""Worlds of one known object in six degrees of freedom, over backgrounds that are anything."""
+"""Worlds of one known object in six degrees of freedom, over backgrounds of any kind."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,94 +18,86 @@ from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.materials import random_appearances
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
-from curio_train.worlds.base import Batch, Camera, ImageSource, ObjectKind, Split, World, jitter_seed
-from curio_train.worlds.placement import colors
+from curio_train.worlds.base import SPLITS, Batch, Camera, ImageSource, ObjectKind, Split, World, jitter_seed
+from curio_train.worlds.generated.fields import COLOR_FIELD, CONFIDENCE_FIELD
+from curio_train.worlds.single_object.base_colors import BaseColorPrior, any_base_color
 from curio_train.worlds.single_object.viewpoints import (
     AMBIENT,
     ANY_EXPOSURE,
+    MAX_LIGHT,
     MILD_EXPOSURE,
-    STRONGEST_LIGHT,
-    WEAKEST_KNOWN_LIGHT,
-    WEAKEST_LIGHT,
+    MIN_LIGHT,
+    MIN_LIGHT_OF_KNOWN_SCENE,
     Exposure,
-    exposures,
-    lights,
-    places,
-    turned_towards,
-    upper_views,
+    allocentric_to_egocentric,
+    random_exposures,
+    random_lights,
+    random_positions,
+    upper_hemisphere_rotations,
 )
 
-Views = Callable[[int, np.random.Generator], Float[Tensor, "count 3 3"]]
+RotationPrior = Callable[[int, np.random.Generator], Float[Tensor, "count 3 3"]]
 """Draws rotations cam_from_obj of objects on the optical axis."""
 
-BaseColorPrior = Callable[[int, np.random.Generator], Float[Tensor, "count 1 3"]]
-"""Draws sRGB colours of objects."""
-
 EXPOSURE = "exposure"
-"""What the colours of an object that has its own are multiplied by, [batch, 1, 3]: drawn beside the code, never
-predicted. What a camera sees of a part on a desk is darker, and of another tint, than its mesh's colours."""
+"""Key beside the code of an object with colours of its own: factors on them, [batch, 1, 3], never predicted. Cameras
+see a part on a desk darker, and of another tint, than its mesh's colours."""
 
-FINISH = "finish"
-"""What its surface is like beside its colour, drawn beside the code of images that teach and never predicted."""
+APPEARANCE = "appearance"
+"""Key beside the code of training images: random surface properties other than colour, never predicted."""
 
-LEAST_PAINT_VALUE = 0.1
-"""Of the colours of an unpainted object, which may be black, white, grey or anything between."""
-
-_FINISH_DRAWS = 1  # of the draws of a step
-_SPLITS: tuple[Split, ...] = ("train", "validation", "test")
-
-
-def any_base_color(count: int, random: np.random.Generator) -> Float[Tensor, "count 1 3"]:
-    """Colours of a part of which nothing is known: black, white, grey or anything between."""
-    return colors(count, 1, random, 0.0, LEAST_PAINT_VALUE)
+_APPEARANCE_DRAWS = 1  # keeps these draws of a step apart from its others
 
 
 @dataclass(frozen=True, eq=False)
 class Object:
-    """What is looked for, and with what.
-
-    Attributes:
-        kind: Name, size and symmetries.
-        mesh: Its shape, metres.
-        camera: What frames are taken with.
-        near_m: Least distance along the optical axis.
-        far_m: Largest.
-        backgrounds: What it is seen in front of, made or found in a cache folder.
-        views: From where it is seen.
-        painted: The mesh has no colours: it has another one in each image, which is part of the scene code.
-        paints: Which ones.
-        known_scene: What is behind the object where it is looked for, and the light there, are known.
-    """
+    """The object of a world, and the scenes that it occurs in."""
 
     kind: ObjectKind
+    """Name, size and symmetries."""
     mesh: Mesh
+    """Its shape, metres."""
     camera: Intrinsics
+    """The camera that takes the frames."""
     near_m: float
+    """Smallest distance along the optical axis."""
     far_m: float
+    """Largest."""
     backgrounds: Callable[[Path], Backgrounds]
-    views: Views = field(default=upper_views)
-    painted: bool = False
-    paints: BaseColorPrior = field(default=any_base_color)
+    """Renders its backgrounds, or finds them in a cache folder."""
+    rotations: RotationPrior = field(default=upper_hemisphere_rotations)
+    """Viewpoints that it is seen from."""
+    unpainted: bool = False
+    """The mesh has no colours: it has another base colour in each image, which is part of the scene code."""
+    base_colors: BaseColorPrior = field(default=any_base_color)
+    """Prior of these base colours."""
     known_scene: bool = False
+    """Its background and the light there are known."""
 
 
 class SingleObjectWorld(World):
-    """One object before one pinhole camera, anywhere in its frame, rendered without end.
+    """One object anywhere in the frame of a pinhole camera, rendered without end."""
 
-    Attributes:
-        object: What is looked for.
-        given: Entries of its codes that are known of every image and never predicted.
-        num_shown: How many of the object an image shows.
-        finished: Images that teach show surfaces of any kind, see finish.py, unless the scene is known.
-    """
-
+    object: Object
+    """The object."""
     given: tuple[str, ...] = ()
-    num_shown: int = 1
-    finished: bool = False
+    """Entries of its codes that are known of every image and never predicted."""
+    num_instances: int = 1
+    """Copies of the object in each image."""
+    random_appearance: bool = False
+    """Whether training images show the object with random surface properties, unless the scene is known."""
 
-    def __init__(self, thing: Object, camera: Camera, layout: Layout) -> None:
-        self.object, self.camera, self.layout = thing, camera, layout
-        self.objects, self.mesh = (thing.kind,), thing.mesh
+    def __init__(self, name: str, object_: Object, camera: Camera, layout: Layout) -> None:
+        """Hold the object.
+
+        Args:
+            name: As on the command line; of a stage, as in the names of its losses.
+            object_: The object.
+            camera: The camera of its images, with a matrix.
+            layout: Of its scene code.
+        """
+        self.name, self.object, self.camera, self.layout = name, object_, camera, layout
+        self.objects = (object_.kind,)
 
     @property
     def model_name(self) -> str:
@@ -115,63 +107,57 @@ class SingleObjectWorld(World):
     def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:
         """Poses anywhere in the frame, light from the camera's side."""
         random = np.random.default_rng(seed)
-        translation = places(position_field(self.object), count, random)
-        rotation = turned_towards(translation, self.object.views(count, random))
-        code = scene(translation, rotation, self.lights(count, random))
-        code |= self.paint(count, random)
+        translation_m = random_positions(position_field(self.object), count, random)
+        rotation = allocentric_to_egocentric(translation_m, self.object.rotations(count, random))
+        code = pose_code(translation_m, rotation, self.sample_lights(count, random))
+        code |= self.sample_colors(count, random)
         return code | {CONFIDENCE: torch.ones(count, 1, 1)} if CONFIDENCE in self.layout else code
 
     def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
         """The object over ``backgrounds``, or over black."""
-        assert self.camera.matrix is not None  # these worlds have pinhole cameras
-        return self._image(code, code[TRANSLATION].float(), self.camera.matrix, backgrounds)
+        assert self.camera.matrix is not None
+        return self._render(code, code[TRANSLATION].float(), self.camera.matrix, backgrounds)
 
     def augment(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
-        """What real cameras and scenes do to a picture, see :func:`~curio_train.data.augmentation.augment`."""
+        """Renderings as real cameras and scenes change them, see :func:`~curio_train.data.augmentation.augment`."""
         return augment(images, np.random.default_rng(seed), self.augmentation)
-
-    def lights(self, count: int, random: np.random.Generator) -> Tensor:
-        """Light of any strength, or, in a known scene, as a place where things are looked at is lit, [count, 3]."""
-        return lights(count, random, WEAKEST_KNOWN_LIGHT if self.object.known_scene else WEAKEST_LIGHT)
 
     @property
     def augmentation(self) -> AugmentationStrength:
-        """How much its images are disturbed."""
+        """How strongly its images are augmented."""
         return KNOWN_SCENE if self.object.known_scene else UNKNOWN_SCENE
 
     @property
     def exposure(self) -> Exposure:
-        """How much the light on an object that has its own colours differs."""
+        """Range of the exposures of an object with its own colours."""
         return MILD_EXPOSURE if self.object.known_scene else ANY_EXPOSURE
 
-    def paint(self, count: int, random: np.random.Generator) -> dict[str, Tensor]:
-        """The entry of codes that says which colour an unpainted object has, [count, 1, 3] sRGB; others' exposure."""
-        if self.object.painted:
-            return {COLOR: self.object.paints(count, random)}
-        return {EXPOSURE: exposures(count, random, self.exposure)}
+    def sample_lights(self, count: int, random: np.random.Generator) -> Float[Tensor, "count 3"]:
+        """Light of any strength, or in a known scene of at least that of a lamp or a window."""
+        return random_lights(count, random, MIN_LIGHT_OF_KNOWN_SCENE if self.object.known_scene else MIN_LIGHT)
 
-    def finishes(self, code: SceneCode, seed: tuple[int, ...]) -> dict[str, Tensor]:
-        """The entry of a code that says what its surfaces are like, of any kind [batch, slots, FINISH_SIZE]."""
-        count, slots = code[TRANSLATION].shape[:2]
-        drawn = random_appearances(count * slots, np.random.default_rng((*seed, _FINISH_DRAWS)))
-        return {FINISH: drawn.reshape(count, slots, -1)}
+    def sample_colors(self, count: int, random: np.random.Generator) -> dict[str, Tensor]:
+        """The colour entry of codes, [count, 1, 3]: sRGB base colours of an unpainted object, else exposures."""
+        if self.object.unpainted:
+            return {COLOR: self.object.base_colors(count, random)}
+        return {EXPOSURE: random_exposures(count, random, self.exposure)}
 
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> "RenderedStream":
         """An endless stream of renderings; the splits differ in poses and in backgrounds."""
         training = split == "train"
         backgrounds = self.backgrounds(cache).split(training)
-        return RenderedStream(self, backgrounds, (_SPLITS.index(split), seed), with_code, training)
+        return RenderedStream(self, backgrounds, (SPLITS.index(split), seed), with_code=with_code, training=training)
 
     def backgrounds(self, cache: Path) -> Backgrounds:
-        """What its images show behind the object."""
+        """The backgrounds of its images."""
         return self.object.backgrounds(cache)
 
     @cached_property
     def _renderer(self) -> Renderer:
-        kinds = [0] * self.num_shown
+        kinds = [0] * self.num_instances
         return Renderer([self.object.mesh], kinds, self.camera.width, self.camera.height, ambient=AMBIENT)
 
-    def _image(self, code: SceneCode, translation_m: Tensor, matrix: np.ndarray, backgrounds: Tensor | None) -> Tensor:
+    def _render(self, code: SceneCode, translation_m: Tensor, matrix: np.ndarray, backgrounds: Tensor | None) -> Tensor:
         size = (len(translation_m), 3, self.camera.height, self.camera.width)
         return self._renderer(
             matrix_from_rotation_6d(code[ROTATION_6D].float()),
@@ -181,49 +167,60 @@ class SingleObjectWorld(World):
             light=code[LIGHT].float(),
             color=code[COLOR].float() if COLOR in code else code.get(EXPOSURE),
             confidence=code[CONFIDENCE][..., 0].float() if CONFIDENCE in code else None,
-            finish=code.get(FINISH),
+            appearance=code.get(APPEARANCE),
             seed=jitter_seed(code),
         )
 
 
 class RenderedStream(ImageSource):
-    """Images of a world over random backgrounds, rendered as they are asked for and never stored."""
+    """Images of a world over random backgrounds, rendered when they are asked for and never stored."""
 
     def __init__(
-        self, world: SingleObjectWorld, backgrounds: Backgrounds, seed: tuple[int, ...], with_code: bool, finished: bool
+        self,
+        world: SingleObjectWorld,
+        backgrounds: Backgrounds,
+        seed: tuple[int, ...],
+        *,
+        with_code: bool,
+        training: bool,
     ) -> None:
         self._world, self._backgrounds, self._seed, self._with_code = world, backgrounds, seed, with_code
-        self._finished = finished and world.finished and not world.object.known_scene
+        self._random_appearance = training and world.random_appearance and not world.object.known_scene
 
     @torch.no_grad()
     def batch(self, step: int, size: int) -> Batch:
         """The images of one step, a function of seed and step alone."""
-        code = self._world.sample(size, (*self._seed, step))
-        if self._finished:
-            code |= self._world.finishes(code, (*self._seed, step))
+        seed = (*self._seed, step)
+        code = self._world.sample(size, seed)
+        if self._random_appearance:
+            count, slots = code[TRANSLATION].shape[:2]
+            drawn = random_appearances(count * slots, np.random.default_rng((*seed, _APPEARANCE_DRAWS)))
+            code[APPEARANCE] = drawn.reshape(count, slots, -1)
         backgrounds = self.backgrounds(step, size)
         images = self._world.render(code, backgrounds)
         given = {name: code[name] for name in self._world.given}
         return Batch(images, backgrounds, code if self._with_code else None, given)
 
     def backgrounds(self, step: int, size: int) -> Tensor:
-        """Without the images, which take longer."""
+        """Without rendering the images."""
         camera = self._world.camera
         return self._backgrounds.draw(size, camera.width, camera.height, (*self._seed, step))
 
 
-def scene(translation: Tensor, rotation: Tensor, light: Tensor) -> dict[str, Tensor]:
-    """The code of scenes with one object: [count, 3], [count, 3, 3] and [count, 3]."""
+def pose_code(
+    translation_m: Float[Tensor, "count 3"], rotation: Float[Tensor, "count 3 3"], light: Float[Tensor, "count 3"]
+) -> dict[str, Tensor]:
+    """The code of scenes with one object."""
     return {
-        TRANSLATION: translation[:, None],
+        TRANSLATION: translation_m[:, None],
         ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None],
         LIGHT: light,
     }
 
 
-def position_field(thing: Object) -> Field:
-    """Where its centre may be: anywhere in the frame, between the nearest and the farthest distance."""
-    camera = thing.camera
+def position_field(object_: Object) -> Field:
+    """Positions of the object's origin: anywhere in the frame, between the smallest and the largest distance."""
+    camera = object_.camera
     center, focal = camera.matrix[[0, 1], 2], camera.matrix[[0, 1], [0, 1]]
     first, last = ((np.array(corner) - center) / focal for corner in ((0, 0), (camera.width - 1, camera.height - 1)))
     return Field(
@@ -232,23 +229,21 @@ def position_field(thing: Object) -> Field:
         unit="m",
         frame="camera",
         activation="perspective",
-        lower=(*first.tolist(), thing.near_m),
-        upper=(*last.tolist(), thing.far_m),
+        lower=(*first.tolist(), object_.near_m),
+        upper=(*last.tolist(), object_.far_m),
     )
 
 
 def pose_layout(position: Field, *, confidence: bool, color: bool = False) -> Layout:
-    """The paper's R¹² of one object: position 3, rotation 6, light 3; confidence and colour of one object are ours."""
+    """The paper's R¹² of one object: position 3, rotation 6, light 3; confidence and colour are not the paper's."""
     rotation = Field(ROTATION_6D, 6, frame="camera", lower=(-1.0,) * 6, upper=(1.0,) * 6)
-    bounds = (-STRONGEST_LIGHT,) * 3, (STRONGEST_LIGHT,) * 3
+    bounds = (-MAX_LIGHT,) * 3, (MAX_LIGHT,) * 3
     light = Field(LIGHT, 3, per_object=False, frame="camera", lower=bounds[0], upper=bounds[1])
-    sure = Field(CONFIDENCE, 1, activation="sigmoid", lower=(0.0,), upper=(1.0,))
-    paint = Field(COLOR, 3, activation="sigmoid", lower=(0.0,) * 3, upper=(1.0,) * 3)
-    return Layout((position, rotation, *[sure] * confidence, *[paint] * color, light))
+    return Layout((position, rotation, *[CONFIDENCE_FIELD] * confidence, *[COLOR_FIELD] * color, light))
 
 
 def resized(camera: Intrinsics, width: int, height: int) -> Camera:
-    """The same view with other pixels."""
+    """The same view in another number of pixels."""
     return Camera(width, height, scale_matrix(camera.matrix, (camera.width, camera.height), (width, height)))
 
 

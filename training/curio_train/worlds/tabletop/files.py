@@ -1,4 +1,4 @@
-"""The world of parts on a plane from a user's files: meshes set upright, photographs through one camera, the plane."""
+"""The world of parts on a plane from a user's files: meshes set upright, photographs of one camera, the plane."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -9,119 +9,138 @@ import torch
 from torch import Tensor
 
 from curio_train.camera import Intrinsics, load_intrinsics
-from curio_train.capture.plane import CameraPoseFile, ever_changed, seen_points
+from curio_train.capture.plane import CameraPoseFile, changed_pixels, points_on_plane
+from curio_train.data.part_color import is_unpainted
 from curio_train.data.photographs import Photographs, read_frames
 from curio_train.errors import DataError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import Mesh, load_mesh
 from curio_train.meshes.symmetries import Symmetries, find_symmetries
 from curio_train.scene_code import TRANSLATION, Field
-from curio_train.worlds.base import Camera, ObjectKind, View
-from curio_train.worlds.generated.ground import AMBIENT, SUN
-from curio_train.worlds.generated.mesh_world import SceneSetup
+from curio_train.worlds.base import Camera, ObjectKind, PhotographSet
+from curio_train.worlds.generated.ground import AMBIENT, GROUND_SRGB, OUTLINE_SAMPLES, SUN, standing_kind
+from curio_train.worlds.generated.scene_setup import SceneSetup
 from curio_train.worlds.options import CaptureOptions
 from curio_train.worlds.single_object.world import resized
-from curio_train.worlds.tabletop.world import Part, Pictures, Table
+from curio_train.worlds.tabletop.world import Part, TabletopPhotographs, TabletopWorld
 
 SIDE_PX = 128
-_ALONG = 0.999  # cosine of an angle between an axis and the vertical that counts as none
+_PARALLEL = 0.999  # cosine of the angle between an axis and the vertical
 
-# Rotations that carry the mesh's axis up to y; each keeps the frame right-handed.
-_Y_FROM_UP = {
+# Rotations from the mesh file's frame, with the named axis up, to one with y up; right-handed.
+_Y_UP_FROM = {
     "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
     "y": np.eye(3),
     "z": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),
 }
 
 
-def build_table(options: CaptureOptions) -> Table:
+def build_tabletop(options: CaptureOptions) -> TabletopWorld:
     """Read everything that the world is made of.
+
+    Args:
+        options: With a plane and a background.
 
     Raises:
         UsageError: The flags do not fit each other.
         MeshError: A mesh is missing or broken.
-        CameraError: The camera file or the file of the plane does not do.
-        DataError: A photograph or plate is missing, broken or of another size, or they show no parts.
+        CameraError: The camera file or the file of the plane cannot be used.
+        DataError: A photograph or background image is missing, broken or of another size, or they show no parts.
     """
-    assert options.plane is not None  # what makes it a table
-    assert options.background is not None  # refused by the options
-    amounts, intrinsics = options.amounts, load_intrinsics(options.camera)
+    assert options.plane is not None
+    assert options.background is not None  # the options have refused a plane without one
+    count_ranges, intrinsics = options.count_ranges, load_intrinsics(options.camera)
     cameras = CameraPoseFile.read(options.plane)
     parts = [
-        _part(load_mesh(file, options.mesh_unit), file.stem, options, *amount)
-        for file, amount in zip(options.mesh, amounts, strict=True)
+        _part(load_mesh(file, options.mesh_unit), file.stem, options, *counts)
+        for file, counts in zip(options.mesh, count_ranges, strict=True)
     ]
-    camera = resized(intrinsics, SIDE_PX, SIDE_PX)
-    pose = _pose(cameras.cam_from_world(options.background))
-    stage = SceneSetup(camera, pose, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), AMBIENT, (0.0, SUN, 0.0))
-    highest = max(float(np.linalg.norm(part.mesh.vertices_m, axis=1).max()) for part in parts) if options.lying else 0.0
-    pictures = _pictures(options, cameras, intrinsics, camera, highest)
-    return Table(parts, stage, pictures, lying=options.lying, blur_px=options.blur_px)
+    setup = SceneSetup(
+        resized(intrinsics, SIDE_PX, SIDE_PX),
+        Pose.from_matrix(cameras.pose_above_plane(options.background)),
+        center_m=(0.0, 0.0, 0.0),
+        up=(0.0, 1.0, 0.0),
+        ambient=AMBIENT,
+        sun=(0.0, SUN, 0.0),
+        ground_srgb=GROUND_SRGB,
+        outline_samples=OUTLINE_SAMPLES,
+    )
+    highest_m = max(part.radius_m for part in parts) if options.lying else 0.0
+    photographs = _photographs(options, options.background, cameras, intrinsics, setup, highest_m)
+    return TabletopWorld(parts, setup, photographs, lying=options.lying, blur_px=options.blur_px)
 
 
-def _part(mesh: Mesh, name: str, options: CaptureOptions, fewest: int, most: int) -> Part:
+def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_count: int) -> Part:
     """A mesh set upright, or with its middle at the origin."""
-    turn = _Y_FROM_UP[options.up]
-    turned = mesh.vertices_m @ turn.T
-    low, high = turned.min(axis=0), turned.max(axis=0)
+    rotation = _Y_UP_FROM[options.up]
+    rotated = mesh.vertices_m @ rotation.T
+    low, high = rotated.min(axis=0), rotated.max(axis=0)
     origin = (low + high) / 2
     if not options.lying:
         origin[1] = low[1]
-    own = dataclasses.replace(mesh, vertices_m=turned - origin)
+    own = dataclasses.replace(mesh, vertices_m=rotated - origin)
+    radius_m = float(np.linalg.norm(own.vertices_m, axis=1).max())
+    if not options.lying:
+        radius_m = standing_kind(name, own, 1).radius_m
     found = find_symmetries(mesh)
     kind = ObjectKind(name, (), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous)
-    unpainted = mesh.texture is None and mesh.vertex_colors_srgb is None
-    fold = _fold(found, turn[1]) if unpainted else 1
-    return Part(kind, own, Pose(turn.T, turn.T @ origin), fewest, most, fold, unpainted)
+    unpainted = is_unpainted(mesh)
+    fold = _fold(found, rotation[1]) if unpainted else 1
+    file_from_own = Pose(rotation.T, rotation.T @ origin)
+    return Part(kind, own, file_from_own, radius_m, min_count, max_count, fold, unpainted)
 
 
 def _fold(found: Symmetries, up: np.ndarray) -> int:
-    """How many turns about the vertical axis look alike, being none among them; 0: all."""
-    if len(found.continuous) > 1 or any(abs(axis @ up) > _ALONG for axis, _ in found.continuous):
+    """Order of the rotational symmetry about the vertical axis, 1 without one; 0: of revolution."""
+    if len(found.continuous) > 1 or any(abs(axis @ up) > _PARALLEL for axis, _ in found.continuous):
         return 0
-    return 1 + sum(bool(up @ matrix[:3, :3] @ up > _ALONG) for matrix in found.discrete)
+    return 1 + sum(bool(up @ matrix[:3, :3] @ up > _PARALLEL) for matrix in found.discrete)
 
 
-def _pictures(
-    options: CaptureOptions, cameras: CameraPoseFile, intrinsics: Intrinsics, camera: Camera, highest_m: float
-) -> Pictures:
-    assert options.background is not None  # refused by the options
+def _photographs(
+    options: CaptureOptions,
+    background: Path,
+    cameras: CameraPoseFile,
+    intrinsics: Intrinsics,
+    setup: SceneSetup,
+    highest_m: float,
+) -> TabletopPhotographs:
     paths = Photographs(options.photos).paths
     for path in paths:
-        cameras.sees_alike(path, options.background)
-    own_plates = [cameras.plate(path) or options.background for path in paths]
-    frames = {plate: _frames([plate], intrinsics)[0] for plate in {*own_plates, options.background}}
+        cameras.check_same_viewpoint(path, background)
+    own_backgrounds = [cameras.background_image(path) or background for path in paths]
+    images = {path: _frames([path], intrinsics)[0] for path in {*own_backgrounds, background}}
     training = _frames(paths, intrinsics)
-    behind = torch.stack([frames[plate] for plate in own_plates])
-    occupied = ever_changed(list(training.numpy()), list(behind.numpy()))
-    position = _position(camera, cameras.cam_from_world(options.background), occupied, highest_m)
+    backgrounds = torch.stack([images[path] for path in own_backgrounds])
+    occupied = changed_pixels(list(training.numpy()), list(backgrounds.numpy()))
+    position = _position_field(setup.camera, cameras.pose_above_plane(background), occupied, highest_m)
     judged = Photographs(options.held_out).paths if options.held_out is not None else paths
-    views, second = _views(options, cameras, intrinsics, judged, frames[options.background])
-    one_plate = len(set(own_plates)) == 1 and own_plates[0] == options.background
-    return Pictures(training, behind[:1] if one_plate else behind, views, second, occupied, position)
+    second = second_pose = None
+    if options.second is not None and options.second_background is not None:
+        judged, others = _pairs(options.second, judged)
+        second = PhotographSet(_frames(others, intrinsics), _frames([options.second_background], intrinsics)[0])
+        second_pose = Pose.from_matrix(cameras.pose_above_plane(options.second_background))
+    own = PhotographSet(_frames(judged, intrinsics), images[background])
+    differ = any(path != background for path in own_backgrounds)
+    return TabletopPhotographs(training, backgrounds if differ else None, own, second, second_pose, occupied, position)
 
 
-def _views(
-    options: CaptureOptions, cameras: CameraPoseFile, intrinsics: Intrinsics, paths: Sequence[Path], plate: Tensor
-) -> tuple[tuple[View, ...], Pose | None]:
-    if options.second is None or options.second_background is None:
-        return (View(_frames(paths, intrinsics), plate),), None
-    others = {path.name: path for path in Photographs(options.second).paths}
-    pairs = [path for path in paths if path.name in others]
-    if not pairs:
+def _pairs(folder: Path, paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """The photographs that have a namesake in the second camera's folder, and those namesakes."""
+    others = {path.name: path for path in Photographs(folder).paths}
+    own = [path for path in paths if path.name in others]
+    if not own:
         raise DataError(
-            f"--second {options.second}: no photograph there is named like one in {paths[0].parent}; the two of a "
+            f"--second {folder}: no photograph there is named like one in {paths[0].parent}; the two of a "
             f"scene have to have one name, such as {paths[0].name}"
         )
-    second_plate = _frames([options.second_background], intrinsics)[0]
-    second = View(_frames([others[path.name] for path in pairs], intrinsics), second_plate)
-    return (View(_frames(pairs, intrinsics), plate), second), _pose(cameras.cam_from_world(options.second_background))
+    return own, [others[path.name] for path in own]
 
 
-def _position(camera: Camera, cam_from_world: np.ndarray, occupied: np.ndarray, highest_m: float) -> Field:
-    """The rectangle of the plane that is seen where parts ever were."""
+def _position_field(camera: Camera, cam_from_world: np.ndarray, occupied: np.ndarray, highest_m: float) -> Field:
+    """The rectangle of the plane around all points that project to occupied pixels."""
     assert camera.matrix is not None  # it has a pinhole camera
-    points = seen_points(camera.matrix, cam_from_world, camera.width, camera.height)[occupied]
+    points = points_on_plane(camera.matrix, cam_from_world, camera.width, camera.height)[occupied]
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise DataError("parts are seen above the horizon of --plane alone; does the file fit to the photographs?")
@@ -138,7 +157,3 @@ def _position(camera: Camera, cam_from_world: np.ndarray, occupied: np.ndarray, 
 
 def _frames(paths: Sequence[Path], intrinsics: Intrinsics) -> Tensor:
     return torch.from_numpy(read_frames(paths, intrinsics, SIDE_PX, SIDE_PX))
-
-
-def _pose(matrix: np.ndarray) -> Pose:
-    return Pose(matrix[:3, :3], matrix[:3, 3])

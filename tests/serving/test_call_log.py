@@ -1,0 +1,29 @@
+"""A fault of ours is answered as INTERNAL, counted, and logged with its traceback."""
+
+import logging
+
+import pytest
+from curio_serve.api.status import CallLog
+from curio_serve.errors import InternalError
+from curio_serve.telemetry import LOGGER, Metrics
+from prometheus_client import CollectorRegistry
+
+
+class Caller:
+    def peer(self) -> str:
+        return "ipv4:127.0.0.1:1"
+
+
+def test_an_unforeseen_fault_is_answered_counted_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+    registry = CollectorRegistry()
+
+    with caplog.at_level(logging.ERROR, LOGGER.name):
+        LOGGER.addHandler(caplog.handler)
+        try:
+            with pytest.raises(InternalError) as caught, CallLog(Metrics(registry)).record("Detect", Caller()):
+                raise ZeroDivisionError("of ours")
+        finally:
+            LOGGER.removeHandler(caplog.handler)
+    assert "of ours" not in str(caught.value), "what went wrong inside is the log's business"
+    assert registry.get_sample_value("curio_requests_total", {"method": "Detect", "code": "INTERNAL"}) == 1
+    assert any(record.exc_info and record.exc_info[0] is ZeroDivisionError for record in caplog.records)
