@@ -81,7 +81,7 @@ def agree(
 ) -> tuple[dict[str, Tensor], Tensor]:
     symmetries = symmetry_poses(world.object.kind.info, SYMMETRY_STEP)
     estimates = Estimates(read, read, torch.ones(NUM, dtype=torch.bool))
-    return consensus_poses(RenderAndCompare(world), frames, CameraPoses(matrices), estimates, symmetries)
+    return consensus_poses(RenderAndCompare.in_world(world), frames, CameraPoses(matrices), estimates, symmetries)
 
 
 def errors(found: SceneCode, true: SceneCode) -> tuple[Tensor, Tensor]:
@@ -113,7 +113,7 @@ def test_metres_correct_what_an_object_is_read_too_far_by(
     estimates = Estimates(read, read, torch.ones(NUM, dtype=torch.bool))
     off = []
     for where in (CameraPoses(of_any_scale), CameraPoses(metres, in_metres=True)):
-        code, chosen = consensus_poses(RenderAndCompare(world), frames, where, estimates, [Pose.identity()])
+        code, chosen = consensus_poses(RenderAndCompare.in_world(world), frames, where, estimates, [Pose.identity()])
         assert chosen.sum() >= NUM - 4
         off.append((code[TRANSLATION][chosen, 0, 2] / truth[TRANSLATION][chosen, 0, 2]).log().median())
     assert off[0] == pytest.approx(np.log(1.04), abs=0.01)

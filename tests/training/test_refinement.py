@@ -42,7 +42,7 @@ def world() -> TwoStageWorld:
 
 @pytest.fixture(scope="module")
 def refinement(world: TwoStageWorld) -> RenderAndCompare:
-    return RenderAndCompare(world)
+    return RenderAndCompare.in_world(world)
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +143,6 @@ def test_rotations_of_vectors_are_scipys() -> None:
 
 def test_worlds_without_one_object_are_refused(tmp_path: Path, write_run) -> None:
     with pytest.raises(UsageError, match="--refine: world circles cannot be refined, expected one object"):
-        RenderAndCompare(Circles())
+        RenderAndCompare.in_world(Circles())
     with pytest.raises(UsageError, match="--refine: world circles"):
         evaluate(write_run(tmp_path / "run"), refine=True, cache=tmp_path)

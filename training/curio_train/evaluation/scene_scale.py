@@ -84,6 +84,6 @@ def _scale_by(path: Path, data: Path | None, structure: Structure) -> float | No
     chosen = spread(structure.photographs, MOST_PHOTOGRAPHS)
     matrices = structure.cam_from_world[[structure.photographs.index(photograph) for photograph in chosen]]
     frames = torch.from_numpy(read_frames(chosen, camera, world.camera.width, world.camera.height))
-    refiner = RenderAndCompare(world)
+    refiner = RenderAndCompare.in_world(world)
     found = predict_and_refine(refiner, frames, lambda images: subject.predict((images * 255).round().byte()))
     return estimate_scale(CameraPoses(matrices), found.refined, found.accepted, refiner.diameter_m)

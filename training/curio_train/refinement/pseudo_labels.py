@@ -71,7 +71,7 @@ class PseudoLabels:
             If camera poses are known and enough photographs are part of a consensus, those. Else the photographs whose
             refined pose, refined once more, was accepted either time. None if there are none.
         """
-        refiner = RenderAndCompare(world)
+        refiner = RenderAndCompare.in_world(world)
         estimates = predict_and_refine(refiner, frames, predict)
         if cameras is not None:
             symmetries = symmetry_poses(world.object.kind.info, SYMMETRY_STEP)

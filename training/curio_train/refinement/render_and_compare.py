@@ -12,7 +12,7 @@ the estimate, and enough of the silhouette is inliers: pixels that the backgroun
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -24,11 +24,12 @@ from torch import Tensor
 
 from curio_train.errors import UsageError
 from curio_train.geometry import rotation_angle_deg
+from curio_train.meshes.meshes import Mesh
 from curio_train.refinement.crops import Crops, PoseAndLight, PoseUpdate, crop_frames
 from curio_train.refinement.inpainting import blurred, dilated, inpainted
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, LIGHT, ROTATION_6D, TRANSLATION, SceneCode, index
-from curio_train.worlds.base import World
+from curio_train.worlds.base import Camera, World
 from curio_train.worlds.single_object.crop_pose_stage import crop_matrices
 from curio_train.worlds.single_object.viewpoints import AMBIENT
 from curio_train.worlds.single_object.world import SingleObjectWorld
@@ -74,18 +75,32 @@ def with_refinement(predict: Callable[[Tensor], SceneCode], world: World) -> Cal
     Raises:
         UsageError: The world is another.
     """
-    refiner = RenderAndCompare(world)
+    refiner = RenderAndCompare.in_world(world)
     return lambda images: refiner.refine(images, predict(images))[0]
 
 
 class RenderAndCompare:
-    """Refines poses of one object in frames of a world's camera."""
+    """Refines poses of one object in frames of one camera."""
 
     diameter_m: float
     """Of the object."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, mesh: Mesh, camera: Camera, diameter_m: float) -> None:
         """Build the renderer.
+
+        Args:
+            mesh: Of the object.
+            camera: Of the frames, with K.
+            diameter_m: Of the object; crops and limits are measured in it.
+        """
+        self._camera = camera
+        self._matrix = torch.from_numpy(np.asarray(camera.matrix)).float()
+        self.diameter_m = diameter_m
+        self._renderer = Renderer([mesh], [0], CROP_PX, CROP_PX, ambient=AMBIENT)
+
+    @classmethod
+    def in_world(cls, world: World) -> "RenderAndCompare":
+        """For the object and the camera of a world.
 
         Raises:
             UsageError: The world does not have one object before a pinhole camera.
@@ -95,10 +110,7 @@ class RenderAndCompare:
                 f"--refine: world {world.name} cannot be refined, expected one object before a camera (linemod, "
                 "capture); leave it out"
             )
-        self._camera = world.camera
-        self._matrix = torch.from_numpy(np.asarray(world.camera.matrix)).float()
-        self.diameter_m = world.object.kind.diameter_m
-        self._renderer = Renderer([world.object.mesh], [0], CROP_PX, CROP_PX, ambient=AMBIENT)
+        return cls(world.object.mesh, world.camera, world.object.kind.diameter_m)
 
     def refine(self, images: Tensor, code: SceneCode) -> tuple[dict[str, Tensor], Bool[Tensor, " batch"]]:
         """Refine the poses of a batch, all at once.
@@ -111,14 +123,24 @@ class RenderAndCompare:
             The code with refined positions and rotations where the result was accepted, everything else as it was; and
             where it was accepted.
         """
-        result = dict(code)
-        for number in range(len(_ROUNDS)):
-            result |= self._optimised(images, result, number)
+        *_, (result, _) = self.steps(images, code)
         accepted = self._accepted(images, code, result)
         refined = {
             name: torch.where(accepted[:, None, None], result[name], code[name]) for name in (TRANSLATION, ROTATION_6D)
         }
         return dict(code) | refined, accepted
+
+    def steps(self, images: Tensor, code: SceneCode) -> Iterator[tuple[dict[str, Tensor], Float[Tensor, " batch"]]]:
+        """The code after each step of the optimisation, and the mean residual before the step, 0 to 1.
+
+        Arguments are those of :meth:`refine`. Residuals of different rounds are behind different blurs.
+        """
+        result = dict(code)
+        for number in range(len(_ROUNDS)):
+            for update, residual in self._round(images, result, number):
+                found = result | update
+                yield found, residual
+            result = found
 
     @torch.no_grad()
     def inlier_ratio(self, images: Tensor, code: SceneCode) -> Float[Tensor, " batch"]:
@@ -146,8 +168,10 @@ class RenderAndCompare:
         visible: np.ndarray = inside & (depth[:, 0] > self.diameter_m)
         return visible
 
-    def _optimised(self, images: Tensor, code: SceneCode, number: int) -> dict[str, Tensor]:
-        """Pose and light after one of the rounds."""
+    def _round(
+        self, images: Tensor, code: SceneCode, number: int
+    ) -> Iterator[tuple[dict[str, Tensor], Float[Tensor, " batch"]]]:
+        """Pose and light after each step of one round, and the mean residual before it."""
         times, margin_px = _ROUNDS[number]
         crops = self._crops(images, code, margin_px).blurred(times)
         start, update = crops.from_code(code), PoseUpdate.zero(len(images))
@@ -159,12 +183,13 @@ class RenderAndCompare:
         for _ in range(_STEPS):
             optimizer.zero_grad()
             estimate = start.updated(update, self.diameter_m)
-            residual = crops.residual(self._rendered(crops, estimate, gain_and_offset))
-            crops.mean_residual(residual).sum().backward()
+            residual = crops.mean_residual(crops.residual(self._rendered(crops, estimate, gain_and_offset)))
+            residual.sum().backward()
             optimizer.step()
             rates.step()
-        with torch.no_grad():
-            return crops.to_code(start.updated(update, self.diameter_m))
+            with torch.no_grad():
+                result = crops.to_code(start.updated(update, self.diameter_m))
+            yield result, residual.detach()
 
     @torch.no_grad()
     def _crops(self, images: Tensor, code: SceneCode, margin_px: int) -> Crops:

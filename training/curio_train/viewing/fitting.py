@@ -1,11 +1,12 @@
 """Moves one object of a page by render-and-compare, from where it was put."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from curio_train.camera import scale_matrix
 from curio_train.drawing.pictures import LIGHT as DEFAULT_LIGHT
 from curio_train.geometry import Pose, rotation_6d_from_matrix
 from curio_train.refinement.render_and_compare import RenderAndCompare
@@ -20,35 +21,34 @@ class Step(NamedTuple):
     pose: Pose
     """cam_from_obj, metres."""
     loss: float
-    """Robust difference between the crop around the object and its re-rendering; see ``render_and_compare``."""
+    """Mean robust residual between the crop around the object and its re-rendering, 0 to 1."""
 
 
 def walk(page: Page, number: int) -> Iterator[Step]:
     """The pose after each step of the optimisation.
 
     Args:
-        page: Its image is what the object's rendering is to look like.
+        page: With the image that the object's rendering is to resemble.
         number: Of the object in the page's scene.
 
     Raises:
         RendererError: There is no usable libLLVM.
     """
-    item = page.scene.objects[number]
+    item, mesh = page.scene.objects[number], page.context.mesh(page.scene.objects[number].kind)
     height, width = page.image.shape[:2]
-    scale = np.diag([width / page.scene.width, height / page.scene.height, 1.0])
-    refine = RenderAndCompare(page.context.mesh(item.kind), Camera(width, height, scale @ page.scene.camera_matrix))
+    matrix = scale_matrix(page.scene.camera_matrix, (page.scene.width, page.scene.height), (width, height))
     light = page.scene.light if page.scene.light is not None else page.context.light
     code = {
         TRANSLATION: _tensor(item.pose.translation_m)[None],
-        ROTATION_6D: rotation_6d_from_matrix(_tensor(item.pose.rotation)),
+        ROTATION_6D: rotation_6d_from_matrix(_tensor(item.pose.rotation))[None],
         LIGHT: _tensor(DEFAULT_LIGHT if light is None else light),
         COLOR: _tensor(item.color_srgb)[None],
     }
     image = torch.from_numpy(np.ascontiguousarray(page.image)).permute(2, 0, 1)[None]
-    for found, loss in refine.walk(image, code):
-        (pose,) = poses(found)
-        yield Step(pose, float(loss))
+    refiner = RenderAndCompare(mesh, Camera(width, height, matrix), mesh.diameter_m)
+    for found, residual in refiner.steps(image, code):
+        yield Step(poses(found)[0], float(residual))
 
 
-def _tensor(values: object) -> torch.Tensor:
+def _tensor(values: Sequence[float] | np.ndarray) -> torch.Tensor:
     return torch.tensor(np.array(values), dtype=torch.float32)[None]

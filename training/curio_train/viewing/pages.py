@@ -4,8 +4,8 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,15 @@ from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Scene, mesh_world, read_scenes, scene_of_code
 from curio_train.errors import CurioError, DataError, UsageError
 from curio_train.evaluation.subject import load_subject
+from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE
 from curio_train.meshes.meshes import Unit
+from curio_train.scene_code import index
 from curio_train.worlds import WORLDS
+from curio_train.worlds.base import World
 from curio_train.worlds.generated.mesh_world import MeshWorld
+from curio_train.worlds.single_object.viewpoints import AMBIENT
+from curio_train.worlds.single_object.world import SingleObjectWorld
 
 NUM_DRAWN = 8
 """Scenes that a world or a run shows."""
@@ -30,14 +35,14 @@ _SEED = 7
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """One image with the scene code that was read in it.
-
-    ``image`` is [height, width, 3] uint8 sRGB: a photograph, or the rendering that a run was validated with.
-    """
+    """One image with the scene code that was read in it."""
 
     scene: Scene
+    """The scene code."""
     context: SceneContext
+    """Meshes and whatever else a code does not say."""
     image: np.ndarray
+    """[height, width, 3] uint8 sRGB: a photograph, or the rendering that a run was validated with."""
     over_image: bool
     """Whether objects are drawn over the image (photographs), or over the world's own background."""
 
@@ -47,10 +52,17 @@ class Opening:
     """What to open; see :func:`open_pages`."""
 
     path: str
+    """A result file, a photograph or a folder of them, a run folder, or the name of a generated world."""
     meshes: tuple[str, ...] = ()
+    """FILE or NAME=FILE, of the objects in a result file."""
     mesh_unit: Unit | None = None
+    """Of their coordinates; the file's own unless given."""
     model: str | None = None
+    """Model folder or server address that reads photographs."""
     camera: Path | None = None
+    """Camera file of the photographs."""
+    cache: Path = Path()
+    """Where image sets that a world draws once are kept."""
 
 
 def open_pages(opening: Opening) -> list[Page]:
@@ -72,10 +84,29 @@ def open_pages(opening: Opening) -> list[Page]:
     if not path.exists():
         raise UsageError(f"{path}: there is no such file or folder, and no world of that name; expected {_EXPECTED}")
     if (path / CONFIG_FILE).exists():
-        return list(_of_run(path))
+        return list(_of_run(path, opening.cache))
     if path.suffix in (".json", ".jsonl"):
         return _of_results(path, opening)
     return _of_photographs(path, opening)
+
+
+def newer_pages(opening: Opening) -> Callable[[], list[Page] | None]:
+    """A function that opens a run folder again once it has a newer checkpoint; else, and for all else, None."""
+    path = Path(opening.path)
+    if not (path / CONFIG_FILE).exists():
+        return lambda: None
+    run = RunFolder.open(path)
+    seen = run.checkpoints()[-1:]
+
+    def reload() -> list[Page] | None:
+        nonlocal seen
+        latest = run.checkpoints()[-1:]
+        if latest == seen:
+            return None
+        seen = latest
+        return open_pages(opening)
+
+    return reload
 
 
 _EXPECTED = f"a result file of curio-detect, a photograph, a run folder, or one of the worlds {', '.join(WORLDS)}"
@@ -86,24 +117,29 @@ def _of_world(name: str) -> Iterator[Page]:
     codes = world.sample(NUM_DRAWN, (_SEED,))
     images = world.render(codes).clamp(0, 1)
     for number in range(NUM_DRAWN):
-        scene = scene_of_code(world, {field: values[number : number + 1] for field, values in codes.items()}, number)
+        scene = scene_of_code(world, index(codes, slice(number, number + 1)), number)
         yield Page(scene, SceneContext.of_world(world), _uint8(images[number]), over_image=False)
 
 
-def _of_run(path: Path) -> Iterator[Page]:
+def _of_run(path: Path, cache: Path) -> Iterator[Page]:
     """Validation images, and what the network of the newest checkpoint reads in them."""
     subject = load_subject(path)
     world = subject.world
-    if world.camera.matrix is None or not (isinstance(world, MeshWorld) or world.mesh):
-        raise UsageError(f"{path}: world {world.name} is flat; curio-view shows scenes in three dimensions")
-    cache = Path("~/.cache/curio-pose").expanduser()
-    images = world.source("validation", 0, with_code=False, cache=cache).batch(0, NUM_DRAWN).images
+    context = _context(path, world)
+    source = world.source("validation", 0, with_code=False, cache=cache)
+    images = source.batch(0, NUM_DRAWN).images
     codes = subject.predict((images * 255).round().byte())
-    flat = isinstance(world, MeshWorld)
     for number in range(NUM_DRAWN):
-        scene = scene_of_code(world, {field: values[number : number + 1] for field, values in codes.items()}, number)
-        context = SceneContext.of_world(world) if isinstance(world, MeshWorld) else SceneContext({"": world.mesh})
-        yield Page(scene, context, _uint8(images[number]), over_image=not flat)
+        scene = scene_of_code(world, index(codes, slice(number, number + 1)), number)
+        yield Page(scene, context, _uint8(images[number]), over_image=not isinstance(world, MeshWorld))
+
+
+def _context(path: Path, world: World) -> SceneContext:
+    if isinstance(world, MeshWorld):
+        return SceneContext.of_world(world)
+    if isinstance(world, SingleObjectWorld):
+        return SceneContext({"": world.object.mesh}, AMBIENT)
+    raise UsageError(f"{path}: world {world.name} is flat; curio-view shows scenes in three dimensions")
 
 
 def _of_results(path: Path, opening: Opening) -> list[Page]:
@@ -149,11 +185,6 @@ def _of_photographs(path: Path, opening: Opening) -> list[Page]:
             if errors:
                 raise DataError(f"{path}: {errors[0]}") from None
             raise
-
-
-def with_scene(page: Page, scene: Scene) -> Page:
-    """The page with another scene in front of the same image."""
-    return replace(page, scene=scene)
 
 
 def _uint8(image: torch.Tensor) -> np.ndarray:
