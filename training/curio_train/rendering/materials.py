@@ -92,7 +92,7 @@ def log_uniform(low: float, high: float, shape: tuple[int, ...], random: np.rand
 
 @dataclass(frozen=True)
 class Appearance:
-    """The appearances of the rows that hits belong to; see :func:`finishes`."""
+    """Appearance of the instances that rays hit; see :func:`random_appearances`."""
 
     mi: ModuleType
     """Mitsuba."""

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: training appearances and saves the current step first; all else stops at once."""
+"""Ctrl-C and SIGTERM: training finishes and saves the current step first; everything else stops at once."""
 
 import signal
 from collections.abc import Iterator
