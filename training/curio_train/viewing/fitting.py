@@ -7,7 +7,6 @@ import numpy as np
 import torch
 
 from curio_train.camera import scale_matrix
-from curio_train.drawing.pictures import LIGHT as DEFAULT_LIGHT
 from curio_train.geometry import Pose, rotation_6d_from_matrix
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import COLOR, LIGHT, ROTATION_6D, TRANSLATION, poses
@@ -37,11 +36,10 @@ def walk(page: Page, number: int) -> Iterator[Step]:
     item, mesh = page.scene.objects[number], page.context.mesh(page.scene.objects[number].kind)
     height, width = page.image.shape[:2]
     matrix = scale_matrix(page.scene.camera_matrix, (page.scene.width, page.scene.height), (width, height))
-    light = page.scene.light if page.scene.light is not None else page.context.light
     code = {
         TRANSLATION: _tensor(item.pose.translation_m)[None],
         ROTATION_6D: rotation_6d_from_matrix(_tensor(item.pose.rotation))[None],
-        LIGHT: _tensor(DEFAULT_LIGHT if light is None else light),
+        LIGHT: _tensor(page.light),
         COLOR: _tensor(item.color_srgb)[None],
     }
     image = torch.from_numpy(np.ascontiguousarray(page.image)).permute(2, 0, 1)[None]

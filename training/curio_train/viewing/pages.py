@@ -13,7 +13,7 @@ import torch
 
 from curio_train.data.photographs import read_photograph
 from curio_train.drawing.album import scene_context
-from curio_train.drawing.pictures import SceneContext
+from curio_train.drawing.pictures import LIGHT, SceneContext
 from curio_train.drawing.scenes import Scene, mesh_world, read_scenes, scene_of_code
 from curio_train.errors import CurioError, DataError, UsageError
 from curio_train.evaluation.subject import load_subject
@@ -45,6 +45,12 @@ class Page:
     """[height, width, 3] uint8 sRGB: a photograph, or the rendering that a run was validated with."""
     over_image: bool
     """Whether objects are drawn over the image (photographs), or over the world's own background."""
+
+    @property
+    def light(self) -> np.ndarray:
+        """The light that the scene is drawn under [3], camera frame: its own, else the context's, else the usual one."""
+        known = self.scene.light if self.scene.light is not None else self.context.light
+        return np.array(LIGHT) if known is None else known
 
 
 @dataclass(frozen=True)

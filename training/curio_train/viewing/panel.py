@@ -7,7 +7,6 @@ import numpy as np
 import viser
 from scipy.spatial.transform import Rotation
 
-from curio_train.drawing.pictures import LIGHT
 from curio_train.drawing.scenes import Placed, Scene
 from curio_train.geometry import Pose
 from curio_train.viewing.comparison import Comparison
@@ -54,9 +53,9 @@ class Panel:
         self.objects.value = names[0]
         self.message("")
 
-    def show_values(self, scene: Scene, selected: int) -> None:
-        """Show the light and one object's fields."""
-        self.light.value = _triple(LIGHT if scene.light is None else scene.light)
+    def show_values(self, scene: Scene, light: np.ndarray, selected: int) -> None:
+        """Show the light [3] and one object's fields."""
+        self.light.value = _triple(light)
         if not scene.objects:
             return
         item = scene.objects[selected]

@@ -52,7 +52,7 @@ class Viewer:
         self._lock = threading.RLock()
         self._changed, self._fit_asked, self._ended = threading.Event(), threading.Event(), threading.Event()
         self._server = viser.ViserServer(host=host, port=port, label="curio-view", verbose=False)
-        self._server.gui.configure_theme(control_width="large")
+        self._server.gui.configure_theme(control_width="large", show_share_button=False)
         self._panel = Panel(self._server.gui)
         self._space = Space(self._server, self._drag)
         self._connect()
@@ -97,12 +97,15 @@ class Viewer:
         self._number, self._selected = number, 0
         self._panel.show_page(number, len(self._pages), self.page.scene)
         self._space.show(self.page)
-        self._panel.show_values(self.page.scene, 0)
+        self._show_values()
         self._changed.set()
 
     def _select(self) -> None:
         self._selected = self._panel.objects.options.index(self._panel.objects.value)
-        self._panel.show_values(self.page.scene, self._selected)
+        self._show_values()
+
+    def _show_values(self) -> None:
+        self._panel.show_values(self.page.scene, self.page.light, self._selected)
 
     def _edit_object(self) -> None:
         if self.page.scene.objects:
@@ -129,7 +132,7 @@ class Viewer:
         with self._lock:
             self._selected = number
             self._replace_object(number, replace(self.page.scene.objects[number], pose=pose))
-            self._panel.show_values(self.page.scene, number)
+            self._show_values()
 
     def _replace_object(self, number: int, item: Placed) -> None:
         objects = list(self.page.scene.objects)
@@ -185,7 +188,7 @@ class Viewer:
                     return
                 self._replace_object(number, replace(page.scene.objects[number], pose=step.pose))
                 self._space.move(number, step.pose)
-                self._panel.show_values(self.page.scene, number)
+                self._show_values()
                 shown = self.page
             self._panel.message(f"fit: step {count}, robust residual {first:.3f} → {step.loss:.3f}")
             if count % _STEPS_SHOWN == 0:

@@ -1,0 +1,173 @@
+"""curio-view in a real browser: open, drag, fit, save, reload."""
+
+import json
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from curio_train.data.clutter import dead_leaves_texture
+from curio_train.drawing.pictures import RenderOptions, SceneContext, picture
+from curio_train.drawing.scenes import Placed, Scene
+from curio_train.geometry import Pose
+from curio_train.meshes.shapes import chair
+from curio_train.viewing.saving import save
+from scipy.spatial.transform import Rotation
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+ROOT = Path(__file__).resolve().parents[2]
+WIDTH, HEIGHT = 320, 240
+K = np.array([[400.0, 0, 159.5], [0, 400.0, 119.5], [0, 0, 1]])
+TRUE = Pose(Rotation.from_euler("xyz", [160, 35, 10], degrees=True).as_matrix(), np.array([0.01, 0.02, 0.6]))
+WINDOW = (1600, 800)
+
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine; .ci/run installs it where it can")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mesh, a rendering of it over clutter, and a result file whose pose is off by 9 mm and 7 degrees."""
+    folder = tmp_path_factory.mktemp("viewing")
+    mesh = chair(0.15)
+    solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
+    shade = np.linspace(60, 240, len(mesh.vertices_m))[:, None] * [1.0, 0.8, 0.6]
+    solid.visual.vertex_colors = shade.astype(np.uint8)
+    solid.export(folder / "chair.ply")
+    clutter = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+    dead_leaves_texture(clutter, np.random.default_rng(2))
+    scene = Scene("photograph", WIDTH, HEIGHT, K, (Placed("chair", TRUE),), None, folder / "photograph.png")
+    context = SceneContext({"chair": colored(folder / "chair.ply")})
+    drawn = picture(scene, context, RenderOptions(), photograph=(255 * clutter.clip(0, 1)).astype(np.uint8))
+    cv2.imwrite(str(folder / "photograph.png"), drawn[..., ::-1])
+    off = Rotation.from_rotvec([4.0, -5.0, 3.0], degrees=True).as_matrix()
+    wrong = Pose(off @ TRUE.rotation, TRUE.translation_m + [0.006, -0.005, 0.005])
+    save(Scene("", WIDTH, HEIGHT, K, (Placed("chair", wrong),), None, folder / "photograph.png"), folder / "found.jsonl")
+    return folder
+
+
+def colored(path: Path) -> Any:
+    from curio_train.meshes.meshes import load_mesh
+
+    return load_mesh(path, "m")
+
+
+class Command:
+    """A running ``curio-view``."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        script = "from curio_train.commands.view import view; view()"
+        given = [sys.executable, "-c", script, *map(str, arguments), "--port", str(self.port)]
+        self.process = subprocess.Popen(given, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+        assert self.process.stderr is not None
+        self.url = f"http://127.0.0.1:{self.port}"
+        assert f"{self.url}, for this machine alone" in self.process.stderr.readline()
+
+    def end(self) -> None:
+        self.process.terminate()
+        assert self.process.wait(20) == 143
+
+
+@pytest.fixture
+def view() -> Iterator[Callable[..., Command]]:
+    started: list[Command] = []
+
+    def start(*arguments: str | Path) -> Command:
+        started.append(Command(*arguments))
+        return started[-1]
+
+    yield start
+    for command in started:
+        command.end()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as started:
+        options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        found = started.chromium.launch(executable_path=BROWSER, args=options)
+        yield found
+        found.close()
+
+
+def opened(browser: Any, url: str) -> Any:
+    page = browser.new_page(viewport={"width": WINDOW[0], "height": WINDOW[1]})
+    page.goto(url)
+    page.get_by_text("image loss").wait_for(timeout=60_000)
+    return page
+
+
+def loss(page: Any) -> float:
+    match = re.search(r"image loss ([\d.e+]+)", page.get_by_text("image loss").inner_text())
+    assert match is not None
+    return float(match[1])
+
+
+def re_rendering(page: Any) -> str:
+    return str(page.locator("img").evaluate_all("images => images.map(image => image.src).join()"))
+
+
+def until(met: Callable[[], bool], seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not met():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.1)
+
+
+def gizmo_arrow_px(pose: Pose, scale_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the gizmo's x arrow begins and ends in the window, which has the camera's vertical field of view."""
+    focal_px = K[1, 1] * WINDOW[1] / HEIGHT
+    ends = np.array([pose.translation_m, pose.translation_m + scale_m * pose.rotation[:, 0]])
+    start, end = ends[:, :2] / ends[:, 2:] * focal_px + np.array(WINDOW) / 2
+    return start, end
+
+
+def drag(page: Any, start: np.ndarray, end: np.ndarray) -> None:
+    """With pauses, because the browser must have drawn what is under the pointer."""
+    for position in (start - 1, start):
+        page.mouse.move(*position)
+        page.wait_for_timeout(1000)
+    page.mouse.down()
+    for fraction in np.linspace(0, 1, 6):
+        page.mouse.move(*(start + fraction * (end - start)))
+        page.wait_for_timeout(100)
+    page.mouse.up()
+
+
+def test_drag_fit_save_and_reload(files: Path, view: Callable[..., Command], browser: Any) -> None:
+    out = files / "edited.jsonl"
+    command = view(files / "found.jsonl", "--mesh", files / "chair.ply", "--out", out)
+    page = opened(browser, command.url)
+    other = opened(browser, command.url)
+    before, seen = loss(page), re_rendering(page)
+    (record,) = [json.loads(line) for line in (files / "found.jsonl").read_text().splitlines()]
+    start_pose = Pose(*(np.array(record["detections"][0][name]) for name in ("rotation", "translation_m")))
+    start, end = gizmo_arrow_px(start_pose, 0.6 * colored(files / "chair.ply").diameter_m)
+    grip = start + 0.8 * (end - start)
+    drag(page, grip, grip + 0.15 * (end - start))
+    until(lambda: loss(page) != before and re_rendering(page) != seen)
+    other.close()  # a browser that leaves in the middle
+    page.get_by_role("button", name="fit this object").click()
+    page.get_by_text("fit: done").wait_for(timeout=120_000)
+    assert loss(page) < before / 2
+    page.get_by_role("button", name="save the code").click()
+    page.get_by_text("saved to").wait_for()
+    (saved,) = [json.loads(line) for line in out.read_text().splitlines()]
+    found = saved["detections"][0]
+    assert np.array(found["translation_m"]) == pytest.approx(TRUE.translation_m, abs=0.002)
+    turned = Rotation.from_matrix(np.array(found["rotation"]).T @ TRUE.rotation).magnitude()
+    assert np.degrees(turned) < 2
+    page.reload()
+    page.get_by_text("image loss").wait_for(timeout=60_000)
+    assert loss(page) < before / 2
