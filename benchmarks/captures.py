@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from curio_train.capture.stand_ins import Amount, make
-from curio_train.cli import answer
-from curio_train.evaluation.captures_table import METHODS, Table, markdown, row
-from curio_train.evaluation.results import load_rows, save_results
-from curio_train.evaluation.run_queue import QueuedRun, carry_out
+from curio_train.commands.cli import answer
+from paper.captures_table import METHODS, Table, markdown, row
+from paper.results import load_rows, save_results
+from paper.run_queue import QueuedRun, carry_out
+from synthetic_captures.captures import Amount, make
 
 Scene = Literal["sphere_real", "bunny", "shapes"]
 Method = Literal["noncur", "our", "sleep", "sleep_cells"]

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
-from curio_train.cli import answer
+from curio_train.commands.cli import answer
 from curio_train.config import PRESETS
 from curio_train.errors import UsageError
-from curio_train.evaluation.run_queue import QueuedRun, carry_out
+from paper.run_queue import QueuedRun, carry_out
 
 _RECIPE = PRESETS["laptop"]
 _LONGER = 4

@@ -189,7 +189,7 @@ def evaluate(run: Path) -> dict[str, Any]:
 def write_frames(folder: Path) -> tuple[list[Path], np.ndarray]:
     """The test split as PNG files, and the true positions [num_frames, 2] in image widths."""
     from curio_train.scene_code import TRANSLATION
-    from curio_train.worlds.circles import Circles
+    from curio_train.worlds.generated.circles import Circles
 
     folder.mkdir(parents=True)
     source = Circles().source("test", 0, with_code=True, cache=Path("~/.cache/curio-pose"))

@@ -25,7 +25,7 @@ from load.network import write_model
 _BARE = (
     "import sys; sys.path.insert(0, sys.argv[1]); from load.generator import bare_folder; bare_folder(*sys.argv[2:])"
 )
-_DETECT = "from curio_serve.detect_cli import main; main()"
+_DETECT = "from curio_serve.batch.detect_cli import main; main()"
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import tyro
-from curio_train.evaluation.validation_experiment import ValidationSettings, solve
+from paper.validation_experiment import ValidationSettings, solve
 from torch import Tensor
 
 _PLACE, _LUMINANCE, _SIDE = 0.6, 0.8, 0.12

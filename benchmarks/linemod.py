@@ -12,16 +12,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
-from curio_train.cli import answer
+from curio_train.commands.cli import answer
 from curio_train.data.bop import BopDataset
+from curio_train.evaluation.candidates import Candidate, candidates
 from curio_train.evaluation.evaluate import evaluate
-from curio_train.evaluation.linemod_markdown import markdown
-from curio_train.evaluation.linemod_sheet import write_sheet
-from curio_train.evaluation.linemod_table import REFINED, Candidate, candidates, is_current, load_table, make_row
 from curio_train.evaluation.real_frames import evaluate_real_frames
-from curio_train.evaluation.results import Results, Row, save_results
 from curio_train.evaluation.subject import load_subject
-from curio_train.worlds.refinement import refined
+from curio_train.refinement.render_and_compare import refined
+from paper.linemod_markdown import markdown
+from paper.linemod_sheet import write_sheet
+from paper.linemod_table import REFINED, is_current, load_table, make_row
+from paper.results import Results, Row, save_results
 
 COMMAND = "python benchmarks/linemod.py"
 

@@ -3,7 +3,7 @@
     python benchmarks/own_part.py [--minutes 26.5] [--photos 200] [--tests 50] [--out runs/own_part] [--json]
 
 An unpainted STL, 200 path traced photographs of it on a table, a plate and a camera file, calibrated from photographs
-of a chessboard, are made first (see ``benchmarks/stand_ins.py``); what is there already is kept. Then the installed
+of a chessboard, are made first (see ``benchmarks/make_captures.py``); what is there already is kept. Then the installed
 commands look at the files, train and export, and detect in 50 photographs that nothing has seen. The last line is the
 result, also in OUT/own_part.json:
 
@@ -24,12 +24,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from curio_train.capture.stand_ins import Amount, make
 from curio_train.data.bop import ModelInfo
-from curio_train.data.meshes import load_mesh
-from curio_train.data.symmetries import find_symmetries
 from curio_train.geometry import Pose
+from curio_train.meshes.meshes import load_mesh
+from curio_train.meshes.symmetries import find_symmetries
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, rotation_error_deg
+from synthetic_captures.captures import Amount, make
 
 _NEAR_M, _FAR_M = 0.5, 1.0
 _SAMPLES_PER_PIXEL = 16  # pixels are small here

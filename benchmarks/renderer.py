@@ -23,14 +23,14 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from curio_train.data.meshes import Mesh
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
-from curio_train.rendering import baseline
-from curio_train.rendering.baseline import StockPoses
-from curio_train.rendering.differences import TURN, central_differences, cosine, gradients, turned
+from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.renderer import Renderer
 from curio_train.rendering.variant import load_mitsuba
 from scipy.spatial.transform import Rotation
+from stock import baseline
+from stock.baseline import StockPoses
+from stock.gradient_check import TURN, central_differences, cosine, gradients, turned
 from torch import Tensor
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"

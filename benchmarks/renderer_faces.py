@@ -16,9 +16,9 @@ from typing import Any
 
 import torch
 from curio_train.rendering import renderer as renderer_module
-from curio_train.rendering.differences import TURN, cosine, gradients
 from curio_train.rendering.renderer import Renderer
 from renderer import AMBIENT, POSITION, Poses, background, draw_poses, log, our_images, root_mesh
+from stock.gradient_check import TURN, cosine, gradients
 from torch import Tensor
 
 from training import LumpWorld, lump, measure

@@ -20,7 +20,7 @@ import torch
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import SceneCode
 from curio_train.worlds import WORLDS, build
-from curio_train.worlds.mesh_world import MeshWorld
+from curio_train.worlds.generated.mesh_world import MeshWorld
 from renderer import AMBIENT, BATCH, SAMPLES, SIZE, draw_poses, log, our_step, root_mesh, seconds
 
 NUM_STEPS, NUM_KERNELS = 9, 12

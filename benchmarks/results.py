@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from curio_train.cli import answer
+from curio_train.commands.cli import answer
 from curio_train.config import PRESETS
 from curio_train.errors import UsageError
-from curio_train.evaluation.results import ORDER, WORLDS, collect, load_results, merge, save_results
-from curio_train.evaluation.run_queue import QueuedRun, carry_out
+from paper.results import ORDER, WORLDS, collect, load_results, merge, save_results
+from paper.run_queue import QueuedRun, carry_out
 
 World = Literal["circles", "spheres", "chairs", "varied", "multi", "light"]
 
@@ -94,7 +94,7 @@ def _run(settings: Settings, world: str, method: str, seed: int) -> QueuedRun:
 
 def write(settings: Settings, runs: list[QueuedRun]) -> None:
     """Results, tables and plot of all runs that are done, into what was there."""
-    from curio_train.evaluation.results_tables import markdown, plot
+    from paper.results_tables import markdown, plot
 
     found = collect(run.evaluation for run in runs if run.done)
     results = merge(load_results(settings.results), found)

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 import torch
 import tyro
-from curio_train.cli import answer
+from curio_train.commands.cli import answer
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.data.bop import BopDataset
 from curio_train.geometry import Pose
 from curio_train.rendering.renderer import Renderer
-from curio_train.worlds.views import AMBIENT, lights, turned_towards, upper_views
+from curio_train.worlds.single_object.viewpoints import AMBIENT, lights, turned_towards, upper_views
 from torch import Tensor
 
 SEED = 20_211

@@ -207,7 +207,7 @@ def start_time_s(models: Path) -> float:
 @contextmanager
 def running_server(models: Path, cores: Sequence[int], *flags: str) -> Iterator[tuple[str, int]]:
     """Address and process id of a server on these cores, once its health service says SERVING."""
-    program = "from curio_serve.serve_cli import main; main()"
+    program = "from curio_serve.server.serve_cli import main; main()"
     call = [sys.executable, "-c", program, str(models), "--port", "0", "--log-level", "warning", *flags]
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)  # inherited

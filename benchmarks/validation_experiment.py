@@ -19,8 +19,8 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-from curio_train.evaluation.validation_experiment import Solution, ValidationSettings, solve
-from curio_train.learning.provenance import commit, machine
+from curio_train.learning.runs.provenance import commit, machine
+from paper.validation_experiment import Solution, ValidationSettings, solve
 
 _SETTINGS = ValidationSettings()
 _NUM_SEGMENTS = 200  # of a way as it is drawn

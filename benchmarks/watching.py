@@ -18,9 +18,9 @@ from typing import Annotated, Any, get_args
 import numpy as np
 import torch
 import tyro
-from curio_train.evaluation.watching import Discs, Loss, Moment, Scene, watch
-from curio_train.learning.provenance import commit, machine
+from curio_train.learning.runs.provenance import commit, machine
 from curio_train.metrics.assignment import parameter_errors
+from paper.watching import Discs, Loss, Moment, Scene, watch
 from PIL import Image
 
 _LOSSES: Sequence[Loss] = get_args(Loss)

@@ -36,11 +36,11 @@ def make_frames(num_frames: int = 24) -> list[bytes]:
 
 def bare_loop(model_folder: Path) -> Callable[[bytes], None]:
     """Decode, warp and session alone, for one frame; called from several threads."""
-    from curio_serve.camera import PinholeCamera
-    from curio_serve.detector import Detector
-    from curio_serve.image import decode, open_header
-    from curio_serve.model_folder import open_model
-    from curio_serve.view import PinholeFrame, Region
+    from curio_serve.imaging.camera import PinholeCamera
+    from curio_serve.imaging.image import decode, open_header
+    from curio_serve.imaging.view import PinholeFrame, Region
+    from curio_serve.models.detector import Detector
+    from curio_serve.models.model_folder import open_model
 
     cv2.setNumThreads(1)
     model = open_model(model_folder)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from curio_train.worlds.circles import Circles
+from curio_train.worlds.generated.circles import Circles
 
 NUM_FRAMES = 12
 Call = Callable[..., "subprocess.CompletedProcess[str]"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from curio_serve.client import PoseClient
-from curio_train.learning.checkpoint import RunFolder
+from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.scene_code import TRANSLATION
 from curio_train.worlds import build
 

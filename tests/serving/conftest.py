@@ -253,7 +253,7 @@ def start_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[
 
     def start(models: Path, *flags: str) -> RunningServer:
         log = tmp_path_factory.mktemp("server") / "log"
-        code = "from curio_serve.serve_cli import main; main()"
+        code = "from curio_serve.server.serve_cli import main; main()"
         command = [sys.executable, "-c", code, str(models), "--port", "0", *flags]
         with log.open("w") as stderr:
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True)

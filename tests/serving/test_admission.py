@@ -1,13 +1,13 @@
 """The bounded queue: refusals, deadlines, calls that hang up, order."""
 
-import math
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import pytest
-from curio_serve.admission import WorkQueue
+from curio_serve.api.admission import WorkQueue
 from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
 from curio_serve.telemetry import Metrics
 from prometheus_client import CollectorRegistry
@@ -153,82 +153,18 @@ def test_a_call_that_ended_before_it_waits_never_works(gate: threading.Event, ma
     assert first.result(30) == "done"
 
 
-class Place:
-    """A waiter that is never told anything."""
-
-    def tell(self) -> None:
-        raise AssertionError("nobody left")
-
-
-def test_a_promise_keeps_a_place() -> None:
-    queue = WorkQueue(1, 1, Metrics(CollectorRegistry()))
-    first, second, third = Place(), Place(), Place()
-    queue.promise(first, math.inf)
-    queue.promise(second, math.inf)
-    with pytest.raises(Overloaded):
-        queue.promise(third, math.inf)
-    assert queue.enter(first)
-    assert not queue.enter(second)
-    with pytest.raises(Overloaded):
-        queue.enter(third)
-    assert queue.withdraw(second)
-    assert not queue.withdraw(second)
-    assert not queue.enter(third)
-    assert queue.leave(0.001) is third
-    assert queue.leave(0.001) is None
-
-
-def test_a_promise_given_up_is_free_again() -> None:
-    queue, place = WorkQueue(1, 0, Metrics(CollectorRegistry())), Place()
-    for _ in range(3):
-        queue.promise(place, math.inf)
-        assert queue.withdraw(place)
-    assert queue.enter(Place())
-
-
-def test_promises_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Callers who never send their message do not keep others out."""
-    queue = WorkQueue(1, 1, Metrics(CollectorRegistry()))
-    slow = [Place(), Place()]
-    for place in slow:
-        queue.promise(place, math.inf)
-    monkeypatch.setattr("curio_serve.admission._PROMISE_S", 0.0)
-    queue.promise(quick := Place(), math.inf)
-    assert queue.enter(quick)
-    # Their messages come late; they find a place where there is one.
-    assert not queue.enter(slow[0])
-    with pytest.raises(Overloaded):
-        queue.enter(slow[1])
-
-
-def test_who_would_come_too_late_is_refused_at_once() -> None:
-    queue = WorkQueue(1, 9, Metrics(CollectorRegistry()))
-    for _ in range(200):
-        assert queue.enter(Place())
-        assert queue.leave(0.1) is None
-    # Nobody is ahead, so there is no telling that it cannot be done.
-    queue.promise(first := Place(), 0.001)
-    assert queue.enter(first)
-    queue.promise(second := Place(), 0.001)
-    assert not queue.enter(second)
+def test_a_call_that_would_come_too_late_is_refused_at_once(gate: threading.Event, make_bench: MakeBench) -> None:
+    bench = make_bench(1, 9)
+    for _ in range(20):  # the queue learns that work takes some 20 ms
+        with bench.queue.slot(Caller()):
+            time.sleep(0.02)
+    accepted = [bench.hold(gate), bench.hold(gate, Caller(0.001 + 1e9))]
     with pytest.raises(Overloaded, match="1 are waiting, which takes longer than the call's deadline") as caught:
-        queue.promise(Place(), 0.3)
-    assert caught.value.retry_after_s == pytest.approx(0.2, rel=0.05)
-    queue.promise(Place(), 0.4)
-    with pytest.raises(Overloaded, match="2 are waiting"):
-        queue.promise(Place(), 0.4)
-    queue.promise(Place(), math.inf)
-
-
-def test_calls_without_work_do_not_pass_for_quick_ones() -> None:
-    queue = WorkQueue(1, 9, Metrics(CollectorRegistry()))
-    for worked_s in [0.1] * 200 + [None] * 200:
-        assert queue.enter(Place())
-        assert queue.leave(worked_s) is None
-    assert queue.enter(Place())
-    assert not queue.enter(Place())
-    with pytest.raises(Overloaded):
-        queue.promise(Place(), 0.3)
+        bench.hold(gate, Caller(0.001)).result(30)
+    assert caught.value.retry_after_s > 0
+    accepted.append(bench.hold(gate, Caller()))
+    gate.set()
+    assert [future.result(30) for future in accepted] == ["done"] * 3
 
 
 def test_errors_of_the_work_give_the_slot_back() -> None:

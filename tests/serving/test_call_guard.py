@@ -3,8 +3,8 @@
 import logging
 
 import pytest
+from curio_serve.api.pose_detector import CallGuard
 from curio_serve.errors import InternalError
-from curio_serve.service import CallGuard
 from curio_serve.telemetry import LOGGER, Metrics
 from prometheus_client import CollectorRegistry
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from curio_serve.camera import PinholeCamera, scaling
-from curio_serve.camera_files import read_camera_file
 from curio_serve.errors import CameraError
+from curio_serve.imaging.camera import PinholeCamera, scaling
+from curio_serve.imaging.camera_files import read_camera_file
 
 K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
 

@@ -15,11 +15,11 @@ import pytest
 from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer, add_PoseDetectorServicer_to_server
 from curio_serve import errors
-from curio_serve.camera import PinholeCamera
+from curio_serve.api.messages import status_from_error
 from curio_serve.client import AsyncPoseClient, PoseClient, Tls, detect_request, error_from_answer
-from curio_serve.detector import Detector
-from curio_serve.model_folder import open_model
-from curio_serve.wire import status_from_error
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.models.detector import Detector
+from curio_serve.models.model_folder import open_model
 
 K = np.array([[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]])
 CAMERA = PinholeCamera(K, (), (320, 240))

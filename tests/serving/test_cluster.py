@@ -18,7 +18,7 @@ needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="
 
 def detect(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
     """In a process of its own: Ray leaves threads and handlers behind."""
-    program = "from curio_serve.detect_cli import main; main()"
+    program = "from curio_serve.batch.detect_cli import main; main()"
     call = [sys.executable, "-c", program, *map(str, arguments)]
     return subprocess.run(call, capture_output=True, text=True, env=os.environ)
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-from curio_serve.config import ServeConfig, read_config, to_toml
 from curio_serve.errors import UsageError
+from curio_serve.server.config import ServeConfig, read_config, to_toml
 
 
 def test_defaults_listen_on_loopback_alone() -> None:

@@ -13,8 +13,8 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
-from curio_serve.config import read_config
 from curio_serve.errors import UsageError
+from curio_serve.server.config import read_config
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"

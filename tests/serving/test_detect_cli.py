@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from curio_serve.detect_cli import DetectArguments, run
+from curio_serve.batch.detect_cli import DetectArguments, run
 from curio_serve.errors import CurioError, UsageError
 
 SIZE = (320, 240)
@@ -20,7 +20,7 @@ K = [[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]]
 
 
 def command(*arguments: str | Path) -> list[str]:
-    return [sys.executable, "-c", "from curio_serve.detect_cli import main; main()", *map(str, arguments)]
+    return [sys.executable, "-c", "from curio_serve.batch.detect_cli import main; main()", *map(str, arguments)]
 
 
 def detect(model: Path, *sources: Path | str, **flags: Any) -> int:

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from curio_serve.detect_cli import DetectArguments, run
+from curio_serve.batch.detect_cli import DetectArguments, run
 from curio_serve.errors import ModelNotFound, TokenError, Unavailable, UsageError
 
 K = [[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]]
@@ -116,7 +116,7 @@ def test_a_server_that_is_replaced_costs_nothing_but_time(
     for number in range(800):
         os.link(frames / f"{number % 4:06d}.jpg", many / f"{number:04d}.jpg")
     first = start_server(models_dir)
-    program = "from curio_serve.detect_cli import main; main()"
+    program = "from curio_serve.batch.detect_cli import main; main()"
     call = [sys.executable, "-c", program, f"{first.address}/flat", str(many), "--out", str(out)]
     with subprocess.Popen(call, stderr=subprocess.PIPE, text=True) as process:
         while not out.exists() or out.read_bytes().count(b"\n") < 50:

@@ -16,7 +16,7 @@ NUM_MANY = 3000  # enough that no machine is done before it is stopped
 
 
 def command(*arguments: str | Path) -> list[str]:
-    return [sys.executable, "-c", "from curio_serve.detect_cli import main; main()", *map(str, arguments)]
+    return [sys.executable, "-c", "from curio_serve.batch.detect_cli import main; main()", *map(str, arguments)]
 
 
 def read(path: Path) -> list[dict[str, Any]]:
@@ -107,7 +107,7 @@ def test_it_runs_where_the_training_stack_cannot_be_imported(models_dir: Path, f
 
 
 def test_help_imports_nothing_heavy() -> None:
-    program = "import sys, curio_serve.detect_cli; print(*sys.modules)"
+    program = "import sys, curio_serve.batch.detect_cli; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert not {"numpy", "cv2", "onnxruntime", "scipy", "grpc", "google.protobuf"} & set(loaded)
 

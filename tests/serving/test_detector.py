@@ -13,12 +13,12 @@ from curio_proto.v1.detector_pb2 import (
     REGION_STATUS_OUTSIDE_FRAME,
 )
 from curio_proto.v1.model_spec_pb2 import ModelSpec
-from curio_serve.camera import PinholeCamera
-from curio_serve.detector import Detector
 from curio_serve.errors import ArgumentError, CameraError, CameraMissing, ImageError
-from curio_serve.model import load
-from curio_serve.model_folder import open_model
-from curio_serve.view import Region
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.view import Region
+from curio_serve.models.detector import Detector
+from curio_serve.models.model import load
+from curio_serve.models.model_folder import open_model
 from scipy.spatial.transform import Rotation
 
 SPOT_RADIUS_M = 0.05

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from curio_serve.errors import ModelError
-from curio_serve.model_check import ChildCheck
-from curio_serve.model_folder import load_version
-from curio_serve.repository import Repository
+from curio_serve.models.model_check import ChildCheck
+from curio_serve.models.model_folder import load_version
+from curio_serve.models.repository import Repository
 
 
 @pytest.fixture

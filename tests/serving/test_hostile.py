@@ -109,7 +109,7 @@ def test_messages_nobody_can_read_keep_no_call_open(server: Any, method: str) ->
 
 
 def test_a_log_that_cannot_be_written(models_dir: Path) -> None:
-    code = "from curio_serve.serve_cli import main; main()"
+    code = "from curio_serve.server.serve_cli import main; main()"
     command = [sys.executable, "-c", code, str(models_dir), "--port", "0", "--log-level", "debug"]
     with Path("/dev/full").open("w") as full:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=full, text=True)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from curio_serve.errors import ImageError
-from curio_serve.image import decode, from_raw
-from curio_serve.image_header import read_header
+from curio_serve.imaging.image import decode, from_raw
+from curio_serve.imaging.image_header import read_header
 
 FORMATS = {".jpg": "jpeg", ".png": "png", ".webp": "webp"}
 

@@ -9,8 +9,8 @@ import onnx
 import pytest
 from curio_proto.v1.model_spec_pb2 import Field, ModelSpec, ObjectModel
 from curio_serve.errors import ModelError
-from curio_serve.model import load
-from curio_serve.model_folder import open_model
+from curio_serve.models.model import load
+from curio_serve.models.model_folder import open_model
 from google.protobuf import json_format
 from onnx import TensorProto, helper
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
 from curio_proto.v1.model_spec_pb2 import ModelSpec, ObjectModel
-from curio_serve.camera import PinholeCamera
-from curio_serve.overlay import draw
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.overlay import draw
 from scipy.spatial.transform import Rotation
 
 CAMERA = PinholeCamera(np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), (), (640, 480))

@@ -12,9 +12,9 @@ import numpy as np
 import onnx
 import pytest
 from curio_serve.errors import ModelError, ModelNotFound
-from curio_serve.model_check import ChildCheck
-from curio_serve.model_folder import load_version
-from curio_serve.repository import Repository
+from curio_serve.models.model_check import ChildCheck
+from curio_serve.models.model_folder import load_version
+from curio_serve.models.repository import Repository
 
 MakeOnnx = Callable[..., onnx.ModelProto]
 WriteFolder = Callable[..., Path]

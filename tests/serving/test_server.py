@@ -35,7 +35,7 @@ def slow_request() -> pb.DetectRequest:
 
 
 def _run(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    code = "from curio_serve.serve_cli import main; main()"
+    code = "from curio_serve.server.serve_cli import main; main()"
     return subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=60, check=False
     )
@@ -246,8 +246,8 @@ def test_it_serves_where_the_training_stack_cannot_be_imported(models_dir: Path)
 import sys
 for name in ("torch", "mitsuba", "drjit", "onnx", "trimesh", "curio_train"):
     sys.modules[name] = None
-from curio_serve.config import ServeConfig
-from curio_serve.server import PoseServer
+from curio_serve.server.config import ServeConfig
+from curio_serve.server.server import PoseServer
 from pathlib import Path
 
 server = PoseServer(ServeConfig(models=Path(sys.argv[1]), port=0))

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from curio_proto.v1 import detector_pb2 as pb
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
-from curio_serve.camera import PinholeCamera
-from curio_serve.detector import Detector
-from curio_serve.model_folder import open_model
-from curio_serve.view import Region
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.view import Region
+from curio_serve.models.detector import Detector
+from curio_serve.models.model_folder import open_model
 from google.rpc import error_details_pb2
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoReflectionDescriptorDatabase

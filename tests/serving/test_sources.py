@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from curio_serve import sources
+from curio_serve.batch.parallel import sources
+from curio_serve.batch.sources import check_arguments, common_folder, images
 from curio_serve.errors import ImageError, UsageError
-from curio_serve.sources import check_arguments, common_folder, images
 
 
 def touch(folder: Path, *names: str) -> None:

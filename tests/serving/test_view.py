@@ -4,10 +4,10 @@ from itertools import product
 
 import numpy as np
 import pytest
-from curio_serve.camera import PinholeCamera, scaling
 from curio_serve.errors import CameraError
-from curio_serve.rotation import quaternion_xyzw, smallest_rotation
-from curio_serve.view import CanonicalCamera, FlatFrame, PinholeFrame, Region
+from curio_serve.imaging.camera import PinholeCamera, scaling
+from curio_serve.imaging.rotation import quaternion_xyzw, smallest_rotation
+from curio_serve.imaging.view import CanonicalCamera, FlatFrame, PinholeFrame, Region
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation

@@ -6,8 +6,8 @@ import json
 
 import pytest
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
+from curio_serve.batch.formats import Bop, Csv, ImageResult, JsonLines, bop_object_ids
 from curio_serve.errors import UsageError
-from curio_serve.writers import Bop, Csv, ImageResult, JsonLines, bop_object_ids
 
 QUARTER_TURN = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 

@@ -9,15 +9,15 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.config import RunConfig, WorldOptions
 from curio_train.data.backgrounds import ClutterBackgrounds
-from curio_train.data.shapes import box
-from curio_train.learning.checkpoint import RunFolder
-from curio_train.learning.provenance import note_sitting
-from curio_train.learning.state import Course, TrainState
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.provenance import record_session
+from curio_train.learning.state import TrainingProgress, TrainState
+from curio_train.meshes.shapes import box
 from curio_train.worlds import build
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.gaze import GazeWorld
 from curio_train.worlds.options import CirclesOptions
-from curio_train.worlds.single_object import Object
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.world import Object
 
 
 @pytest.fixture(scope="session")
@@ -28,7 +28,7 @@ def write_run() -> Callable[..., Path]:
         config = RunConfig(options or CirclesOptions(), method="noncur", seed=3, images=64)
         run = RunFolder(path, config)
         run.write_config(new=True)
-        note_sitting(path)
+        record_session(path)
         state = TrainState(config, build(config.world), torch.device("cpu"))
         generator = torch.Generator().manual_seed(1)
         for module in state.pose.network.modules():
@@ -38,7 +38,7 @@ def write_run() -> Callable[..., Path]:
                 module.weight.data.uniform_(0.5, 2.0, generator=generator)
         for branch in state.pose.network.heads.branches.values():
             branch[-1].weight.data *= spread
-        state.course = Course(step=2, images=64, seconds=1.5)
+        state.course = TrainingProgress(step=2, images=64, seconds=1.5)
         run.save(state)
         return path
 
@@ -57,6 +57,6 @@ def brick() -> Object:
 
 
 @pytest.fixture(scope="session")
-def brick_world(brick: Object) -> GazeWorld:
+def brick_world(brick: Object) -> TwoStageWorld:
     """The two looks at it."""
-    return GazeWorld("linemod", brick)
+    return TwoStageWorld("linemod", brick)

@@ -10,20 +10,20 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.config import ConvStack, NetworkConfig, Recipe, RunConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
-from curio_train.data.shapes import box
 from curio_train.errors import DataError
-from curio_train.learning.ahead import Ahead
-from curio_train.learning.checkpoint import RunFolder
-from curio_train.learning.interruption import Interruption
 from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
-from curio_train.learning.session import learn
+from curio_train.learning.prefetch import Prefetcher
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.interruption import Interruption
+from curio_train.learning.runs.session import learn
 from curio_train.learning.state import TrainState
+from curio_train.meshes.shapes import box
 from curio_train.worlds.base import Batch, ImageSource, ObjectKind
-from curio_train.worlds.circles import Circles
-from curio_train.worlds.gaze import GazeWorld
+from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions
-from curio_train.worlds.single_object import Object
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.world import Object
 from torch import Tensor
 
 CONFIG = RunConfig(
@@ -48,10 +48,10 @@ def test_items_are_asked_for_in_order_by_one_other_thread_one_ahead() -> None:
             began.set()
         return number * number
 
-    with Ahead(make, 3) as ahead:
+    with Prefetcher(make, 3) as ahead:
         assert [ahead.take(number) for number in (2, 5, 8)] == [4, 25, 64]
         assert began.wait(10), "nothing is made ahead"
-        ahead.settle()
+        ahead.wait_idle()
         assert [number for number, _ in made] == [2, 5, 8, 11]
         assert ahead.take(40) == 1600, "another number than foreseen"
     assert len({thread for _, thread in made} | {threading.get_ident()}) == 2
@@ -67,9 +67,9 @@ def test_an_error_arrives_when_its_item_is_taken_and_the_thread_ends() -> None:
         return number
 
     def take_all() -> None:
-        with Ahead(make, 1) as ahead:
+        with Prefetcher(make, 1) as ahead:
             assert ahead.take(0) == 0
-            ahead.settle()
+            ahead.wait_idle()
             ahead.take(1)
 
     with pytest.raises(DataError) as raised:
@@ -81,7 +81,7 @@ def test_an_error_arrives_when_its_item_is_taken_and_the_thread_ends() -> None:
 def test_the_callers_number_of_threads_stays() -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    with Ahead(lambda _: torch.get_num_threads(), 1) as ahead:
+    with Prefetcher(lambda _: torch.get_num_threads(), 1) as ahead:
         assert ahead.take(0) == 1
         assert torch.get_num_threads() == 2
     torch.set_num_threads(before)
@@ -105,7 +105,7 @@ def test_dreams_made_ahead_teach_what_others_teach_bit_for_bit(tmp_path: Path) -
     source = world.source("train", 0, with_code=False, cache=tmp_path)
     one, other = (Trainer(CONFIG, world, [source], here) for _ in range(2))
     losses = [one.step(1.0) for _ in range(3)]
-    with other.dreaming_ahead():
+    with other.prefetching():
         assert [other.step(1.0) for _ in range(3)] == losses
         assert any(name.startswith("ahead") for name in names())
     assert not any(name.startswith("ahead") for name in names())
@@ -122,7 +122,7 @@ def test_images_that_cannot_be_read_end_training_with_their_error(tmp_path: Path
     one = Trainer(CONFIG, Circles(), [Broken()], Ranks(0, 1, torch.device("cpu")))
 
     def train() -> None:
-        with one.dreaming_ahead():
+        with one.prefetching():
             one.step(1.0)
             one.step(1.0)
 
@@ -141,19 +141,19 @@ def test_the_renderer_draws_the_same_in_another_thread() -> None:
     kind = ObjectKind("brick", (0,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256)
     pool = np.full((5, 240, 320, 3), 128, np.uint8)
     thing = Object(kind, mesh, Intrinsics(matrix, 640, 480), 0.5, 1.5, lambda _: ClutterBackgrounds(pool))
-    world = GazeWorld("linemod", thing)
+    world = TwoStageWorld("linemod", thing)
 
     def draw(number: int) -> list[Tensor]:
-        look = world.looks[number % 2]
+        look = world.stages[number % 2]
         code = look.sample(8, (number,))
-        return [look.disturb(look.render(code), (number,)), *code.values()]
+        return [look.augment(look.render(code), (number,)), *code.values()]
 
     threads = drjit.thread_count()
     drjit.set_thread_count(1)
     try:
-        with torch.no_grad(), Ahead(draw, 1) as ahead:
+        with torch.no_grad(), Prefetcher(draw, 1) as ahead:
             drawn = [ahead.take(number) for number in range(4)]
-            ahead.settle()
+            ahead.wait_idle()
             for number, elsewhere in enumerate(drawn):
                 assert all(map(torch.equal, elsewhere, draw(number)))
     finally:

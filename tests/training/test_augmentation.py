@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from curio_train.data.augmentation import KNOWN_SCENE, UNKNOWN_SCENE, WHOLE_FRAME, Disturbance, disturb
+from curio_train.data.augmentation import KNOWN_SCENE, UNKNOWN_SCENE, WHOLE_FRAME, AugmentationStrength, augment
 from torch import Tensor
 
-NOTHING = Disturbance(0.0, 0.0, 0.0, (1.0, 1.0), (1.0, 1.0), 0.0, (1.0, 1.0), 0.0, 0.0, 0.0)
+NOTHING = AugmentationStrength(0.0, 0.0, 0.0, (1.0, 1.0), (1.0, 1.0), 0.0, (1.0, 1.0), 0.0, 0.0, 0.0)
 
 
 def coarse(count: int, side: int = 32) -> Tensor:
@@ -18,13 +18,13 @@ def coarse(count: int, side: int = 32) -> Tensor:
 
 def disturbed(images: Tensor, seed: int = 3, **ranges: object) -> Tensor:
     """By the ranges named alone."""
-    return disturb(images, np.random.default_rng(seed), replace(NOTHING, **ranges))
+    return augment(images, np.random.default_rng(seed), replace(NOTHING, **ranges))
 
 
 def test_same_draws_same_pictures_and_each_its_own():
     images = torch.full((8, 3, 32, 32), 0.5)
-    first, again = (disturb(images, np.random.default_rng(3), UNKNOWN_SCENE) for _ in range(2))
-    other = disturb(images, np.random.default_rng(4), UNKNOWN_SCENE)
+    first, again = (augment(images, np.random.default_rng(3), UNKNOWN_SCENE) for _ in range(2))
+    other = augment(images, np.random.default_rng(4), UNKNOWN_SCENE)
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
     assert len({round(float(image.mean()), 4) for image in first}) == len(first)
@@ -34,7 +34,7 @@ def test_same_draws_same_pictures_and_each_its_own():
 @pytest.mark.parametrize("size", [(24, 40), (300, 260)])
 def test_stays_an_image(size):
     images = torch.rand(16, 3, *size).round()  # black and white, which have no logarithm and nothing above
-    out = disturb(images, np.random.default_rng(0), UNKNOWN_SCENE)
+    out = augment(images, np.random.default_rng(0), UNKNOWN_SCENE)
     assert out.shape == images.shape
     assert out.min() >= 0
     assert out.max() <= 1
@@ -44,7 +44,7 @@ def test_the_picture_remains_recognisable_and_the_more_so_the_more_is_known():
     """Disturbed images correlate with their own originals far more than with others'."""
     images, own = coarse(64), []
     for most in (UNKNOWN_SCENE, WHOLE_FRAME, KNOWN_SCENE):
-        out = disturb(images, np.random.default_rng(1), most)
+        out = augment(images, np.random.default_rng(1), most)
         a, b = ((x - x.mean((1, 2, 3), keepdim=True)).flatten(1) for x in (images, out))
         correlation = torch.nn.functional.normalize(a) @ torch.nn.functional.normalize(b).T
         own.append(correlation.diagonal().mean())

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 from curio_train.data.backgrounds import POOL_HEIGHT, POOL_WIDTH, ClutterBackgrounds, PhotographBackgrounds, render_pool
-from curio_train.data.leaves import scatter_leaves
+from curio_train.data.clutter import dead_leaves_texture
 from curio_train.data.photographs import Photographs
-from curio_train.data.shapes import sphere
 from curio_train.errors import DataError
+from curio_train.meshes.shapes import sphere
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def test_leaves_cover_each_other_with_strong_edges_everywhere():
     random = np.random.default_rng(2)
     pictures = np.full((12, POOL_HEIGHT, POOL_WIDTH, 3), 0.5, np.float32)
     for picture in pictures:
-        scatter_leaves(picture, random)
+        dead_leaves_texture(picture, random)
     assert pictures.min() >= 0
     assert pictures.max() <= 1
     covered = (pictures != 0.5).any(axis=-1)

@@ -118,7 +118,7 @@ def test_projection_is_the_inverse_of_rays() -> None:
 def test_gaze_puts_the_direction_in_the_centre() -> None:
     matrix = torch.tensor(LINEMOD)[None]
     point = torch.tensor([[0.2, -0.15, 1.1]], dtype=torch.float64)
-    gaze = camera.gaze_at(point, torch.tensor([900.0], dtype=torch.float64), 128, matrix)
+    gaze = camera.crop_camera_at(point, torch.tensor([900.0], dtype=torch.float64), 128, matrix)
     seen = (gaze.rotation @ point[..., None])[..., 0]
     assert seen[0].tolist() == pytest.approx([0, 0, point.norm().item()], abs=1e-12)
     # A neighbour of that point reaches the same crop pixel through the homography as through the turned camera.
@@ -132,7 +132,7 @@ def test_gaze_puts_the_direction_in_the_centre() -> None:
 def test_gaze_ahead_is_a_plain_crop() -> None:
     matrix = torch.tensor([[[100.0, 0, 31.5], [0, 100.0, 23.5], [0, 0, 1]]])
     frame = torch.arange(64 * 48, dtype=torch.float32).view(1, 1, 48, 64)
-    gaze = camera.gaze_at(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([100.0]), 16, matrix)
+    gaze = camera.crop_camera_at(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([100.0]), 16, matrix)
     grid = camera.sampling_grid(gaze, matrix, 16, 64, 48)
     crop = grid_sample(frame, grid, align_corners=False)
     torch.testing.assert_close(crop, frame[..., 16:32, 24:40], atol=0.05, rtol=0)
@@ -140,12 +140,12 @@ def test_gaze_ahead_is_a_plain_crop() -> None:
 
 def test_grid_follows_the_homography_and_ignores_what_is_behind() -> None:
     matrix = torch.tensor(LINEMOD, dtype=torch.float32)[None]
-    gaze = camera.gaze_at(torch.tensor([[0.5, 0.2, 1.0]]), torch.tensor([300.0]), 32, matrix)
+    gaze = camera.crop_camera_at(torch.tensor([[0.5, 0.2, 1.0]]), torch.tensor([300.0]), 32, matrix)
     grid = camera.sampling_grid(gaze, matrix, 32, *SIZE)[0, 7, 21]
     frame = (grid + 1) * torch.tensor(SIZE) / 2 - 0.5
     warped = gaze.homography[0] @ torch.tensor([*frame.tolist(), 1.0])
     assert (warped[:2] / warped[2]).tolist() == pytest.approx([21, 7], abs=1e-2)
-    sideways = camera.gaze_at(torch.tensor([[1.0, 0.0, 0.01]]), torch.tensor([10.0]), 32, matrix)
+    sideways = camera.crop_camera_at(torch.tensor([[1.0, 0.0, 0.01]]), torch.tensor([10.0]), 32, matrix)
     outside = camera.sampling_grid(sideways, matrix, 32, *SIZE)[0, 16, 31]
     assert outside.abs().max() > 1
     assert torch.isfinite(outside).all()
@@ -154,7 +154,7 @@ def test_grid_follows_the_homography_and_ignores_what_is_behind() -> None:
 def test_gaze_has_gradients_straight_ahead() -> None:
     matrix = torch.tensor(LINEMOD, dtype=torch.float32)[None]
     direction = torch.tensor([[0.0, 0.0, 1.0]], requires_grad=True)
-    gaze = camera.gaze_at(direction, torch.tensor([300.0]), 32, matrix)
+    gaze = camera.crop_camera_at(direction, torch.tensor([300.0]), 32, matrix)
     rotation_6d_from_matrix(gaze.rotation).sum().backward()
     assert torch.isfinite(direction.grad).all()
     assert direction.grad.abs().sum() > 0

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from curio_train import cli
+from curio_train.commands import cli
 
 
 def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, str]:

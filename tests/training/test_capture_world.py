@@ -10,22 +10,23 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train import cli
 from curio_train.camera import Intrinsics
+from curio_train.commands import cli
 from curio_train.config import NetworkConfig
 from curio_train.data import backgrounds
-from curio_train.data.plate import MixedBackgrounds, PlateBackgrounds
+from curio_train.data.background_image import BackgroundImages, MixedBackgrounds
 from curio_train.doctor.before_training import refuse_unfit
 from curio_train.errors import CameraError, DataError, MeshError, UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.subject import load_subject
-from curio_train.export import export
+from curio_train.export.graph import export
 from curio_train.geometry import matrix_from_rotation_6d
-from curio_train.learning.checkpoint import RunFolder
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
-from curio_train.worlds.capture import NUM_JUDGED, Capture
 from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.single_object.capture import NUM_JUDGED, Capture
 from torch import Tensor
 
 WIDTH, HEIGHT = 160, 120
@@ -88,7 +89,7 @@ def test_an_unpainted_part_has_any_colour_and_says_which(world: Capture) -> None
     assert saturation.min() < 0.05
     assert saturation.max() > 0.9
     assert colors.amax(1).min() < 0.2
-    second = world.looks[1]
+    second = world.stages[1]
     scenes = second.sample(6, (1,))
     scenes[CONFIDENCE][:] = 1
     light, dark = (scenes | {COLOR: torch.full((6, 1, 3), value)} for value in (0.9, 0.2))
@@ -129,7 +130,7 @@ def test_it_is_seen_from_all_sides_or_from_above(folder: Path, world: Capture) -
 
 
 def test_backgrounds_are_the_plate_and_clutter(folder: Path, world: Capture, cache: Path) -> None:
-    source = world.looks[0].source("train", 0, with_code=False, cache=cache)
+    source = world.stages[0].source("train", 0, with_code=False, cache=cache)
     frames = source.backgrounds(0, 60)
     assert frames.shape == (60, 3, HEIGHT // 4, WIDTH // 4)
     assert torch.equal(frames, source.backgrounds(0, 60))
@@ -138,23 +139,23 @@ def test_backgrounds_are_the_plate_and_clutter(folder: Path, world: Capture, cac
     flat = torch.cat([frames.flatten(1), small.permute(2, 0, 1).float().flatten()[None]])
     alike = torch.corrcoef(flat)[-1, :-1] > 0.7
     assert 42 <= alike.sum() <= 58, "seventeen of twenty are the plate"
-    crops = world.looks[1].source("train", 0, with_code=False, cache=cache).backgrounds(0, 8)
+    crops = world.stages[1].source("train", 0, with_code=False, cache=cache).backgrounds(0, 8)
     assert crops.shape == (8, 3, 64, 64)
 
 
 def test_crops_of_a_plate_span_what_they_span_in_a_frame() -> None:
     ramp = np.tile(np.linspace(0, 255, 400).astype(np.uint8)[None, :, None], (300, 1, 3))
-    whole = PlateBackgrounds(ramp).draw(20, 40, 30, (0,))
-    part = PlateBackgrounds(ramp).of_crops(0.2, 0.3).draw(20, 30, 30, (0,))
+    whole = BackgroundImages(ramp).draw(20, 40, 30, (0,))
+    part = BackgroundImages(ramp).of_crops(0.2, 0.3).draw(20, 30, 30, (0,))
     across = [(views[..., -1] - views[..., 0]).mean(dim=(1, 2)) for views in (whole, part)]
     assert across[0].min() > 0.55
     assert across[1].max() < 0.45
     assert across[1].min() > 0.05
-    assert PlateBackgrounds(ramp).of_crops(3.0, 4.0).draw(2, 30, 30, (0,)).shape == (2, 3, 30, 30), "larger than it"
+    assert BackgroundImages(ramp).of_crops(3.0, 4.0).draw(2, 30, 30, (0,)).shape == (2, 3, 30, 30), "larger than it"
 
 
 def test_crops_of_a_plate_are_darker_where_a_part_throws_its_shadow() -> None:
-    plate = PlateBackgrounds(np.full((300, 400, 3), 128, np.uint8))
+    plate = BackgroundImages(np.full((300, 400, 3), 128, np.uint8))
     crops, whole = plate.of_crops(0.2, 0.3).draw(100, 32, 32, (0,)), plate.draw(100, 32, 32, (0,))
     middle, border = (slice(12, 20), slice(0, 2))
     relative = [(v[..., middle, middle].mean() / v[..., border, :].mean()).item() for v in (crops, whole)]
@@ -163,7 +164,7 @@ def test_crops_of_a_plate_are_darker_where_a_part_throws_its_shadow() -> None:
 
 
 def test_a_mixture_draws_from_both() -> None:
-    black, white = (PlateBackgrounds(np.full((30, 40, 3), value, np.uint8)) for value in (0, 255))
+    black, white = (BackgroundImages(np.full((30, 40, 3), value, np.uint8)) for value in (0, 255))
     mixed = MixedBackgrounds(black, white, 0.5).split(True).of_crops(0.5, 1)
     bright = mixed.draw(40, 8, 6, (3,)).mean(dim=(1, 2, 3)) > 0.5
     assert 8 < bright.sum() < 32
@@ -203,10 +204,10 @@ def test_a_model_is_not_judged_by_what_it_learned_from(folder: Path, tmp_path: P
     judged = many.photographs(1000)
     assert judged is not None
     assert len(greys(judged)) == NUM_JUDGED
-    assert many.lessons(predict) is None
+    assert PseudoLabels.from_photographs(many, predict) is None
     assert greys(torch.cat(read)) == set(range(2 * NUM_JUDGED)) - greys(judged)
     read.clear()
-    assert few.lessons(predict) is None
+    assert PseudoLabels.from_photographs(few, predict) is None
     assert not read
 
 
@@ -243,7 +244,7 @@ def test_files_that_do_not_belong_together_are_refused_all_at_once(folder: Path,
     with pytest.raises(DataError, match=r"backgrounds: .*cut\.png"):
         refuse_unfit(options(folder, background=None, backgrounds=tmp_path / "other"))
     with pytest.raises(DataError, match="80x60"):
-        PlateBackgrounds.read(tmp_path / "plate.png", Intrinsics(np.eye(3), WIDTH, HEIGHT))
+        BackgroundImages.read(tmp_path / "plate.png", Intrinsics(np.eye(3), WIDTH, HEIGHT))
 
 
 def call(*words: object) -> int:

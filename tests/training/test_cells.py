@@ -10,12 +10,12 @@ from curio_train.errors import UsageError
 from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
 from curio_train.metrics.assignment import scene_error
-from curio_train.networks.cells import AMOUNTS, cell_error, fill_slots
 from curio_train.networks.grid import STRIDE, CellGrid, of_cells
+from curio_train.networks.set_detector import HEAT_MAP, cell_error, fill_slots
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, SceneCode, index
 from curio_train.worlds import WORLDS, build
-from curio_train.worlds.mesh_world import MeshWorld
-from curio_train.worlds.stored import StoredImages
+from curio_train.worlds.generated.mesh_world import MeshWorld
+from curio_train.worlds.image_sets import StoredImages
 from torch import Tensor
 
 CELLS = NetworkConfig(reading="cells")
@@ -146,7 +146,7 @@ def reading(world: MeshWorld, code: SceneCode) -> dict[str, Tensor]:
     amounts, values = perfect_cells(world, code)
     of_scene = {field.name: code[field.name] for field in world.layout.fields if not field.per_object}
     logits = torch.logit(amounts.clamp(1e-4, 1 - 1e-4))
-    return {AMOUNTS: logits, **{of_cells(name): value for name, value in values.items()}, **of_scene}
+    return {HEAT_MAP: logits, **{of_cells(name): value for name, value in values.items()}, **of_scene}
 
 
 def test_error_of_cells_is_least_at_the_truth(worlds: dict[str, MeshWorld]) -> None:
@@ -159,7 +159,7 @@ def test_error_of_cells_is_least_at_the_truth(worlds: dict[str, MeshWorld]) -> N
 
     true = reading(world, code)
     least = error(true)
-    for name in (of_cells(TRANSLATION), of_cells(COLOR), LIGHT, AMOUNTS):
+    for name in (of_cells(TRANSLATION), of_cells(COLOR), LIGHT, HEAT_MAP):
         assert (error({**true, name: true[name] + 0.4}) > least + 0.05).all(), name
 
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from curio_train.metrics.certainty import calibration, calibration_error, separation
+from curio_train.metrics.certainty import auroc, calibration, calibration_error
 
 
 def test_a_confidence_that_is_right_as_often_as_it_says_has_no_error() -> None:
@@ -16,21 +16,21 @@ def test_error_by_hand() -> None:
 
 
 def test_separation_counts_pairs() -> None:
-    assert separation([0.9, 0.8], [0.1, 0.2, 0.3]) == 1
-    assert separation([0.1], [0.9]) == 0
-    assert separation([0.5, 0.5], [0.5]) == 0.5
-    assert separation([0.2, 0.8], [0.5]) == 0.5
+    assert auroc([0.9, 0.8], [0.1, 0.2, 0.3]) == 1
+    assert auroc([0.1], [0.9]) == 0
+    assert auroc([0.5, 0.5], [0.5]) == 0.5
+    assert auroc([0.2, 0.8], [0.5]) == 0.5
     random = np.random.default_rng(0)
     some, others = random.random(40), random.random(30)
     pairs = (some[:, None] > others).mean()
-    assert separation(some, others) == pytest.approx(pairs)
+    assert auroc(some, others) == pytest.approx(pairs)
 
 
 def test_nothing_to_judge_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one"):
         calibration_error([], [])
     with pytest.raises(ValueError, match="without"):
-        separation([0.5], [])
+        auroc([0.5], [])
 
 
 def test_calibration_mends_confidences_that_say_too_little() -> None:

@@ -12,13 +12,13 @@ import pytest
 import torch
 from curio_train.config import ConvStack, NetworkConfig, Recipe, RunConfig
 from curio_train.errors import CheckpointError, ResumeMismatch, UsageError
-from curio_train.learning.checkpoint import RunFolder
-from curio_train.learning.configuration import load_config, refuse_other
-from curio_train.learning.interruption import Interrupted, Interruption, interruptible
 from curio_train.learning.loop import Outcome
-from curio_train.learning.session import learn
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.configuration import load_config, refuse_other
+from curio_train.learning.runs.interruption import Interrupted, Interruption, interruptible
+from curio_train.learning.runs.session import learn
 from curio_train.learning.state import TrainState
-from curio_train.worlds.circles import Circles
+from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions, LinemodOptions
 from torch import Tensor
 

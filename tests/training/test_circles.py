@@ -7,8 +7,9 @@ import pytest
 import torch
 from curio_train.errors import DataError, UsageError
 from curio_train.scene_code import TRANSLATION
-from curio_train.worlds import build, circles
-from curio_train.worlds.circles import RADIUS, REACH, SIDE_PX, Circles
+from curio_train.worlds import build
+from curio_train.worlds.generated import circles
+from curio_train.worlds.generated.circles import RADIUS, REACH, SIDE_PX, Circles
 from curio_train.worlds.options import CirclesOptions
 from torch import Tensor
 

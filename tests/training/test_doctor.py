@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from curio_train import cli
+from curio_train.commands import cli
 from curio_train.doctor.examine import Subjects, examine_files
 from curio_train.doctor.machine import examine_machine
 

@@ -12,10 +12,10 @@ import onnx
 import pytest
 import trimesh
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec
-from curio_train.data.meshes import load_mesh
 from curio_train.doctor.examine import Subjects, examine_files
 from curio_train.doctor.finding import Finding
-from curio_train.onnx_file import put_spec
+from curio_train.export.onnx import put_spec
+from curio_train.meshes.meshes import load_mesh
 from PIL import Image
 
 WIDTH, HEIGHT, NUM_PHOTOS = 160, 120, 64

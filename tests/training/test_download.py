@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import trimesh
-from curio_train import cli
+from curio_train.commands import cli
 from curio_train.data.bop import BopDataset
 from curio_train.data.download import ARCHIVES, download_linemod
 from curio_train.errors import DataError

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_serve.camera import PinholeCamera
-from curio_serve.view import CanonicalCamera, PinholeFrame, Region
-from curio_train import cli
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.view import CanonicalCamera, PinholeFrame, Region
+from curio_train.commands import cli
 from curio_train.config import RunConfig
 from curio_train.data.bop import ModelInfo
 from curio_train.errors import CurioError, DataError, ExportError, UsageError
@@ -24,10 +24,10 @@ from curio_train.evaluation.tables import print_evaluation
 from curio_train.geometry import Pose
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds.base import Camera
-from curio_train.worlds.circles import Circles
-from curio_train.worlds.linemod import build
+from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import LinemodOptions
-from curio_train.worlds.single_object import SingleObjectWorld
+from curio_train.worlds.single_object.linemod import build
+from curio_train.worlds.single_object.world import SingleObjectWorld
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 

@@ -12,19 +12,27 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from curio_train import cli
+from curio_train.commands import cli
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, ExportError, UsageError
-from curio_train.export import Exported, Graph, check_images, export, largest_difference, refuse_disparity, settled
-from curio_train.learning.checkpoint import RunFolder
-from curio_train.learning.provenance import this_sitting
-from curio_train.learning.state import Course
-from curio_train.model_card import EVALUATION_FILE, Making, card, portable
-from curio_train.model_folder import find_model
-from curio_train.onnx_file import OnnxModel
+from curio_train.export.card import EVALUATION_FILE, Provenance, card, portable
+from curio_train.export.folder import find_model
+from curio_train.export.graph import (
+    Exported,
+    Graph,
+    check_images,
+    export,
+    largest_difference,
+    refuse_disparity,
+    settled,
+)
+from curio_train.export.onnx import OnnxModel
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.provenance import this_session
+from curio_train.learning.state import TrainingProgress
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout
 from curio_train.worlds import build
-from curio_train.worlds.circles import Circles
+from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions
 
 WriteRun = Callable[..., Path]
@@ -141,8 +149,8 @@ def test_versions_stand_beside_each_other(single: Exported, half: Exported, mode
 
 def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Exported, tmp_path: Path) -> None:
     spec = OnnxModel.open(single.path / "model.onnx").spec
-    config, course = RunConfig(CirclesOptions(), method="noncur"), Course(step=2, images=64, seconds=1.5)
-    made = Making(tmp_path, config, this_sitting(), course, "float32")
+    config, course = RunConfig(CirclesOptions(), method="noncur"), TrainingProgress(step=2, images=64, seconds=1.5)
+    made = Provenance(tmp_path, config, this_session(), course, "float32")
     result = {"split": "test", "num_images": 500, "metrics": {"position_px": 1.25}, "untrained": {"position_px": 40.0}}
     for images_seen, quoted in ((32, False), (64, True)):
         (tmp_path / EVALUATION_FILE).write_text(json.dumps(result | {"images_seen": images_seen}))
@@ -286,7 +294,7 @@ def test_a_place_that_cannot_be_written_is_told(run: Path, tmp_path: Path, capsy
 
 
 def test_a_full_disk_leaves_nothing_behind(run: Path, tmp_path: Path) -> None:
-    limited = f'ulimit -f 2000; exec "{sys.executable}" -c "from curio_train.cli import export; export()" "$@"'
+    limited = f'ulimit -f 2000; exec "{sys.executable}" -c "from curio_train.commands.cli import export; export()" "$@"'
     command = ["bash", "-c", limited, "curio-export", str(run), "--out", str(tmp_path / "models")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1

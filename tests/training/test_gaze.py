@@ -14,19 +14,32 @@ from curio_train.geometry import (
     rotation_angle_deg,
     rotation_between,
 )
-from curio_train.networks.crop import SURFACE
-from curio_train.networks.gaze import SCALES
-from curio_train.networks.look import Look
-from curio_train.networks.places import AMOUNTS, CANDIDATE_LOG_WEIGHTS, CANDIDATES, NUM_CANDIDATES, PLACES
+from curio_train.networks.base import StageNetwork
+from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
+from curio_train.networks.two_stage.localise import (
+    CANDIDATE_LOG_WEIGHTS,
+    CANDIDATES,
+    HEAT_MAP,
+    NUM_CANDIDATES,
+    PROPOSALS,
+)
+from curio_train.networks.two_stage.network import SCALES
+from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, index
-from curio_train.worlds.calibration import calibrate
-from curio_train.worlds.gaze import ASSUMED_M, CROP_PX, FirstLook, GazeWorld, SecondLook, gaze_camera
-from curio_train.worlds.single_object import EXPOSURE, Object
-from curio_train.worlds.surface import SurfaceMap
+from curio_train.worlds.single_object.confidence import calibrate
+from curio_train.worlds.single_object.two_stage import (
+    ASSUMED_M,
+    CROP_PX,
+    CropPoseStage,
+    LocalisationStage,
+    TwoStageWorld,
+    frame_camera,
+)
+from curio_train.worlds.single_object.world import EXPOSURE, Object
 from torch import Tensor, nn
 
 
-class Told(Look):
+class Told(StageNetwork):
     """A look that answers what it was told, and keeps what it was shown.
 
     Of crops placed nearer and farther too, it says so.
@@ -47,15 +60,15 @@ class Told(Look):
 
 
 def test_the_canonical_camera_is_the_frames_own_at_most_640_pixels_long(brick: Object) -> None:
-    camera = gaze_camera(brick.camera)
+    camera = frame_camera(brick.camera)
     assert (camera.width, camera.height) == (640, 480)
     assert np.array_equal(camera.matrix, brick.camera.matrix)
-    large = gaze_camera(Intrinsics(np.array([[1600.0, 0, 960], [0, 1600, 540], [0, 0, 1]]), 1920, 1080))
+    large = frame_camera(Intrinsics(np.array([[1600.0, 0, 960], [0, 1600, 540], [0, 0, 1]]), 1920, 1080))
     assert (large.width, large.height) == (640, 360)
     assert large.matrix[0, 0] == pytest.approx(1600 / 3)
 
 
-def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(brick_world: GazeWorld) -> None:
+def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(brick_world: TwoStageWorld) -> None:
     """A frame is rendered, looked at where the object is, and the crop compared with one rendered as a crop.
 
     Told the truth about the crop, the gaze must answer the truth about the frame.
@@ -66,14 +79,14 @@ def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(b
     images = brick_world.render(code)
     place = code[TRANSLATION][:, 0]
     distance = place.norm(dim=1, keepdim=True)
-    second = brick_world.looks[1]
+    second = brick_world.stages[1]
     turn = rotation_between(place, torch.tensor([0.0, 0, 1]).expand_as(place))
     relative = {
         TRANSLATION: torch.tensor([0.0, 0, 1]).expand(6, 1, 3),
         ROTATION_6D: rotation_6d_from_matrix(turn @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0]))[:, None],
         CONFIDENCE: torch.full((6, 1, 1), 0.7),
         LIGHT: (turn @ code[LIGHT][..., None])[..., 0],
-        SURFACE: torch.zeros(6, 4, 16, 16),
+        OBJECT_COORDINATES: torch.zeros(6, 4, 16, 16),
     }
     glance = Told(relative)
     places = {CANDIDATES: code[TRANSLATION], CANDIDATE_LOG_WEIGHTS: torch.zeros(6, 1)}
@@ -91,12 +104,14 @@ def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(b
     assert missed < 0.5 * (rendered - rendered.roll(1, dims=-1)).abs().mean(), "further off than half a pixel"
 
 
-def test_objects_of_the_second_look_lie_where_its_code_says(brick_world: GazeWorld) -> None:
-    second = brick_world.looks[1]
+def test_objects_of_the_second_look_lie_where_its_code_says(brick_world: TwoStageWorld) -> None:
+    second = brick_world.stages[1]
     code = second.sample(40, (1,))
     assert 0 < (code[CONFIDENCE] == 0).sum() < 15
     code[CONFIDENCE][:] = 1
-    second.layout.check({name: value for name, value in code.items() if name not in (ASSUMED_M, EXPOSURE, SURFACE)})
+    second.layout.check(
+        {name: value for name, value in code.items() if name not in (ASSUMED_M, EXPOSURE, OBJECT_COORDINATES)}
+    )
     drawn = second.render(code).amax(dim=1) > 0.02
     place = code[TRANSLATION][:, 0]
     pixels = project(place[:, None], torch.from_numpy(second.camera.matrix).float()[None])[:, 0]
@@ -106,10 +121,10 @@ def test_objects_of_the_second_look_lie_where_its_code_says(brick_world: GazeWor
         assert (middle - pixel).norm() < 6
 
 
-def test_surface_points_project_to_the_patches_that_see_them(brick_world: GazeWorld) -> None:
-    second = brick_world.looks[1]
+def test_surface_points_project_to_the_patches_that_see_them(brick_world: TwoStageWorld) -> None:
+    second = brick_world.stages[1]
     code = second.sample(8, (3,))
-    surface_map = SurfaceMap(second.object.mesh, 32)
+    surface_map = ObjectCoordinateMap(second.object.mesh, 32)
     rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
     place = second._metres(code[TRANSLATION][:, 0], code[ASSUMED_M])
     matrices = second._matrices(code, 32)
@@ -123,9 +138,9 @@ def test_surface_points_project_to_the_patches_that_see_them(brick_world: GazeWo
         assert (pixels - torch.stack([u, v], dim=1)).abs().mean() < 0.3
 
 
-def test_first_look_reads_the_likeliest_place(brick_world: GazeWorld) -> None:
+def test_first_look_reads_the_likeliest_place(brick_world: TwoStageWorld) -> None:
     """A network that scores brightness must answer with the bright spot's place, between the depth bounds."""
-    first = brick_world.looks[0]
+    first = brick_world.stages[0]
     network = first.network(NetworkConfig()).eval()
     spot = torch.zeros(1, 3, 120, 160)
     spot[:, :, 60:68, 100:108] = 1.0
@@ -139,15 +154,15 @@ def test_first_look_reads_the_likeliest_place(brick_world: GazeWorld) -> None:
         network.score.weight.zero_()
         network.score.weight[0, 0] = 50.0
         found = network(spot)
-    assert found[PLACES].shape == (1, 20 * 15, 3)
-    assert found[AMOUNTS].shape == (1, 20 * 15)
+    assert found[PROPOSALS].shape == (1, 20 * 15, 3)
+    assert found[HEAT_MAP].shape == (1, 20 * 15)
     pixel = project(found[TRANSLATION][0], torch.from_numpy(first.camera.matrix).float())[0]
     assert (pixel - torch.tensor([104.0, 64.0])).abs().max() < 8.1
     assert 0.5 <= found[TRANSLATION][0, 0, 2] <= 1.5
 
 
-def test_first_look_sees_several_under_one_light(brick_world: GazeWorld) -> None:
-    first: FirstLook = brick_world.looks[0]
+def test_first_look_sees_several_under_one_light(brick_world: TwoStageWorld) -> None:
+    first: LocalisationStage = brick_world.stages[0]
     code = first.sample(4, (1,))
     assert code[TRANSLATION].shape == (4, first.num_shown, 3)
     assert code[LIGHT].shape == (4, 3)
@@ -160,16 +175,16 @@ def test_first_look_sees_several_under_one_light(brick_world: GazeWorld) -> None
         assert patch.any(), (number, u, v)
 
 
-def test_batches_of_crops_give_what_rendering_needs_and_no_label(brick_world: GazeWorld, tmp_path) -> None:
-    batch = brick_world.looks[1].source("train", 0, with_code=False, cache=tmp_path).batch(3, 4)
+def test_batches_of_crops_give_what_rendering_needs_and_no_label(brick_world: TwoStageWorld, tmp_path) -> None:
+    batch = brick_world.stages[1].source("train", 0, with_code=False, cache=tmp_path).batch(3, 4)
     assert batch.code is None
     assert set(batch.given) == {ASSUMED_M}
-    labelled = brick_world.looks[1].source("train", 0, with_code=True, cache=tmp_path).batch(3, 4)
-    again = brick_world.looks[1].render(index(labelled.code, slice(None)), labelled.backgrounds)
+    labelled = brick_world.stages[1].source("train", 0, with_code=True, cache=tmp_path).batch(3, 4)
+    again = brick_world.stages[1].render(index(labelled.code, slice(None)), labelled.backgrounds)
     assert torch.allclose(again, batch.images, atol=1e-5)  # Dr.Jit's threads add in any order
 
 
-class Bright(Look):
+class Bright(StageNetwork):
     """A look at crops that sees the more of the object the brighter they are, and says that it is in the middle."""
 
     def __init__(self) -> None:
@@ -183,11 +198,11 @@ class Bright(Look):
             ROTATION_6D: torch.tensor([1.0, 0, 0, 0, 1, 0]).expand(count, 1, 6),
             CONFIDENCE: brightness.view(count, 1, 1),
             LIGHT: torch.zeros(count, 3),
-            SURFACE: brightness.view(count, 1, 1, 1).expand(count, 4, 16, 16),
+            OBJECT_COORDINATES: brightness.view(count, 1, 1, 1).expand(count, 4, 16, 16),
         }
 
 
-def test_of_several_candidates_the_likeliest_is_answered(brick_world: GazeWorld) -> None:
+def test_of_several_candidates_the_likeliest_is_answered(brick_world: TwoStageWorld) -> None:
     """Two frames, each bright at another of three candidates; then a first look that knows better than the second."""
     candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8], [0.0, 0.2, 1.2]]).expand(2, 3, 3)
     pixels = project(candidates, torch.from_numpy(brick_world.camera.matrix).float()[None]).round().int()
@@ -205,7 +220,7 @@ def test_of_several_candidates_the_likeliest_is_answered(brick_world: GazeWorld)
     assert torch.allclose(found[TRANSLATION][:, 0], candidates[0, [1, 1]], atol=1e-5)
 
 
-def test_confidence_weighs_what_all_glances_see(brick_world: GazeWorld) -> None:
+def test_confidence_weighs_what_all_glances_see(brick_world: TwoStageWorld) -> None:
     """Probability that the object is there, by evidence and weight of the place, times that of being right then."""
     candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8]]).expand(3, 2, 3)
     weights = torch.tensor([[-3.0, -0.5]]).expand(3, 2)
@@ -222,7 +237,7 @@ def test_confidence_weighs_what_all_glances_see(brick_world: GazeWorld) -> None:
     assert torch.allclose(network(frames)[CONFIDENCE].flatten(), expected, atol=1e-4)
 
 
-class Middle(Look):
+class Middle(StageNetwork):
     """A look at frames that takes everything to be at one place."""
 
     def __init__(self) -> None:
@@ -235,7 +250,7 @@ class Middle(Look):
         return {}, {CANDIDATES: place, CANDIDATE_LOG_WEIGHTS: torch.zeros(count, 1)}
 
 
-def test_calibration_knows_empty_frames(brick_world: GazeWorld, tmp_path: Path) -> None:
+def test_calibration_knows_empty_frames(brick_world: TwoStageWorld, tmp_path: Path) -> None:
     """To a network that sees what stands out from the wall, whose own confidence says nothing."""
     wall = torch.full((4, 3, 480, 640), 128 / 255)
 
@@ -243,7 +258,10 @@ def test_calibration_knows_empty_frames(brick_world: GazeWorld, tmp_path: Path) 
         def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
             seen = (features - wall[0, 0, 0, 0]).abs().mean(dim=(1, 2, 3), keepdim=True)
             surface = (100 * seen).expand(-1, 4, 16, 16)
-            return {}, super().decode(features)[1] | {SURFACE: surface, CONFIDENCE: torch.full_like(seen[:, 0], 0.5)}
+            return {}, super().decode(features)[1] | {
+                OBJECT_COORDINATES: surface,
+                CONFIDENCE: torch.full_like(seen[:, 0], 0.5),
+            }
 
     network = brick_world.assemble([Middle(), StandsOut()])
     calibrate(network, brick_world, tmp_path)
@@ -253,8 +271,8 @@ def test_calibration_knows_empty_frames(brick_world: GazeWorld, tmp_path: Path) 
     assert empty < 0.6 * full
 
 
-def test_candidates_are_apart_and_the_likeliest_comes_first(brick_world: GazeWorld) -> None:
-    first = brick_world.looks[0]
+def test_candidates_are_apart_and_the_likeliest_comes_first(brick_world: TwoStageWorld) -> None:
+    first = brick_world.stages[0]
     network = first.network(NetworkConfig())
     weights = torch.full((1, 20 * 15), 1e-6)
     chosen = torch.tensor([5 * 20 + 5, 5 * 20 + 6, 10 * 20 + 12, 2 * 20 + 17])
@@ -270,30 +288,30 @@ def test_candidates_are_apart_and_the_likeliest_comes_first(brick_world: GazeWor
     assert torch.equal(found[0, :2], places[0, chosen[[0, 3]]])
 
 
-def test_colours_differ_least_where_they_tell_most(brick: Object, brick_world: GazeWorld) -> None:
+def test_colours_differ_least_where_they_tell_most(brick: Object, brick_world: TwoStageWorld) -> None:
     """The first look, and all looks at a known scene, see milder light than the second look at an unknown one."""
-    first, second = brick_world.looks
-    known = GazeWorld("capture", replace(brick, known_scene=True))
+    first, second = brick_world.stages
+    known = TwoStageWorld("capture", replace(brick, known_scene=True))
     spread = {
         name: float(look.sample(400, (1,))[EXPOSURE].log().std())
-        for name, look in {"whole": brick_world, "first": first, "second": second, "known": known.looks[1]}.items()
+        for name, look in {"whole": brick_world, "first": first, "second": second, "known": known.stages[1]}.items()
     }
     assert spread["second"] > 1.3 * spread["first"]
     assert spread["whole"] == pytest.approx(spread["first"], rel=0.1)
     assert spread["known"] == pytest.approx(spread["first"], rel=0.1)
     images = torch.rand(64, 3, 1, 1).expand(-1, -1, 64, 64).contiguous()
 
-    def moved(look: FirstLook | SecondLook) -> float:
-        return float((look.disturb(images, (1,)) - images).mean((2, 3)).abs().mean())
+    def moved(look: LocalisationStage | CropPoseStage) -> float:
+        return float((look.augment(images, (1,)) - images).mean((2, 3)).abs().mean())
 
     assert moved(second) > 1.3 * moved(first)
-    assert moved(first) > 1.2 * moved(known.looks[0])
-    assert moved(known.looks[0]) == pytest.approx(moved(known.looks[1]))
+    assert moved(first) > 1.2 * moved(known.stages[0])
+    assert moved(known.stages[0]) == pytest.approx(moved(known.stages[1]))
 
 
 def test_light_of_a_known_scene_tells_faces_apart(brick: Object) -> None:
     for known, weakest in ((False, 0.2), (True, 0.5)):
-        for look in GazeWorld("capture", replace(brick, known_scene=known)).looks:
+        for look in TwoStageWorld("capture", replace(brick, known_scene=known)).stages:
             strength = look.sample(400, (1,))[LIGHT].norm(dim=-1)
             assert weakest <= strength.min() < 1.1 * weakest
             assert strength.max() <= 2

@@ -8,15 +8,15 @@ import pytest
 import torch
 from curio_train.config import NetworkConfig, RunConfig
 from curio_train.errors import CheckpointError, CurioError, UsageError
-from curio_train.export import export
-from curio_train.learning.checkpoint import RunFolder
-from curio_train.learning.initial import begin_with, uses_synthetic_labels
-from curio_train.learning.interruption import Interruption
-from curio_train.learning.session import learn
+from curio_train.export.card import EVALUATION_FILE
+from curio_train.export.graph import export
+from curio_train.export.onnx import OnnxModel
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.initial import begin_with, uses_synthetic_labels
+from curio_train.learning.runs.interruption import Interruption
+from curio_train.learning.runs.session import learn
 from curio_train.learning.state import TrainState
-from curio_train.model_card import EVALUATION_FILE
-from curio_train.onnx_file import OnnxModel
-from curio_train.worlds.circles import Circles
+from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions
 from torch import Tensor
 

@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from curio_train.commands.prepare import prepared
 from curio_train.config import RunConfig, preset_recipe
 from curio_train.errors import CameraError, DataError, UsageError
-from curio_train.export import export
+from curio_train.export.graph import export
 from curio_train.geometry import matrix_from_rotation_6d
-from curio_train.preparation import prepared
+from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
-from curio_train.worlds.linemod import FAR_M, NEAR_M, read_cameras
 from curio_train.worlds.options import LinemodOptions
-from curio_train.worlds.single_object import EXPOSURE
-from curio_train.worlds.views import STRONGEST_LIGHT, WEAKEST_LIGHT
+from curio_train.worlds.single_object.linemod import FAR_M, NEAR_M, read_camera_poses
+from curio_train.worlds.single_object.viewpoints import STRONGEST_LIGHT, WEAKEST_LIGHT
+from curio_train.worlds.single_object.world import EXPOSURE
 
 
 @pytest.fixture(scope="module")
@@ -134,8 +135,15 @@ def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
     with pytest.raises(UsageError, match=r"--photos .*leave out --no-gaze"):
         build(LinemodOptions("ape", data, photographs, photos=photographs, gaze=False))
     read = []
+
+    def remember(world):
+        return lambda images: read.append(images) or world.sample(len(images), (1,))
+
     without = build(LinemodOptions("ape", data, photographs))
-    assert without.lessons(lambda images: read.append(images) or without.sample(len(images), (1,))) is None
+    assert (
+        PseudoLabels.from_photographs(without, lambda images: read.append(images) or without.sample(len(images), (1,)))
+        is None
+    )
     assert not read
 
     frames = tmp_path / "frames"
@@ -144,13 +152,16 @@ def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
     for number in range(3):
         cv2.imwrite(str(frames / f"{number}.png"), grey + number)
     taught = build(LinemodOptions("ape", data, photographs, photos=frames))
-    assert taught.lessons(lambda images: read.append(images) or taught.sample(len(images), (1,))) is None
+    assert (
+        PseudoLabels.from_photographs(taught, lambda images: read.append(images) or taught.sample(len(images), (1,)))
+        is None
+    )
     (seen,) = read
     assert (seen.mean((1, 2, 3)) * 255).tolist() == pytest.approx([90, 91, 92])
 
     cv2.imwrite(str(frames / "9.png"), grey[:96])
     with pytest.raises(DataError, match=r"9\.png"):
-        taught.lessons(lambda images: taught.sample(len(images), (1,)))
+        PseudoLabels.from_photographs(taught, lambda images: taught.sample(len(images), (1,)))
     with pytest.raises(DataError, match=r"9\.png"):  # before an hour is lost, too
         prepared(RunConfig(LinemodOptions("ape", data, photos=frames), method="sleep"), tmp_path, print, print)
 
@@ -166,16 +177,16 @@ def test_where_frames_were_taken_is_known_in_metres_or_not_at_all(data, tmp_path
     frames = [tmp_path / f"{number}.png" for number in range(3)]
     file = tmp_path / "views.json"
     file.write_text(json.dumps({"0.png": {"cam_from_world": view(), "unit": "m"}, "1.png": {"cam_from_world": view()}}))
-    cameras = read_cameras(file, frames)
+    cameras = read_camera_poses(file, frames)
     assert cameras.in_metres
     assert cameras.known.tolist() == [True, False, False]
     assert cameras.cam_from_world[0].tolist() == view()
 
     with pytest.raises(CameraError, match=r'"unit": "m".*--objects'):
-        read_cameras(file, frames[1:])
+        read_camera_poses(file, frames[1:])
     file.write_text(json.dumps({"0.png": {"cam_from_world": [[1, 2], [3, 4]], "unit": "m"}}))
     with pytest.raises(CameraError, match=r"--views .*0\.png: cam_from_world has shape"):
-        read_cameras(file, frames)
+        read_camera_poses(file, frames)
     with pytest.raises(UsageError, match=r"--views .*--photos"):
         build(LinemodOptions("ape", data, views=file))
     for frame in frames:

@@ -17,11 +17,12 @@ import pytest
 import trimesh
 from curio_train.data.bop import LINEMOD_CLASSES
 from curio_train.errors import DataError, UsageError
-from curio_train.evaluation.linemod_markdown import markdown
-from curio_train.evaluation.linemod_table import candidates, load_table
-from curio_train.evaluation.paper_tables import LINEMOD
-from curio_train.evaluation.results import Results
+from curio_train.evaluation.candidates import candidates
 from curio_train.worlds.options import LinemodOptions
+from paper.linemod_markdown import markdown
+from paper.linemod_table import load_table
+from paper.paper_tables import LINEMOD
+from paper.results import Results
 
 ROOT = Path(__file__).parents[2]
 K = [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1]

@@ -10,12 +10,12 @@ import pytest
 import torch
 from curio_train.config import PRESETS, ConvStack, Method, NetworkConfig, Recipe, RunConfig
 from curio_train.errors import DataError, TrainingError, UsageError
-from curio_train.learning.interruption import Interruption
 from curio_train.learning.loop import Outcome, Trainer, learning_rate_factor
 from curio_train.learning.parallel import Ranks
-from curio_train.learning.session import learn
+from curio_train.learning.runs.interruption import Interruption
+from curio_train.learning.runs.session import learn
 from curio_train.worlds.base import Batch, ImageSource
-from curio_train.worlds.circles import Circles
+from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions
 from torch import Tensor
 

@@ -10,7 +10,7 @@ from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, 
 from curio_train.learning.losses import image_loss
 from curio_train.learning.sleep import sleep_codes
 from curio_train.metrics.assignment import scene_error
-from curio_train.networks.critic import Critic
+from curio_train.networks.paper.critic import Critic
 from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Camera, ImageSource, Split, World
 from torch import Tensor

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from curio_train.data import shapes
-from curio_train.data.extent import diameter
-from curio_train.data.meshes import Mesh, load_mesh
 from curio_train.errors import MeshError
+from curio_train.meshes import shapes
+from curio_train.meshes.extent import diameter
+from curio_train.meshes.meshes import Mesh, load_mesh
 from PIL import Image
 from scipy.spatial.distance import pdist
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from curio_train.capture.plane import CameraPlaces, ever_changed, seen_points
+from curio_train.capture.plane import CameraPoseFile, ever_changed, seen_points
 from curio_train.errors import CameraError, DataError
 
 WIDTH, HEIGHT = 96, 72
@@ -67,4 +67,4 @@ def test_camera_places_that_do_not_do(tmp_path: Path, content: str | None, expec
     if content is not None:
         file.write_text(content)
     with pytest.raises(CameraError, match=expected):
-        CameraPlaces.read(file).cam_from_world(tmp_path / "plate.png")
+        CameraPoseFile.read(file).cam_from_world(tmp_path / "plate.png")

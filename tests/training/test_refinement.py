@@ -9,19 +9,19 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.data.bop import ModelInfo
-from curio_train.data.shapes import chair
 from curio_train.errors import UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.scores import add_errors
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.meshes.shapes import chair
+from curio_train.refinement.crops import rotation_from_vector
+from curio_train.refinement.inpainting import filled_in
+from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, poses
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.circles import Circles
-from curio_train.worlds.comparison import rotation_from_vector
-from curio_train.worlds.gaze import GazeWorld
-from curio_train.worlds.inpainting import filled_in
-from curio_train.worlds.refinement import Refinement
-from curio_train.worlds.single_object import Object
+from curio_train.worlds.generated.circles import Circles
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -31,22 +31,22 @@ NUM = 6
 
 
 @pytest.fixture(scope="module")
-def world() -> GazeWorld:
+def world() -> TwoStageWorld:
     kind = ObjectKind("chair", (0,), MESH.diameter_m, MESH.box_corners_m, MESH.sha256)
     random = np.random.default_rng(3)
     pool = np.stack([cv2.resize(random.integers(0, 256, (24, 32, 3), np.uint8), (640, 480)) for _ in range(4)])
-    return GazeWorld(
+    return TwoStageWorld(
         "linemod", Object(kind, MESH, Intrinsics(K, 640, 480), 0.5, 1.0, lambda _: ClutterBackgrounds(pool))
     )
 
 
 @pytest.fixture(scope="module")
-def refinement(world: GazeWorld) -> Refinement:
-    return Refinement(world)
+def refinement(world: TwoStageWorld) -> RenderAndCompare:
+    return RenderAndCompare(world)
 
 
 @pytest.fixture(scope="module")
-def scenes(world: GazeWorld) -> tuple[Tensor, Tensor, SceneCode]:
+def scenes(world: TwoStageWorld) -> tuple[Tensor, Tensor, SceneCode]:
     """Pictures of the object in whole, the clutter behind it, and the truth."""
     code = world.sample(NUM, (1,))
     code[TRANSLATION][..., :2] *= 0.6
@@ -72,7 +72,7 @@ def errors(found: SceneCode, true: SceneCode) -> np.ndarray:
 
 
 def test_most_estimates_come_most_of_the_way_to_the_truth(
-    refinement: Refinement, scenes: tuple[Tensor, Tensor, SceneCode]
+    refinement: RenderAndCompare, scenes: tuple[Tensor, Tensor, SceneCode]
 ) -> None:
     """One of six may end in another pose that explains as much: the search is a local one."""
     images, _, true = scenes
@@ -87,7 +87,9 @@ def test_most_estimates_come_most_of_the_way_to_the_truth(
     assert all(torch.equal(found[name], estimate[name]) for name in estimate.keys() - {TRANSLATION, ROTATION_6D})
 
 
-def test_objects_half_hidden_are_not_lost(refinement: Refinement, scenes: tuple[Tensor, Tensor, SceneCode]) -> None:
+def test_objects_half_hidden_are_not_lost(
+    refinement: RenderAndCompare, scenes: tuple[Tensor, Tensor, SceneCode]
+) -> None:
     """The right half of each object behind something else: what cannot be explained hardly ever pulls it away."""
     images, behind, true = scenes
     place = true[TRANSLATION][:, 0]
@@ -100,7 +102,7 @@ def test_objects_half_hidden_are_not_lost(refinement: Refinement, scenes: tuple[
 
 
 def test_where_there_is_nothing_estimates_stand(
-    refinement: Refinement, scenes: tuple[Tensor, Tensor, SceneCode]
+    refinement: RenderAndCompare, scenes: tuple[Tensor, Tensor, SceneCode]
 ) -> None:
     _, behind, true = scenes
     estimate = off(true)
@@ -111,7 +113,7 @@ def test_where_there_is_nothing_estimates_stand(
 
 
 def test_objects_out_of_the_picture_give_numbers(
-    refinement: Refinement, scenes: tuple[Tensor, Tensor, SceneCode]
+    refinement: RenderAndCompare, scenes: tuple[Tensor, Tensor, SceneCode]
 ) -> None:
     images, _, true = scenes
     lost = dict(true) | {TRANSLATION: true[TRANSLATION] + torch.tensor([3.0, 0.0, 0.0])}
@@ -141,6 +143,6 @@ def test_rotations_of_vectors_are_scipys() -> None:
 
 def test_worlds_without_one_object_are_refused(tmp_path: Path, write_run) -> None:
     with pytest.raises(UsageError, match="--refine: world circles cannot be refined, expected one object"):
-        Refinement(Circles())
+        RenderAndCompare(Circles())
     with pytest.raises(UsageError, match="--refine: world circles"):
         evaluate(write_run(tmp_path / "run"), refine=True, cache=tmp_path)

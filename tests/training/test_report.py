@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from curio_train import cli
+from curio_train.commands import cli
 from curio_train.config import WorldOptions
 from curio_train.errors import ReportError
 from curio_train.evaluation.evaluate import evaluate

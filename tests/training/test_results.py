@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from curio_train.cli import _parse
+from curio_train.commands.cli import _parse
 from curio_train.errors import DataError
-from curio_train.evaluation.captures_table import PAPER
-from curio_train.evaluation.results import collect, load_results, merge, save_results
-from curio_train.evaluation.results_tables import markdown, plot
-from curio_train.learning.configuration import to_json
+from curio_train.learning.runs.configuration import to_json
 from curio_train.worlds.options import CaptureOptions
+from paper.captures_table import PAPER
+from paper.results import collect, load_results, merge, save_results
+from paper.results_tables import markdown, plot
 
 ROOT = Path(__file__).parents[2]
 

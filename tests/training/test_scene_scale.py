@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from curio_train import cli
 from curio_train.camera import Intrinsics
 from curio_train.capture.structure import Structure
+from curio_train.commands import cli
 from curio_train.data.bop import BopDataset
 from curio_train.errors import DataError, UsageError
 from curio_train.evaluation.scene_scale import mean_scale, scale_by_objects

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import trimesh
-from curio_train.data.letters import extruded, letter, triangles
-from curio_train.data.meshes import Mesh
-from curio_train.data.shapes import box, capsule, chair, cone, painted, sphere, standing
+from curio_train.meshes.letters import extruded, letter, triangles
+from curio_train.meshes.meshes import Mesh
+from curio_train.meshes.shapes import box, capsule, chair, cone, painted, sphere, standing
 from matplotlib.path import Path
 
 SHAPES = {

@@ -6,13 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from curio_train.capture import stand_in_scenes as scenes
-from curio_train.capture.sensor import Sensor
-from curio_train.capture.stand_in_boards import calibrated, photograph_boards
-from curio_train.capture.stand_ins import Amount, make
-from curio_train.data.meshes import load_mesh
 from curio_train.errors import DataError, UsageError
+from curio_train.meshes.meshes import load_mesh
 from scipy.spatial.transform import Rotation
+from synthetic_captures import scenes
+from synthetic_captures.boards import calibrated, photograph_boards
+from synthetic_captures.captures import Amount, make
+from synthetic_captures.sensor import Sensor
 
 AMOUNT = Amount(num_photos=3, num_tests=1, samples_per_pixel=8)
 

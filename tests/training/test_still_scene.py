@@ -8,17 +8,18 @@ import pytest
 import torch
 from curio_train.camera import Intrinsics
 from curio_train.data.backgrounds import ClutterBackgrounds
-from curio_train.data.shapes import chair
+from curio_train.data.photographs import CameraPoses
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
+from curio_train.meshes.shapes import chair
 from curio_train.metrics.poses import symmetry_poses
+from curio_train.refinement.multi_view import agreed, estimate_scale
+from curio_train.refinement.pseudo_labels import MIN_CONSENSUS, PseudoLabels
+from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.gaze import SYMMETRY_STEP, GazeWorld
-from curio_train.worlds.lessons import FEWEST_AGREED, Lessons
-from curio_train.worlds.linemod import LinemodGaze
-from curio_train.worlds.refinement import Refinement
-from curio_train.worlds.single_object import Object
-from curio_train.worlds.still_scene import Cameras, agreed, told_scale
+from curio_train.worlds.single_object.linemod import TwoStageLinemod
+from curio_train.worlds.single_object.two_stage import SYMMETRY_STEP, TwoStageWorld
+from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -35,12 +36,12 @@ def thing() -> Object:
 
 
 @pytest.fixture(scope="module")
-def world() -> GazeWorld:
-    return GazeWorld("linemod", thing())
+def world() -> TwoStageWorld:
+    return TwoStageWorld("linemod", thing())
 
 
 @pytest.fixture(scope="module")
-def truth(world: GazeWorld) -> SceneCode:
+def truth(world: TwoStageWorld) -> SceneCode:
     code = world.sample(NUM, (1,))
     code[TRANSLATION][..., :2] *= 0.5
     code[LIGHT] = torch.tensor([[0.2, -0.5, -0.6]]).expand(NUM, 3)
@@ -48,7 +49,7 @@ def truth(world: GazeWorld) -> SceneCode:
 
 
 @pytest.fixture(scope="module")
-def frames(world: GazeWorld, truth: SceneCode) -> Tensor:
+def frames(world: TwoStageWorld, truth: SceneCode) -> Tensor:
     behind = world.backgrounds(Path()).draw(NUM, 640, 480, (2,))
     return (world.render(truth, behind).clamp(0, 1) * 255).round().byte()
 
@@ -74,10 +75,17 @@ def roughly(code: SceneCode, turned: tuple[int, ...] = FLIPPED) -> dict[str, Ten
     return dict(code) | {TRANSLATION: code[TRANSLATION] * far, ROTATION_6D: six}
 
 
-def agree(world: GazeWorld, frames: Tensor, matrices: np.ndarray, read: SceneCode) -> tuple[dict[str, Tensor], Tensor]:
+def agree(
+    world: TwoStageWorld, frames: Tensor, matrices: np.ndarray, read: SceneCode
+) -> tuple[dict[str, Tensor], Tensor]:
     symmetries = symmetry_poses(world.object.kind.info, SYMMETRY_STEP)
     return agreed(
-        Refinement(world), frames, Cameras(matrices), read, (read, torch.ones(NUM, dtype=torch.bool)), symmetries
+        RenderAndCompare(world),
+        frames,
+        CameraPoses(matrices),
+        read,
+        (read, torch.ones(NUM, dtype=torch.bool)),
+        symmetries,
     )
 
 
@@ -87,7 +95,7 @@ def errors(found: SceneCode, true: SceneCode) -> tuple[Tensor, Tensor]:
     return rotation_angle_deg(*pair), (found[TRANSLATION] - true[TRANSLATION])[:, 0, 2].abs()
 
 
-def test_what_most_read_rightly_corrects_the_others(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+def test_what_most_read_rightly_corrects_the_others(world: TwoStageWorld, truth: SceneCode, frames: Tensor) -> None:
     read = roughly(truth)
     code, chosen = agree(world, frames, cameras(truth), read)
     assert chosen.sum() >= NUM - 2
@@ -99,7 +107,9 @@ def test_what_most_read_rightly_corrects_the_others(world: GazeWorld, truth: Sce
     assert set(code) == set(read)
 
 
-def test_metres_correct_what_an_object_is_read_too_far_by(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+def test_metres_correct_what_an_object_is_read_too_far_by(
+    world: TwoStageWorld, truth: SceneCode, frames: Tensor
+) -> None:
     """All readings err to one side, and the scale that they tell with them; another scale says so."""
     read = roughly(truth)
     read[TRANSLATION] = read[TRANSLATION] * 1.04
@@ -107,22 +117,28 @@ def test_metres_correct_what_an_object_is_read_too_far_by(world: GazeWorld, trut
     metres[:, :3, 3] *= SCALE
     taken = torch.ones(NUM, dtype=torch.bool)
     off = []
-    for where in (Cameras(of_any_scale), Cameras(metres, in_metres=True)):
-        code, chosen = agreed(Refinement(world), frames, where, read, (read, taken), [Pose(np.eye(3), np.zeros(3))])
+    for where in (CameraPoses(of_any_scale), CameraPoses(metres, in_metres=True)):
+        code, chosen = agreed(
+            RenderAndCompare(world), frames, where, read, (read, taken), [Pose(np.eye(3), np.zeros(3))]
+        )
         assert chosen.sum() >= NUM - 4
         off.append((code[TRANSLATION][chosen, 0, 2] / truth[TRANSLATION][chosen, 0, 2]).log().median())
     assert off[0] == pytest.approx(np.log(1.04), abs=0.01)
     assert off[1] == pytest.approx(0, abs=0.01)
 
 
-def test_an_object_that_is_read_tells_the_scale(world: GazeWorld, truth: SceneCode) -> None:
+def test_an_object_that_is_read_tells_the_scale(world: TwoStageWorld, truth: SceneCode) -> None:
     taken = torch.ones(NUM, dtype=torch.bool)
     diameter_m = world.object.kind.diameter_m
-    assert told_scale(Cameras(cameras(truth)), roughly(truth), taken, diameter_m) == pytest.approx(SCALE, rel=0.03)
-    assert told_scale(Cameras(cameras(truth)), world.sample(NUM, (9,)), taken, diameter_m) is None
+    assert estimate_scale(CameraPoses(cameras(truth)), roughly(truth), taken, diameter_m) == pytest.approx(
+        SCALE, rel=0.03
+    )
+    assert estimate_scale(CameraPoses(cameras(truth)), world.sample(NUM, (9,)), taken, diameter_m) is None
 
 
-def test_photographs_whose_camera_is_unknown_teach_nothing(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+def test_photographs_whose_camera_is_unknown_teach_nothing(
+    world: TwoStageWorld, truth: SceneCode, frames: Tensor
+) -> None:
     matrices = cameras(truth)
     matrices[3:6] = np.nan
     _, chosen = agree(world, frames, matrices, roughly(truth))
@@ -130,7 +146,9 @@ def test_photographs_whose_camera_is_unknown_teach_nothing(world: GazeWorld, tru
     assert chosen.sum() >= NUM - 5
 
 
-def test_an_object_that_was_moved_has_a_pose_at_each_place(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+def test_an_object_that_was_moved_has_a_pose_at_each_place(
+    world: TwoStageWorld, truth: SceneCode, frames: Tensor
+) -> None:
     """The second half of the photographs was taken after it had been put elsewhere."""
     matrices = cameras(truth)
     matrices[NUM // 2 :] = cameras(truth, (-0.4, 0.1, 0.2))[NUM // 2 :]
@@ -141,18 +159,20 @@ def test_an_object_that_was_moved_has_a_pose_at_each_place(world: GazeWorld, tru
     assert degrees[chosen].max() < 7
 
 
-def test_readings_that_do_not_agree_teach_nothing(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+def test_readings_that_do_not_agree_teach_nothing(world: TwoStageWorld, truth: SceneCode, frames: Tensor) -> None:
     elsewhere = world.sample(NUM, (9,))
     _, chosen = agree(world, frames, cameras(truth), elsewhere)
     assert not chosen.any()
 
 
-def test_lessons_are_of_agreed_poses_where_the_camera_moved(world: GazeWorld, truth: SceneCode, frames: Tensor) -> None:
+def test_lessons_are_of_agreed_poses_where_the_camera_moved(
+    world: TwoStageWorld, truth: SceneCode, frames: Tensor
+) -> None:
     read = roughly(truth)
     reader = iter([dict(read)])  # photographs are read once, all together: there are fewer than are read at once
-    lessons = Lessons.of_own_reading(world, frames, lambda _: next(reader), Cameras(cameras(truth)))
+    lessons = PseudoLabels.from_predictions(world, frames, lambda _: next(reader), CameraPoses(cameras(truth)))
     assert lessons is not None
-    assert len(lessons) >= FEWEST_AGREED
+    assert len(lessons) >= MIN_CONSENSUS
     taught = matrix_from_rotation_6d(lessons._code[ROTATION_6D][:, 0])
     true = matrix_from_rotation_6d(truth[ROTATION_6D][:, 0])
     nearest = rotation_angle_deg(taught[:, None].expand(-1, NUM, 3, 3), true.expand(len(taught), NUM, 3, 3))
@@ -169,5 +189,5 @@ def test_photographs_without_texture_teach_one_by_one_and_say_why(
     for number in range(4):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((480, 640, 3), 40 * number, np.uint8))
     with caplog.at_level(logging.WARNING):
-        assert LinemodGaze(thing(), tmp_path).cameras(sorted(tmp_path.iterdir())) is None
+        assert TwoStageLinemod(thing(), tmp_path).cameras(sorted(tmp_path.iterdir())) is None
     assert "teach one by one" in caplog.text

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from curio_train import cli
 from curio_train.camera import Intrinsics, load_intrinsics
 from curio_train.capture.ground import scale_by_distance, scale_by_height, to_world
 from curio_train.capture.structure import Structure, every_nth, recover
+from curio_train.commands import cli
 from curio_train.errors import CameraError, DataError
 from curio_train.geometry import camera_looking_at
 from scipy.spatial.transform import Rotation

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from curio_train.data import shapes
 from curio_train.data.bop import BopDataset
-from curio_train.data.meshes import Mesh
-from curio_train.data.symmetries import find_symmetries
+from curio_train.meshes import shapes
+from curio_train.meshes.meshes import Mesh
+from curio_train.meshes.symmetries import find_symmetries
 from scipy.spatial.transform import Rotation
 
 LARGEST_DISAGREEMENT = 0.03

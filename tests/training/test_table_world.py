@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train import cli
+from curio_train.commands import cli
 from curio_train.config import METHODS, NetworkConfig, Recipe, RunConfig
-from curio_train.data.meshes import load_mesh
 from curio_train.doctor.before_training import refuse_unfit
 from curio_train.errors import CameraError, DataError, UsageError
-from curio_train.evaluation.captures_table import markdown, row
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.photographed import judge
-from curio_train.export import export
+from curio_train.export.graph import export
 from curio_train.geometry import camera_looking_at
-from curio_train.learning.configuration import load_config
 from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import ranks
+from curio_train.learning.runs.configuration import load_config
+from curio_train.meshes.meshes import load_mesh
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.table import Table
+from curio_train.worlds.tabletop.world import Table
+from paper.captures_table import markdown, row
 
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT, NUM = 96, 72, 12
@@ -169,12 +169,12 @@ def test_a_few_steps_bring_photographs_or_dreams_nearer(world: Table, folder: Pa
 
         def image_error() -> float:
             with torch.no_grad():
-                read = trainer.state.looks[0](source.images / 255)
+                read = trainer.state.stages[0](source.images / 255)
                 return float((world.compared(world.render(read)) - world.compared(source.images / 255)).square().mean())
 
         def dream_error() -> float:
             with torch.no_grad():
-                return float(world.code_loss(trainer.state.looks[0](world.render(fixed)), fixed))
+                return float(world.code_loss(trainer.state.stages[0](world.render(fixed)), fixed))
 
         error = image_error if "image" in METHODS[method] else dream_error
         before = error()
@@ -308,7 +308,7 @@ def call(*words: object) -> int:
 
 def test_from_files_to_a_model_by_a_project_file(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The whole way, three steps long: train, resume, judge, export, and a row of the table."""
-    monkeypatch.setattr("curio_train.worlds.stored.NUM_IMAGES", {"train": 4, "validation": 4, "test": 4})
+    monkeypatch.setattr("curio_train.worlds.image_sets.NUM_IMAGES", {"train": 4, "validation": 4, "test": 4})
     project = folder / "table.toml"
     project.write_text(
         'mesh = ["wedge.stl"]\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "a"\nbackground = "plate-a.png"\n'

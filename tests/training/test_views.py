@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train import cli
-from curio_train.views.scenes import mesh_world
+from curio_train.commands import cli
+from curio_train.drawing.scenes import mesh_world
 
 WIDTH, HEIGHT = 64, 48
 MATRIX = [[70.0, 0.0, 30.0], [0.0, 66.0, 25.0], [0.0, 0.0, 1.0]]

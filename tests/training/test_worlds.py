@@ -17,8 +17,8 @@ from curio_train.learning.parallel import Ranks
 from curio_train.metrics.assignment import scene_error
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW, index
 from curio_train.worlds import WORLDS, build
-from curio_train.worlds.mesh_world import MeshWorld
-from curio_train.worlds.stored import StoredImages
+from curio_train.worlds.generated.mesh_world import MeshWorld
+from curio_train.worlds.image_sets import StoredImages
 from torch import Tensor
 
 NAMES = ("spheres", "chairs", "varied", "multi", "light")
@@ -283,7 +283,7 @@ def reading_error(world: MeshWorld, trainer: Trainer) -> Callable[[], float]:
 
     @torch.no_grad()
     def error() -> float:
-        network = copy.deepcopy(trainer.state.looks[0])  # normalises by this batch, and the statistics of runs stay
+        network = copy.deepcopy(trainer.state.stages[0])  # normalises by this batch, and the statistics of runs stay
         return scene_error(world.layout, network(images), code, groups).mean().item()
 
     return error

@@ -174,7 +174,7 @@ def _pixel_centres(like: Tensor, width: int, height: int) -> Tensor:
     return torch.stack([u, v, torch.ones_like(u)], dim=-1).flatten(0, 1)
 
 
-class Gaze(NamedTuple):
+class CropCamera(NamedTuple):
     """A virtual camera at the same place that looks at one point: a perspective-correct crop.
 
     Attributes:
@@ -188,12 +188,12 @@ class Gaze(NamedTuple):
     homography: Tensor
 
 
-def gaze_at(
+def crop_camera_at(
     direction: Float[Tensor, "batch 3"],
     focal_px: Float[Tensor, " batch"],
     size: int,
     matrix: Float[Tensor, "batch 3 3"],
-) -> Gaze:
+) -> CropCamera:
     """The camera that looks along ``direction`` with the smallest turn from the frame's optical axis.
 
     Args:
@@ -208,11 +208,11 @@ def gaze_at(
     centre = torch.full_like(focal_px, (size - 1) / 2)
     rows = [focal_px, zero, centre, zero, focal_px, centre, zero, zero, one]
     crop = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
-    return Gaze(rotation, crop, crop @ rotation @ inverse(matrix))
+    return CropCamera(rotation, crop, crop @ rotation @ inverse(matrix))
 
 
 def sampling_grid(
-    gaze: Gaze, matrix: Float[Tensor, "batch 3 3"], size: int, frame_width: int, frame_height: int
+    gaze: CropCamera, matrix: Float[Tensor, "batch 3 3"], size: int, frame_width: int, frame_height: int
 ) -> Float[Tensor, "batch {size} {size} 2"]:
     """Where ``grid_sample(frame, grid, align_corners=False)`` must look for each pixel of the crop.
 

@@ -15,7 +15,7 @@ from curio_train.errors import UsageError
 Term = Literal["image", "curiosity", "sleep", "label"]
 Method = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic"]
 Preset = Literal["laptop", "paper"]
-Reading = Literal["whole", "cells"]
+DecoderKind = Literal["whole", "cells"]
 
 METHODS: Mapping[Method, frozenset[Term]] = {
     "our": frozenset({"image", "curiosity"}),
@@ -70,7 +70,7 @@ class NetworkConfig:
     )
     critic: Suppress[ConvStack] = ConvStack((64, 192, 384, 256, 1), (11, 5, 3, 3, 3), (4, 4, 2, 2, 2), (0, 0, 1, 1, 1))
     critic_normalisation: Literal["batch", "instance"] = "batch"
-    reading: Reading | None = None
+    reading: DecoderKind | None = None
     row: int = 32
     hidden: int = 64
 

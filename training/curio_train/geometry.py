@@ -163,7 +163,7 @@ def compose(
 def camera_looking_at(
     eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"]
 ) -> tuple[Float[Tensor, "... 3 3"], Float[Tensor, "... 3"]]:
-    """cam_from_world of an OpenCV camera at ``eye`` (world frame, y up) that looks at ``target`` without roll.
+    """cam_from_world of an OpenCV camera at ``eye`` (world frame, y up) that stages at ``target`` without roll.
 
     Looking straight up or down, where "without roll" means nothing, the image's x axis is the world's.
     """

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train.data.meshes import Mesh
+from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.variant import load_mitsuba
 from scipy.spatial.transform import Rotation
 from torch import Tensor

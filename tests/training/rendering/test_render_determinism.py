@@ -4,7 +4,7 @@ import drjit
 import pytest
 import torch
 from curio_train.scene_code import SceneCode
-from curio_train.worlds.light import Light
+from curio_train.worlds.generated.light import Light
 
 
 @pytest.fixture(scope="module")

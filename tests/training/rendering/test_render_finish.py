@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train.data.meshes import Mesh
-from curio_train.rendering.differences import central_differences, cosine, gradients
-from curio_train.rendering.finish import FINISH_SIZE, NUM_WAVES, finishes, random_finishes
+from curio_train.meshes.meshes import Mesh
+from curio_train.rendering.materials import APPEARANCE_SIZE, NUM_WAVES, finishes, random_appearances
 from curio_train.rendering.renderer import Renderer
+from stock.gradient_check import central_differences, cosine, gradients
 from torch import Tensor
 
 SIZE = 48
@@ -102,10 +102,10 @@ def test_waves_change_what_is_even(ball, kind):
 
 
 def test_random_finishes_differ_and_are_finite(ball):
-    drawn = random_finishes(64, np.random.default_rng(0))
-    assert drawn.shape == (64, 1, FINISH_SIZE)
+    drawn = random_appearances(64, np.random.default_rng(0))
+    assert drawn.shape == (64, 1, APPEARANCE_SIZE)
     assert drawn.isfinite().all()
-    assert torch.equal(drawn, random_finishes(64, np.random.default_rng(0)))
+    assert torch.equal(drawn, random_appearances(64, np.random.default_rng(0)))
     draw = drawer(ball, (0.3, -0.4, -0.5))
     images = torch.stack([draw(one[None]) for one in drawn[:16]])
     assert images.isfinite().all()
@@ -117,7 +117,7 @@ def test_gradients_by_light_and_colour_equal_differences(meshes, draw, camera_ma
     codes = draw(16, 1, 5)
     size = codes.backgrounds.shape[-1]
     renderer = Renderer([meshes["root"]], [0], size, size, ambient=0.3, samples_per_pixel=16)
-    finish = random_finishes(16, np.random.default_rng(1))
+    finish = random_appearances(16, np.random.default_rng(1))
     finish[..., SHADOW] = 0
     target = torch.full_like(codes.backgrounds, 0.5)
 

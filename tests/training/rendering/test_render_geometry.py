@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train.data.meshes import Mesh
+from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.bounds import enclosing_polytope, project_bounds
-from curio_train.rendering.edges import build_edges
+from curio_train.rendering.instances import Instances
 from curio_train.rendering.renderer import Renderer
-from curio_train.rendering.rows import Rows
+from curio_train.rendering.silhouette_edges import build_edges
 from curio_train.rendering.topology import adjacency, smooth_normals
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -58,7 +58,7 @@ def test_edge_search_finds_every_silhouette_edge(meshes, name: str) -> None:
         None,
         None,
     )
-    rows = Rows(setting.mi, setting.dr, setting.mi.Float(values.reshape(-1)), None)
+    rows = Instances(setting.mi, setting.dr, setting.mi.Float(values.reshape(-1)), None)
     row, edge = (found.numpy() for found in setting.outlines.search.find(rows, 16))
     start, end = (setting.outlines.search.edges[name].numpy().reshape(-1, 3)[edge] for name in ("start", "end"))
     found = np.bincount(row[(start != end).any(1)], minlength=16)  # clusters are filled up with edges of length zero

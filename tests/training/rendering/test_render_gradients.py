@@ -6,9 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from curio_train.data.meshes import Mesh
-from curio_train.rendering.differences import TURN, central_differences, cosine, gradients, turned
+from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.renderer import Renderer
+from stock.gradient_check import TURN, central_differences, cosine, gradients, turned
 from torch import Tensor
 
 NUM_CODES = 64

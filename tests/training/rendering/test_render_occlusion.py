@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from curio_train.data.meshes import Mesh
+from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.renderer import Renderer
 from curio_train.rendering.stock import PosedMesh, emitters, load_scene, sensor
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train.data.meshes import Mesh, load_mesh
+from curio_train.meshes.meshes import Mesh, load_mesh
 from curio_train.rendering.renderer import Renderer
 from curio_train.rendering.stock import OPENCV_AXES, PosedMesh, emitters, load_scene, sensor
 from PIL import Image

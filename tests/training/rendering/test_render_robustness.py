@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from curio_train.data.meshes import Mesh
 from curio_train.errors import RendererError
+from curio_train.meshes.meshes import Mesh
 from curio_train.rendering import renderer as renderer_module
 from curio_train.rendering.renderer import Renderer
 

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from curio_train.data.meshes import Mesh
-from curio_train.rendering.beauty import ground_disk
-from curio_train.rendering.differences import TURN, central_differences, cosine, gradients, turned
+from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.ground import Ground
+from curio_train.rendering.path_tracing import ground_disk
 from curio_train.rendering.renderer import Renderer
 from curio_train.rendering.stock import PosedMesh, emitters, load_scene, sensor
 from scipy.spatial.transform import Rotation
+from stock.gradient_check import TURN, central_differences, cosine, gradients, turned
 
 SIZE, FINER = 64, 8
 MATRIX = np.array([[70.0, 0, 30], [0, 70.0, 26], [0, 0, 1]])

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from curio_train.data.meshes import Mesh
-from curio_train.data.simplification import simplified
+from curio_train.meshes.meshes import Mesh
+from curio_train.meshes.simplification import simplified
 from curio_train.rendering import renderer as renderer_module
-from curio_train.rendering.differences import TURN, cosine, gradients, turned
 from curio_train.rendering.renderer import MIN_FACES, Renderer
+from stock.gradient_check import TURN, cosine, gradients, turned
 from torch import Tensor
 
 Moved = dict[str, Tensor]

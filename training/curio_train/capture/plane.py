@@ -24,7 +24,7 @@ _LEAST_SHARE = 0.002  # of the frame
 
 
 @dataclass(frozen=True, eq=False)
-class CameraPlaces:
+class CameraPoseFile:
     """The file of ``--plane`` and ``--views``: ``{"a.png": {"cam_from_world": [4x4], "plate": "plates/a.png"}, …}``.
 
     Photographs are named by their path from the file's folder, or by their file name. Those of a camera that moves may
@@ -41,7 +41,7 @@ class CameraPlaces:
     flag: str = "--plane"
 
     @classmethod
-    def read(cls, file: Path, flag: str = "--plane") -> "CameraPlaces":
+    def read(cls, file: Path, flag: str = "--plane") -> "CameraPoseFile":
         """Read the file.
 
         Raises:

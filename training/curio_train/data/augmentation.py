@@ -18,7 +18,7 @@ _VALUES_AT_ONCE = 2**17  # half a megabyte: what lies between two operations sta
 
 
 @dataclass(frozen=True)
-class Disturbance:
+class AugmentationStrength:
     """How much pictures are disturbed: each by amounts drawn evenly from these ranges.
 
     Attributes:
@@ -46,7 +46,7 @@ class Disturbance:
     noise: float
 
 
-UNKNOWN_SCENE = Disturbance(
+UNKNOWN_SCENE = AugmentationStrength(
     occluded=0.5,
     shade=0.45,
     gamma=0.35,
@@ -60,7 +60,7 @@ UNKNOWN_SCENE = Disturbance(
 )
 """Any camera, any light: colours hardly count, shapes do."""
 
-WHOLE_FRAME = Disturbance(
+WHOLE_FRAME = AugmentationStrength(
     occluded=0.5,
     shade=0.25,
     gamma=0.2,
@@ -74,7 +74,7 @@ WHOLE_FRAME = Disturbance(
 )
 """The same where an object is a few pixels in clutter: its colour is what tells it from other things."""
 
-KNOWN_SCENE = Disturbance(
+KNOWN_SCENE = AugmentationStrength(
     occluded=0.25,
     shade=0.15,
     gamma=0.1,
@@ -102,8 +102,8 @@ class _Amounts(NamedTuple):
     noise_place: Tensor  # [batch]
 
 
-def disturb(
-    images: Float[Tensor, "batch 3 height width"], random: np.random.Generator, most: Disturbance
+def augment(
+    images: Float[Tensor, "batch 3 height width"], random: np.random.Generator, most: AugmentationStrength
 ) -> Float[Tensor, "batch 3 height width"]:
     """Pictures as a camera on a cluttered desk might take them; each is disturbed by amounts of its own.
 
@@ -124,7 +124,7 @@ def disturb(
     return images
 
 
-def _draw(images: Tensor, random: np.random.Generator, most: Disturbance) -> _Amounts:
+def _draw(images: Tensor, random: np.random.Generator, most: AugmentationStrength) -> _Amounts:
     count, _, height, width = images.shape
 
     def even(low: float, high: float, *shape: int) -> Tensor:

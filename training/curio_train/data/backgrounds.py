@@ -19,12 +19,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from curio_train.data.leaves import scatter_leaves
-from curio_train.data.meshes import Mesh
+from curio_train.data.clutter import dead_leaves_texture
 from curio_train.data.photographs import Photographs
-from curio_train.data.shapes import box, capsule, cone, sphere
 from curio_train.errors import DataError
 from curio_train.geometry import random_rotations
+from curio_train.meshes.meshes import Mesh
+from curio_train.meshes.shapes import box, capsule, cone, sphere
 from curio_train.rendering.renderer import Renderer
 
 POOL_SIZE = 240
@@ -212,7 +212,7 @@ def _desk(random: np.random.Generator) -> np.ndarray:
         shared += cv2.resize(grid, (POOL_WIDTH, POOL_HEIGHT), interpolation=cv2.INTER_CUBIC) / np.sqrt(octave)
     image += shared[..., None] * random.uniform(0.3, 1.0, 3).astype(np.float32)
     np.clip(image, 0, 1, out=image)
-    scatter_leaves(image, random)
+    dead_leaves_texture(image, random)
     return image
 
 

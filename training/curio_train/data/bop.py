@@ -18,9 +18,9 @@ from PIL import Image
 
 from curio_train.camera import Intrinsics, check_matrix, load_intrinsics
 from curio_train.data.bop_json import Record, read_records
-from curio_train.data.meshes import METRES, Mesh, load_mesh
 from curio_train.errors import DataError, UsageError
 from curio_train.geometry import Pose
+from curio_train.meshes.meshes import METRES, Mesh, load_mesh
 
 LINEMOD_IDS: Mapping[str, int] = {
     "ape": 1,

@@ -1,6 +1,6 @@
 """What colour a part has whose CAD file says none: where photographs of it differ from the empty scene's.
 
-No label is needed (:mod:`~curio_train.data.plate_difference`). A colour is believed where the photographs agree on it.
+No label is needed (:mod:`~curio_train.data.background_difference`). A colour is believed where photographs agree on it.
 """
 
 from collections.abc import Sequence
@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from curio_train.camera import Intrinsics
-from curio_train.data.meshes import Mesh
+from curio_train.color import linear_from_srgb, srgb_from_linear
+from curio_train.data.background_difference import compare
 from curio_train.data.photographs import Photographs, read_frame, read_frames
-from curio_train.data.plate_difference import compare
-from curio_train.rendering.color import linear_from_srgb, srgb_from_linear
+from curio_train.meshes.meshes import Mesh
 
 _WIDTH_PX = 160
 _MOST_COMPARED = 64

@@ -7,13 +7,49 @@ import copy
 import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 from PIL import Image
 
 from curio_train.camera import Intrinsics
 from curio_train.errors import DataError
+
+
+class CameraPoses(NamedTuple):
+    """Poses of the camera that took some photographs of one scene.
+
+    Attributes:
+        cam_from_world: Rigid, [num, 4, 4]; NaN for photographs whose camera pose is unknown.
+        in_metres: Whether translations are in metres; else the scene has an arbitrary scale.
+    """
+
+    cam_from_world: Float[np.ndarray, "num 4 4"]
+    in_metres: bool = False
+
+    @property
+    def known(self) -> Bool[np.ndarray, " num"]:
+        """Whether each photograph's camera pose is known."""
+        known: np.ndarray = np.isfinite(self.cam_from_world).all(axis=(1, 2))
+        return known
+
+
+class UnlabelledPhotographs(NamedTuple):
+    """Photographs that a world offers for self-training.
+
+    Attributes:
+        paths: Their files; at most :data:`MAX_UNLABELLED`.
+        cameras: Where the camera stood for each; None if unknown.
+    """
+
+    paths: Sequence[Path]
+    cameras: CameraPoses | None = None
+
+
+MAX_UNLABELLED = 300
+"""Self-training keeps photographs in memory and refines the pose in each, which takes a sixth of a second."""
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
@@ -176,3 +212,8 @@ class Photographs:
         shrinking = columns >= width and rows >= height
         interpolation = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
         return cv2.resize(np.ascontiguousarray(region), (width, height), interpolation=interpolation)
+
+
+def spread(paths: Sequence[Path], count: int) -> list[Path]:
+    """At most ``count`` of the paths, evenly spaced over all of them."""
+    return [paths[number] for number in np.unique(np.linspace(0, len(paths) - 1, count).astype(int))] if paths else []

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from curio_train.camera import Intrinsics
-from curio_train.data.meshes import Mesh, Unit, load_mesh
-from curio_train.data.symmetries import find_symmetries
 from curio_train.doctor.background import examine_background
 from curio_train.doctor.camera_file import examine_camera
 from curio_train.doctor.finding import Finding
@@ -16,6 +14,8 @@ from curio_train.doctor.mesh_file import examine_mesh
 from curio_train.doctor.model import examine_model
 from curio_train.doctor.photographs import examine_photographs
 from curio_train.errors import DataError
+from curio_train.meshes.meshes import Mesh, Unit, load_mesh
+from curio_train.meshes.symmetries import find_symmetries
 
 
 @dataclass(frozen=True)

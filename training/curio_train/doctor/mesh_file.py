@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from curio_train.data.meshes import METRES, Mesh, Unit, load_mesh
-from curio_train.data.symmetries import Symmetries, find_symmetries
 from curio_train.doctor.finding import Finding
 from curio_train.doctor.surface import examine_surface
 from curio_train.errors import CurioError
+from curio_train.meshes.meshes import METRES, Mesh, Unit, load_mesh
+from curio_train.meshes.symmetries import Symmetries, find_symmetries
 
 # What people hold before a camera; outside it a unit was probably mistaken, though such things exist.
 _USUAL_M = (0.01, 3.0)

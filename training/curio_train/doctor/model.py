@@ -7,11 +7,11 @@ import numpy as np
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_train.camera import Intrinsics
-from curio_train.data.meshes import METRES, Mesh
 from curio_train.doctor.finding import Finding
 from curio_train.errors import CurioError
-from curio_train.model_folder import find_model
-from curio_train.onnx_file import OnnxModel
+from curio_train.export.folder import find_model
+from curio_train.export.onnx import OnnxModel
+from curio_train.meshes.meshes import METRES, Mesh
 
 _SAME_SIZE = 0.01
 _OTHER_VIEW = 2.0

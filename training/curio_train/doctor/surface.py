@@ -7,8 +7,8 @@ import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from curio_train.data.meshes import Mesh
 from curio_train.doctor.finding import Finding, Sureness
+from curio_train.meshes.meshes import Mesh
 
 # Scanned meshes in daily use have a few of each (up to 0.1 %); one in a hundred is somebody's mistake.
 _FEW = 0.01

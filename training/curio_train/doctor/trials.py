@@ -5,11 +5,11 @@ import time
 import numpy as np
 import torch
 
-from curio_train.data.shapes import box, sphere
 from curio_train.errors import RendererError
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.learning.losses import image_loss
-from curio_train.networks.pose import PoseNetwork
+from curio_train.meshes.shapes import box, sphere
+from curio_train.networks.paper.pose import PoseNetwork
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, Field, Layout
 

@@ -25,11 +25,11 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from curio_train.data.plate_difference import compare
+from curio_train.data.background_difference import compare
 from curio_train.metrics.images import blurred
+from curio_train.refinement.inpainting import filled_in
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
-from curio_train.worlds.inpainting import filled_in
 
 _TOLERANCE = 0.15  # sRGB; of 0.06, 0.1 and 0.15 the one that told right from wrong best
 _AROUND = 12 / 256  # of the frame's width: how far around the silhouette; 6 / 256 told less
@@ -84,7 +84,7 @@ def inside(photographs: Tensor, drawing: Drawing, backgrounds: Tensor) -> Float[
 def explained(photographs: Tensor, drawing: Drawing) -> Float[Tensor, " num"]:
     """Share of what the surroundings, continued, do not explain of photographs and the drawing does; 0 at worst.
 
-    Differences are robust (Geman and McClure 1987), as in :mod:`~curio_train.worlds.refinement`.
+    Differences are robust (Geman and McClure 1987), as in :mod:`~curio_train.refinement.render_and_compare`.
 
     Args:
         photographs: [num, 3, height, width], sRGB in [0, 1].

@@ -15,15 +15,15 @@ from curio_train.evaluation.real_frames import evaluate_real_frames
 from curio_train.evaluation.report import write_report
 from curio_train.evaluation.scores import add_errors, pose_scores, scene_errors, scene_scores
 from curio_train.evaluation.subject import Predict, Subject, load_subject
-from curio_train.learning.configuration import CONFIG_FILE, world_name
-from curio_train.learning.initial import uses_synthetic_labels
-from curio_train.learning.provenance import machine
-from curio_train.metrics.certainty import calibration_error, separation
+from curio_train.export.card import EVALUATION_FILE
+from curio_train.learning.runs.configuration import CONFIG_FILE, world_name
+from curio_train.learning.runs.initial import uses_synthetic_labels
+from curio_train.learning.runs.provenance import machine
+from curio_train.metrics.certainty import auroc, calibration_error
 from curio_train.metrics.poses import ADD_THRESHOLD
-from curio_train.model_card import EVALUATION_FILE
+from curio_train.refinement.render_and_compare import refined
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
 from curio_train.worlds.base import Split, World
-from curio_train.worlds.refinement import refined
 
 _BATCH_SIZE = 50
 _NUM_EMPTY = 100
@@ -65,7 +65,7 @@ def evaluate(
         num_images: How many; of a finite set at most all.
         data: A BOP data set whose real frames are scored as well, in the LineMOD world.
         bop_results: Folder for a results file of those frames in BOP's format.
-        refine: Score the poses once more after :class:`~curio_train.worlds.refinement.Refinement`.
+        refine: Score the poses once more after :class:`~curio_train.refinement.render_and_compare.RenderAndCompare`.
         cache: Where worlds keep their image sets.
         progress: Told what is being done.
         warn: Told why photographs could not be judged by, or a report not written: no evaluation is thrown away for
@@ -159,7 +159,7 @@ def certainty(world: World, predicted: SceneCode, true: SceneCode, on_empty: Sce
     confidences, without = (code[CONFIDENCE].flatten().tolist() for code in (predicted, on_empty))
     return {
         "confidence_ece": calibration_error(confidences, [error < ADD_THRESHOLD for error in errors]),
-        "present_auroc": separation(confidences, without),
+        "present_auroc": auroc(confidences, without),
     }
 
 

@@ -126,11 +126,11 @@ def estimate_frames(subject: Subject, dataset: BopDataset, targets: Sequence[Ann
 
 def _estimates(subject: Subject, frames: Sequence[Frame]) -> Iterator[Estimate]:
     start = time.perf_counter()
-    looks = [look(read_photograph(frame.path), frame.matrix, subject.world.camera) for frame in frames]
-    images = torch.from_numpy(np.stack([image for image, _ in looks])).permute(0, 3, 1, 2).contiguous()
+    stages = [look(read_photograph(frame.path), frame.matrix, subject.world.camera) for frame in frames]
+    images = torch.from_numpy(np.stack([image for image, _ in stages])).permute(0, 3, 1, 2).contiguous()
     code = subject.predict(images)
     seconds = (time.perf_counter() - start) / len(frames)
-    for number, (frame, (_, canonical_from_cam), seen) in enumerate(zip(frames, looks, poses(code), strict=True)):
+    for number, (frame, (_, canonical_from_cam), seen) in enumerate(zip(frames, stages, poses(code), strict=True)):
         back = canonical_from_cam.T
         confidence = float(code[CONFIDENCE][number, 0]) if CONFIDENCE in code else 1.0
         yield Estimate(frame, Pose(back @ seen.rotation, back @ seen.translation_m), confidence, seconds)

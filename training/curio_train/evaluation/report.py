@@ -19,10 +19,10 @@ from curio_train.evaluation import report_figures as figures
 from curio_train.evaluation.photographed import Judgement, judge
 from curio_train.evaluation.subject import Subject, load_subject
 from curio_train.evaluation.tables import label
-from curio_train.learning.checkpoint import CONFIG_FILE
-from curio_train.learning.configuration import world_name
-from curio_train.learning.progress import read_history
-from curio_train.learning.provenance import Sitting, sittings
+from curio_train.learning.runs.checkpoint import CONFIG_FILE
+from curio_train.learning.runs.configuration import world_name
+from curio_train.learning.runs.progress import read_history
+from curio_train.learning.runs.provenance import RunSession, run_sessions
 from curio_train.metrics.images import dssim
 from curio_train.worlds.base import Split
 
@@ -94,12 +94,12 @@ def _page(
     rendered = world.render(code, batch.backgrounds).clamp(0, 1)
     columns = (batch.images, rendered, world.novel_view(code).clamp(0, 1))
     shown = errors or {"image_dssim": dssim(rendered, batch.images)}
-    made, judgement = sittings(run), judge(world, subject.predict)
+    made, judgement = run_sessions(run), judge(world, subject.predict)
     pages = Environment(loader=PackageLoader("curio_train.evaluation", ""), autoescape=True)
     return pages.get_template("report.html.jinja").render(
         title=f"{world_name(config)}, {config.method}, seed {config.seed}",
         facts=_facts(subject, made),
-        sittings=made,
+        run_sessions=made,
         split=split,
         num_images=evaluation["num_images"] if evaluation else len(batch.images),
         samples=figures.samples([column[:_NUM_SAMPLES] for column in columns]),
@@ -118,7 +118,7 @@ def _judged(judgement: Judgement) -> str:
     return figures.samples(columns, tuple(judgement.columns), judgement.captions[:_NUM_PHOTOGRAPHS])
 
 
-def _facts(subject: Subject, made: list[Sitting]) -> dict[str, str]:
+def _facts(subject: Subject, made: list[RunSession]) -> dict[str, str]:
     """What was done, when, where and with what."""
     minutes = subject.training_seconds / 60
     rate = subject.images_seen / max(subject.training_seconds, 1e-9)

@@ -13,14 +13,14 @@ import torch
 
 from curio_train.capture.ground import scaled
 from curio_train.capture.structure import Structure
-from curio_train.data.photographs import read_frames
+from curio_train.data.photographs import CameraPoses, read_frames, spread
 from curio_train.errors import DataError, UsageError
-from curio_train.evaluation.linemod_table import candidates
+from curio_train.evaluation.candidates import candidates
 from curio_train.evaluation.subject import load_subject
-from curio_train.worlds.lessons import read_twice, spread
-from curio_train.worlds.linemod import LinemodGaze
-from curio_train.worlds.refinement import Refinement
-from curio_train.worlds.still_scene import Cameras, told_scale
+from curio_train.refinement.multi_view import estimate_scale
+from curio_train.refinement.pseudo_labels import predict_and_refine
+from curio_train.refinement.render_and_compare import RenderAndCompare
+from curio_train.worlds.single_object.linemod import TwoStageLinemod
 
 MOST_PHOTOGRAPHS = 100
 """More tell little more: what one object errs by is the same in all."""
@@ -73,7 +73,7 @@ def mean_scale(told: Mapping[str, float]) -> tuple[float, str]:
 def _told_by(path: Path, data: Path | None, structure: Structure) -> float | None:
     subject = load_subject(path, data)
     world = subject.world
-    if not isinstance(world, LinemodGaze):
+    if not isinstance(world, TwoStageLinemod):
         raise UsageError(f"{path}: a network of one look (--no-gaze), expected one of two")
     camera = world.object.camera
     if np.abs(camera.matrix - structure.camera.matrix).max() > _SAME_CAMERA * camera.matrix[0, 0]:
@@ -84,6 +84,8 @@ def _told_by(path: Path, data: Path | None, structure: Structure) -> float | Non
     chosen = spread(structure.photographs, MOST_PHOTOGRAPHS)
     matrices = structure.cam_from_world[[structure.photographs.index(photograph) for photograph in chosen]]
     frames = torch.from_numpy(read_frames(chosen, camera, world.camera.width, world.camera.height))
-    refine = Refinement(world)
-    _, refined, taken = read_twice(refine, frames, lambda images: subject.predict((images * 255).round().byte()))
-    return told_scale(Cameras(matrices), refined, taken, refine.diameter_m)
+    refine = RenderAndCompare(world)
+    _, refined, taken = predict_and_refine(
+        refine, frames, lambda images: subject.predict((images * 255).round().byte())
+    )
+    return estimate_scale(CameraPoses(matrices), refined, taken, refine.diameter_m)

@@ -12,12 +12,12 @@ from torch import Tensor, nn
 
 from curio_train.config import RunConfig
 from curio_train.errors import ExportError, UsageError
-from curio_train.learning.checkpoint import RunFolder
-from curio_train.learning.configuration import CONFIG_FILE, from_json
-from curio_train.learning.provenance import sittings
+from curio_train.export.folder import find_model
+from curio_train.export.onnx import OnnxModel
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.configuration import CONFIG_FILE, from_json
+from curio_train.learning.runs.provenance import run_sessions
 from curio_train.learning.state import TrainState
-from curio_train.model_folder import find_model
-from curio_train.onnx_file import OnnxModel
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World
 
@@ -76,7 +76,12 @@ def _from_run(path: Path) -> Subject:
     state = run.trained(world)
     course = state.course
     return Subject(
-        run.config, world, _reader(state.pose.network), course.all_images, course.all_seconds, sittings(path)[0].commit
+        run.config,
+        world,
+        _reader(state.pose.network),
+        course.all_images,
+        course.all_seconds,
+        run_sessions(path)[0].commit,
     )
 
 

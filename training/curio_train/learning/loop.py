@@ -17,28 +17,28 @@ from torch import Tensor
 
 from curio_train.config import Recipe, RunConfig
 from curio_train.errors import TrainingError, UsageError
-from curio_train.learning.ahead import Ahead
-from curio_train.learning.checkpoint import RunFolder
 from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, gradient_penalty
-from curio_train.learning.interruption import Interruption
 from curio_train.learning.losses import image_loss
 from curio_train.learning.parallel import Ranks
 from curio_train.learning.precision import autocast
-from curio_train.learning.progress import Reporter
+from curio_train.learning.prefetch import Prefetcher
 from curio_train.learning.recoloring import recolored
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.interruption import Interruption
+from curio_train.learning.runs.progress import Reporter
 from curio_train.learning.self_training import SelfTraining
 from curio_train.learning.sleep import sleep_codes
 from curio_train.learning.state import TrainState
-from curio_train.networks.look import Look
+from curio_train.networks.base import StageNetwork
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import Batch, ImageSource, World
 
 _SMOOTHING = 0.98  # of the image loss that convergence is judged by: a memory of about 50 steps
 _NUM_PAIRS = 8
-_NUM_REHEARSED = 32
-_ASLEEP = 1  # marks draws of sleep, so that they are not those of the data
+_NUM_WARM_UP = 32
+_SYNTHETIC = 1  # marks draws of sleep, so that they are not those of the data
 
-Dream = tuple[dict[str, Tensor], Tensor]
+SyntheticBatch = tuple[dict[str, Tensor], Tensor]
 """Scene codes, and the disturbed images of them that are to be read."""
 
 
@@ -72,7 +72,7 @@ class Trainer:
         Raises:
             UsageError: The world, or its network, does not go with the method.
         """
-        if len(world.looks) > 1 and config.terms != {"sleep"}:
+        if len(world.stages) > 1 and config.terms != {"sleep"}:
             raise UsageError(
                 f"--method {config.method} compares images or labels of whole scenes, which the looks of a gaze do not "
                 "see: expected --method sleep (or, with linemod, --no-gaze)"
@@ -84,7 +84,7 @@ class Trainer:
         self._sources = sources
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
         self._share = ranks.share(self._num_micro)
-        self._ahead: Ahead[Dream] | None = None
+        self._prefetcher: Prefetcher[SyntheticBatch] | None = None
         self._self_training = SelfTraining(
             self.state.pose.network, world, config.recipe.self_training, ranks.device, trained=config.init is not None
         )
@@ -109,8 +109,8 @@ class Trainer:
             "label": 1.0,
         }
         turn = self._turn(self.state.course.step)
-        world, source = self.world.looks[turn], self._sources[turn]
-        network = self.state.looks[turn]
+        world, source = self.world.stages[turn], self._sources[turn]
+        network = self.state.stages[turn]
         sums: Counter[str] = Counter()
         for learner in self.state.learners.values():
             learner.optimizer.zero_grad()
@@ -140,9 +140,9 @@ class Trainer:
             # Asleep: render codes of one's own making, read them back.
             if "sleep" in terms:
                 if terms == {"sleep"}:
-                    dream, dreamt = self._ahead.take(number) if self._ahead else self._dream(number)
+                    dream, dreamt = self._prefetcher.take(number) if self._prefetcher else self._synthetic_batch(number)
                 else:
-                    dream, dreamt = self._dream_around(raw, backgrounds, number)
+                    dream, dreamt = self._perturbed_batch(raw, backgrounds, number)
                 losses["sleep"] = world.code_loss(self._read(network, dreamt)[1], dream)
 
             torch.stack([weights[name] * loss for name, loss in losses.items()]).sum().div(self._num_micro).backward()
@@ -156,8 +156,8 @@ class Trainer:
                     critic_total = critic_total + weight * gradient_penalty(self._judge, images)
                 (critic_total / self._num_micro).backward()
 
-            of_look = f", {world.name}" if len(self.world.looks) > 1 else ""
-            sums.update({name + of_look: loss.item() / self._num_micro for name, loss in losses.items()})
+            of_stage = f", {world.name}" if len(self.world.stages) > 1 else ""
+            sums.update({name + of_stage: loss.item() / self._num_micro for name, loss in losses.items()})
 
         means = self._add_up_over_ranks(sums)
         self._move(means, rate)
@@ -169,67 +169,67 @@ class Trainer:
         return turns[step % len(turns)]
 
     @torch.no_grad()
-    def _dream(self, number: int) -> Dream:
+    def _synthetic_batch(self, number: int) -> SyntheticBatch:
         """Of codes drawn by the world: a function of seed and number alone."""
         turn, size = self._turn(number // self._num_micro), self.config.recipe.micro_batch_size
-        world, seed = self.world.looks[turn], (self.config.seed, number)
+        world, seed = self.world.stages[turn], (self.config.seed, number)
         backgrounds = self._sources[turn].backgrounds(number, size)
-        code = self._to_device_code(world.sample(size, (*seed, _ASLEEP)))
+        code = self._to_device_code(world.sample(size, (*seed, _SYNTHETIC)))
         images = world.render(code, None if backgrounds is None else backgrounds.to(self.ranks.device))
-        images = world.disturb(images, seed)
-        is_last = turn == len(self.world.looks) - 1
-        return self._self_training.among(code, images, (*seed, _ASLEEP)) if is_last else (code, images)
+        images = world.augment(images, seed)
+        is_last = turn == len(self.world.stages) - 1
+        return self._self_training.among(code, images, (*seed, _SYNTHETIC)) if is_last else (code, images)
 
     def study(self, progress: float) -> None:
         """Read photographs for self-training, if it is time to after this share of the budget; raises DataError."""
         if self._self_training.is_due(progress):
-            self.settle()
+            self.wait_idle()
             self._self_training.study(progress)
 
-    def _dream_around(self, raw: SceneCode, backgrounds: Tensor | None, number: int) -> Dream:
+    def _perturbed_batch(self, raw: SceneCode, backgrounds: Tensor | None, number: int) -> SyntheticBatch:
         """Of codes around those that were read of data."""
         recipe, seed = self.config.recipe, (self.config.seed, number)
         code = sleep_codes(self.world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
         with torch.no_grad():
-            return code, self.world.disturb(self.world.render(code, backgrounds), seed)
+            return code, self.world.augment(self.world.render(code, backgrounds), seed)
 
     @contextmanager
-    def dreaming_ahead(self) -> Iterator[None]:
+    def prefetching(self) -> Iterator[None]:
         """Within it a method that only sleeps has the next images drawn in a thread, while the networks learn."""
         if self.config.terms != {"sleep"}:
             yield
             return
-        with Ahead(self._dream, self.ranks.size) as self._ahead:
+        with Prefetcher(self._synthetic_batch, self.ranks.size) as self._prefetcher:
             try:
                 yield
             finally:
-                self._ahead = None
+                self._prefetcher = None
 
-    def settle(self) -> None:
+    def wait_idle(self) -> None:
         """Wait for what is drawn ahead: of the renderer, one thread at a time makes use."""
-        if self._ahead is not None:
-            self._ahead.settle()
+        if self._prefetcher is not None:
+            self._prefetcher.wait_idle()
 
     @torch.no_grad()
-    def rehearse(self) -> None:
+    def warm_up(self) -> None:
         """Do what takes most of a step's time, without a trace, so that it can be timed."""
         self.state.pose.network.eval()
-        for look, network in zip(self.world.looks, self.state.looks, strict=True):
-            size = (_NUM_REHEARSED, 3, look.camera.height, look.camera.width)
+        for look, network in zip(self.world.stages, self.state.stages, strict=True):
+            size = (_NUM_WARM_UP, 3, look.camera.height, look.camera.width)
             self._read(network, torch.zeros(size, device=self.ranks.device))
         self.state.pose.network.train()
 
     @torch.no_grad()
     def pairs(self) -> tuple[Tensor, Tensor]:
         """A few training images, always the same, and what the (last) look, as it will be exported, makes of them."""
-        look, network = self.world.looks[-1], self.state.looks[-1]
+        look, network = self.world.stages[-1], self.state.stages[-1]
         batch = self._to_device(self._sources[-1].batch(0, _NUM_PAIRS))
         network.eval()
         rendered = look.render({**batch.given, **network(batch.images)}, batch.backgrounds)
         network.train()
         return batch.images, rendered
 
-    def _read(self, network: Look, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _read(self, network: StageNetwork, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The network's raw outputs and scene codes; positions need float32, convolutions do not."""
         with self._autocast():
             # Channels last: convolutions of small images are a sixth quicker so on CPUs.
@@ -312,14 +312,14 @@ def train(
     """
     config, course, ranks = trainer.config, trainer.state.course, trainer.ranks
     saved_at, clock = course.seconds, time.monotonic()
-    with interruption.deferred(), trainer.dreaming_ahead():
+    with interruption.deferred(), trainer.prefetching():
         while True:
             # All processes go by the slowest clock and by anyone's signal, so that they stop at the same step.
             seconds, signalled = ranks.largest(course.seconds, interruption.signum or 0)
             progress = config.progress(course.images, seconds)
             outcome = _outcome(config, course.image_loss, progress, bool(signalled))
             if outcome or seconds - saved_at >= 60 * checkpoint_minutes:
-                trainer.settle()
+                trainer.wait_idle()
                 if outcome and outcome is not Outcome.INTERRUPTED:
                     finish()
                 if reporter:

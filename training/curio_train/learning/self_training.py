@@ -1,13 +1,13 @@
-"""When photographs are read for self-training, and how they come among the renderings: see ``worlds/lessons.py``."""
+"""When photographs are read for self-training, and how they come among the renderings: see ``pseudo_labels``."""
 
 import torch
 from torch import Tensor, nn
 
+from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
-from curio_train.worlds.lessons import Lessons
 
-STUDIES, STUDIES_OF_TRAINED = (0.6, 0.8), (0.2, 0.5, 0.8)
+ROUNDS, ROUNDS_OF_PRETRAINED = (0.6, 0.8), (0.2, 0.5, 0.8)
 """Shares of the budget after which photographs are read: late, when what is read is worth it, and once more; sooner by
 networks that began as trained ones (``--init``)."""
 
@@ -28,8 +28,8 @@ class SelfTraining:
             trained: The network began as one that reads already.
         """
         self._world, self._network, self._share, self._device = world, network, share, device
-        self._studies = STUDIES_OF_TRAINED if trained else STUDIES
-        self._lessons: Lessons | None = None
+        self._studies = ROUNDS_OF_PRETRAINED if trained else ROUNDS
+        self._lessons: PseudoLabels | None = None
         self._num_studies = 0
 
     def is_due(self, progress: float) -> bool:
@@ -44,7 +44,7 @@ class SelfTraining:
         """
         self._num_studies = sum(progress >= share for share in self._studies)
         self._network.eval()
-        self._lessons = self._world.lessons(self._read) or self._lessons
+        self._lessons = PseudoLabels.from_photographs(self._world, self._read) or self._lessons
         self._network.train()
 
     def among(self, code: SceneCode, images: Tensor, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:

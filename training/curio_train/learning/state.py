@@ -10,7 +10,7 @@ from torch.optim import Adam, Optimizer
 from curio_train.config import RunConfig
 from curio_train.errors import UsageError
 from curio_train.learning.muon import Muon
-from curio_train.networks.critic import Critic
+from curio_train.networks.paper.critic import Critic
 from curio_train.worlds.base import World
 
 N = TypeVar("N", bound=nn.Module)
@@ -75,7 +75,7 @@ class Learner(Generic[N]):
 
 
 @dataclass
-class Course:
+class TrainingProgress:
     """How far a run has come.
 
     Attributes:
@@ -125,15 +125,15 @@ class TrainState:
         if reading is not None and reading not in world.readings:
             raise UsageError(f"--reading {reading}: images of {world.name} cannot be read so; leave it out")
         torch.manual_seed(config.seed)
-        self.course = Course()
-        self.looks = [look.network(config.network) for look in world.looks]
-        if config.terms > {"sleep"} and not self.looks[0].has_raw_values:
+        self.course = TrainingProgress()
+        self.stages = [look.network(config.network) for look in world.stages]
+        if config.terms > {"sleep"} and not self.stages[0].has_raw_values:
             raise UsageError(
                 f"--method {config.method} dreams around what it reads, which cells do not allow: expected --method "
                 "sleep, or --reading whole"
             )
         recipe = config.recipe
-        self.pose = Learner(world.assemble(self.looks).to(device), recipe.learning_rate, recipe.matrix_learning_rate)
+        self.pose = Learner(world.assemble(self.stages).to(device), recipe.learning_rate, recipe.matrix_learning_rate)
         self.critic: Learner[Critic] | None = None
         if "curiosity" in config.terms:
             critic = Critic(config.network.critic, config.network.critic_normalisation).to(device)
@@ -148,7 +148,7 @@ class TrainState:
         """All tensors by name, see :meth:`Learner.tensors`."""
         return {f"{who}.{name}": value for who, one in self.learners.items() for name, value in one.tensors().items()}
 
-    def load(self, tensors: dict[str, Tensor], course: Course) -> None:
+    def load(self, tensors: dict[str, Tensor], course: TrainingProgress) -> None:
         """Go back to where :meth:`tensors` and ``course`` were taken.
 
         Raises:

@@ -56,7 +56,7 @@ def calibration(signs: ArrayLike, right: Sequence[bool]) -> list[float]:
     return weights
 
 
-def separation(with_object: Sequence[float], without: Sequence[float]) -> float:
+def auroc(with_object: Sequence[float], without: Sequence[float]) -> float:
     """AUROC: how often a frame with the object has the higher confidence than one without; ties count half.
 
     Raises:

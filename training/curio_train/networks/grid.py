@@ -110,7 +110,7 @@ class CellGrid(nn.Module):
         return Share(torch.stack(cells, dim=-1), torch.stack(weights, dim=-1))
 
 
-def amounts_error(logits: Float[Tensor, "batch cells"], share: Share) -> Float[Tensor, " batch"]:
+def heat_map_loss(logits: Float[Tensor, "batch cells"], share: Share) -> Float[Tensor, " batch"]:
     """Cross entropy of how much of an object each cell is said to hold, and how much it does hold.
 
     Args:
@@ -121,7 +121,7 @@ def amounts_error(logits: Float[Tensor, "batch cells"], share: Share) -> Float[T
     return F.binary_cross_entropy_with_logits(logits, wanted.clamp(max=1), reduction="none").sum(dim=1)
 
 
-def said_by(values: Float[Tensor, "batch cells size"], share: Share) -> Float[Tensor, "batch objects 4 size"]:
+def gather_cells(values: Float[Tensor, "batch cells size"], share: Share) -> Float[Tensor, "batch objects 4 size"]:
     """What the cells around each object say."""
     picked = values.gather(1, share.cell.flatten(1)[..., None].expand(-1, -1, values.shape[-1]))
     return picked.unflatten(1, share.cell.shape[1:])

@@ -8,8 +8,8 @@ can be added to the image by itself.
 from types import ModuleType
 from typing import Any
 
+from curio_train.rendering.instances import Instances
 from curio_train.rendering.pixels import Place
-from curio_train.rendering.rows import Rows
 
 
 class Occlusion:
@@ -33,7 +33,7 @@ class Occlusion:
         dr.scatter(self.table, depth_m, self._first_entry(place) + place.row % self.num_slots)
         dr.eval(self.entry_of_group, self.table)
 
-    def weight(self, rows: Rows, place: Place, depth_m: Any) -> Any:
+    def weight(self, rows: Instances, place: Place, depth_m: Any) -> Any:
         """What a hit contributes to its sample: its confidence times what the nearer hits let through.
 
         Written without a sort: every slot is asked whether it is nearer (equal depths: the earlier slot), so the

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from curio_train.rendering.edges import CLUSTER_SIZE, EdgeTable
-from curio_train.rendering.rows import Rows
+from curio_train.rendering.instances import Instances
+from curio_train.rendering.silhouette_edges import CLUSTER_SIZE, EdgeTable
 
 
 class EdgeSearch:
@@ -29,7 +29,7 @@ class EdgeSearch:
         """Both ends of edges, scene frame."""
         return [self._point(name, edge) for name in ("start", "end")]
 
-    def find(self, rows: Rows, num_rows: int) -> tuple[Any, Any]:
+    def find(self, rows: Instances, num_rows: int) -> tuple[Any, Any]:
         """(row, edge) of every silhouette edge, rows ascending."""
         mi, dr = self.mi, self.dr
         if self.num_pairs == 0:
@@ -54,7 +54,7 @@ class EdgeSearch:
         dr.eval(row, edge)
         return row, edge
 
-    def _may_have_outline(self, rows: Rows, row: Any, cluster: Any) -> Any:
+    def _may_have_outline(self, rows: Instances, row: Any, cluster: Any) -> Any:
         """False only where every face of the cluster surely looks to the same side of the camera."""
         mi, dr = self.mi, self.dr
         to_camera = rows.toward(row, self._point("center", cluster))
@@ -69,7 +69,7 @@ class EdgeSearch:
         facing = dr.gather(mi.Float, self.edges["facing"], cluster)
         return dr.select(facing > 0, beyond, dr.abs(beyond)) <= spread
 
-    def _is_outline(self, rows: Rows, row: Any, edge: Any) -> Any:
+    def _is_outline(self, rows: Instances, row: Any, edge: Any) -> Any:
         """One face towards the camera and one away, or an open border; at folds as many towards it as are needed."""
         dr = self.dr
         to_camera = rows.toward(row, self._point("start", edge))

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from curio_train.rendering.color import linear_from_srgb, srgb_from_linear
+from curio_train.color import linear_from_srgb, srgb_from_linear
 
 
 @dataclass(frozen=True, eq=False)

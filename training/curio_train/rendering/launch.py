@@ -7,18 +7,18 @@ from typing import Any
 
 from curio_train.rendering.bounds import ImageBounds
 from curio_train.rendering.compositing import Occlusion
-from curio_train.rendering.layers import LayerTracer, Sight
+from curio_train.rendering.edge_sampling import OutlineSampler
+from curio_train.rendering.instances import Instances
 from curio_train.rendering.pixels import Place
-from curio_train.rendering.rows import Rows
 from curio_train.rendering.shadows import Blockers
-from curio_train.rendering.silhouettes import OutlineSampler
+from curio_train.rendering.tracing import LayerTracer, RayQuery
 
 Places = Callable[[Any], tuple[Place, Any]]
 """From the numbers of rays to their places and whether they are inside the image."""
 
 
 @dataclass(frozen=True)
-class Setting:
+class RenderSettings:
     """What all parts of all batches share.
 
     Attributes:
@@ -54,13 +54,13 @@ class View:
         images: First and last + 1 image.
         sight: What is looked for.
         bounds: Of the part's rows.
-        camera: Float, see :class:`Rows`.
+        camera: Float, see :class:`Instances`.
         key: Of all random numbers of the batch, UInt32.
-        finish: Float, see :class:`Rows`, or None.
+        finish: Float, see :class:`Instances`, or None.
     """
 
     images: tuple[int, int]
-    sight: Sight
+    sight: RayQuery
     bounds: ImageBounds
     camera: Any
     key: Any
@@ -94,11 +94,11 @@ class Hits:
 class Launch:
     """Rays over one part of a batch, in front of its backgrounds (flat [b, c, h, w])."""
 
-    def __init__(self, setting: Setting, view: View, background: Any) -> None:
+    def __init__(self, setting: RenderSettings, view: View, background: Any) -> None:
         self.set, self.view, self.background = setting, view, background
         self.mi, self.dr = setting.mi, setting.dr
 
-    def trace(self, rows: Rows, lane: Any, at: Places, per_group: int, num_groups: int) -> Hits | None:
+    def trace(self, rows: Instances, lane: Any, at: Places, per_group: int, num_groups: int) -> Hits | None:
         """Trace rays and keep those that hit; None where none does. Samples come in groups, see :class:`Occlusion`."""
         mi, dr, tracer = self.mi, self.dr, self.set.tracer
         if len(lane) == 0:
@@ -117,14 +117,14 @@ class Launch:
             occlusion.build(at(lane)[0], record.t, num_groups)
         return Hits(lane, at, record, occlusion, self._blockers(rows, at(lane)[0], record.t))
 
-    def _blockers(self, rows: Rows, place: Place, depth_m: Any) -> Blockers | None:
+    def _blockers(self, rows: Instances, place: Place, depth_m: Any) -> Blockers | None:
         if not self.set.object_shadows or self.set.num_slots == 1 or not self.view.sight.shaded:
             return None
         blockers = Blockers(self.mi, self.dr, self.set.tracer, self.set.num_slots)
         blockers.find(rows.detached(), place, depth_m)
         return blockers
 
-    def contributions(self, rows: Rows, hits: Hits) -> tuple[Place, list[Any]]:
+    def contributions(self, rows: Instances, hits: Hits) -> tuple[Place, list[Any]]:
         """What each hit adds to the colour of its sample: weight · (color − background), one array a channel."""
         place, _ = hits.at(hits.lane)
         lit = hits.blockers.lit(rows, place) if hits.blockers else 1.0
@@ -133,7 +133,7 @@ class Launch:
         behind = self.look(self.background, place.pixel)
         return place, [weight * (color - under) for color, under in zip(colors, behind, strict=True)]
 
-    def weighed(self, rows: Rows, hits: Hits, adjoint: Any) -> tuple[Place, Any]:
+    def weighed(self, rows: Instances, hits: Hits, adjoint: Any) -> tuple[Place, Any]:
         """The contributions' scalar product with the adjoint at their pixels."""
         place, colors = self.contributions(rows, hits)
         return place, sum(c * w for c, w in zip(colors, self.look(adjoint, place.pixel), strict=True))

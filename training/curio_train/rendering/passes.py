@@ -3,16 +3,16 @@
 from dataclasses import replace
 from typing import Any
 
-from curio_train.rendering.launch import Hits, Launch, Setting, View
-from curio_train.rendering.outlines import Outlines
+from curio_train.rendering.edge_gradients import Outlines
+from curio_train.rendering.instances import Instances
+from curio_train.rendering.launch import Hits, Launch, RenderSettings, View
 from curio_train.rendering.pixels import PixelSamples
-from curio_train.rendering.rows import Rows
 
 
 class Pass:
     """One view: what was hit in the forward pass is kept for the backward pass."""
 
-    def __init__(self, setting: Setting, view: View) -> None:
+    def __init__(self, setting: RenderSettings, view: View) -> None:
         self.set, self.view = setting, view
         self.mi, self.dr = setting.mi, setting.dr
         self.hits: Hits | None = None
@@ -57,10 +57,10 @@ class Pass:
         dr.eval(through)
         return through
 
-    def _rows(self, values: Any) -> Rows:
+    def _rows(self, values: Any) -> Instances:
         return replace(self.view.sight.rows(values, self.view.camera), finish=self.view.finish)
 
-    def _trace_pixels(self, launch: Launch, rows: Rows) -> Hits | None:
+    def _trace_pixels(self, launch: Launch, rows: Instances) -> Hits | None:
         setting, view = self.set, self.view
         size, area = (setting.width, setting.height), setting.width * setting.height
         key = view.key + self.dr.opaque(self.mi.UInt32, view.images[0] * area)

@@ -8,20 +8,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from curio_train.data.meshes import Mesh
-from curio_train.data.simplification import simplified
+from curio_train.color import linear_from_srgb
 from curio_train.errors import RendererError
+from curio_train.meshes.meshes import Mesh
+from curio_train.meshes.simplification import simplified
 from curio_train.rendering.bounds import project_bounds
-from curio_train.rendering.color import linear_from_srgb
-from curio_train.rendering.finish import in_object_frame
+from curio_train.rendering.edge_sampling import OutlineSampler
 from curio_train.rendering.ground import Ground
-from curio_train.rendering.launch import Setting, View
-from curio_train.rendering.layers import LayerTracer, Objects, Sight
+from curio_train.rendering.instances import INSTANCE_SIZE
+from curio_train.rendering.launch import RenderSettings, View
+from curio_train.rendering.materials import in_object_frame
+from curio_train.rendering.parts import build_scene
 from curio_train.rendering.passes import Pass
-from curio_train.rendering.rows import ROW_SIZE
-from curio_train.rendering.scene import build_scene
 from curio_train.rendering.shadows import GroundShadows, fallen
-from curio_train.rendering.silhouettes import OutlineSampler
+from curio_train.rendering.tracing import LayerTracer, Objects, RayQuery
 from curio_train.rendering.variant import Variant, load_mitsuba
 
 MAX_RAYS = 4_000_000
@@ -72,7 +72,7 @@ class Renderer:
         static = build_scene(mitsuba, [simplified(mesh, max(MIN_FACES, width * height)) for mesh in meshes])
         if not kind_of_slot or not all(0 <= k < len(meshes) for k in kind_of_slot):
             raise RendererError(f"kind_of_slot is {list(kind_of_slot)}; every slot needs one of {len(meshes)} meshes")
-        self.setting = Setting(
+        self.setting = RenderSettings(
             mitsuba,
             drjit,
             LayerTracer(mitsuba, drjit, static.scene, ambient),
@@ -176,7 +176,7 @@ class Renderer:
     def _pack(
         self, rotation: Tensor, translation_m: Tensor, light: Tensor, color: Tensor | None, confidence: Tensor | None
     ) -> Tensor:
-        """[batch · slots, 19], the columns of :class:`Rows`."""
+        """[batch · slots, 19], the columns of :class:`Instances`."""
         batch, slots = rotation.shape[:2]
         transposed = rotation.transpose(-1, -2)
         turned = (transposed @ translation_m[..., None])[..., 0]
@@ -186,10 +186,10 @@ class Renderer:
         albedo = linear_from_srgb(color) if color is not None else torch.ones(batch, slots, 3)
         confidence = confidence if confidence is not None else torch.ones(batch, slots)
         parts = [origin, matrix.flatten(2), light_in_object, albedo, confidence[..., None]]
-        return torch.cat(parts, dim=-1).reshape(-1, ROW_SIZE)
+        return torch.cat(parts, dim=-1).reshape(-1, INSTANCE_SIZE)
 
     def _views(
-        self, corners_m: np.ndarray, intrinsics: np.ndarray, sight: Sight, seed: int, finish: Tensor | None = None
+        self, corners_m: np.ndarray, intrinsics: np.ndarray, sight: RayQuery, seed: int, finish: Tensor | None = None
     ) -> list[View]:
         setting, n = self.setting, self.setting.num_slots
         per_row = np.repeat(intrinsics, n, axis=0)
@@ -212,7 +212,7 @@ class _Render(torch.autograd.Function):
     """The bridge between torch and Dr.Jit: whole arrays of the host, once each way a view."""
 
     @staticmethod
-    def forward(ctx: Any, rows: Tensor, backgrounds: Tensor, setting: Setting, views: list[View]) -> Tensor:
+    def forward(ctx: Any, rows: Tensor, backgrounds: Tensor, setting: RenderSettings, views: list[View]) -> Tensor:
         ctx.setting, ctx.passes = setting, [Pass(setting, view) for view in views]
         parts = []
         for part, (values, background) in zip(ctx.passes, _parts(ctx, rows, backgrounds), strict=True):
@@ -226,7 +226,7 @@ class _Render(torch.autograd.Function):
         rows, *images = ctx.saved_tensors
         gradients, behind = [], []
         for part, arrays in zip(ctx.passes, _parts(ctx, rows, *images, adjoint), strict=True):
-            gradients.append(_tensor(part.gradient(*arrays), (-1, ROW_SIZE)))
+            gradients.append(_tensor(part.gradient(*arrays), (-1, INSTANCE_SIZE)))
             if ctx.needs_input_grad[1]:
                 values, background, _, weights = arrays
                 through = part.gradient_of_background(values, background, weights)

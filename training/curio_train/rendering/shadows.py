@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from curio_train.rendering.ground import Ground
-from curio_train.rendering.layers import LayerTracer, Sight
+from curio_train.rendering.instances import Instances
 from curio_train.rendering.pixels import Place
-from curio_train.rendering.rows import Rows
+from curio_train.rendering.tracing import LayerTracer, RayQuery
 
 _LOWEST_SUN = 1e-3
 """Sine of the elevation below which there are no shadows: they would be endless."""
@@ -43,7 +43,7 @@ def fallen(corners_m: np.ndarray, light: np.ndarray, ground: Ground) -> np.ndarr
 
 
 @dataclass(frozen=True)
-class ShadowRows(Rows):
+class ShadowRows(Instances):
     """Rows as the ground sees them along the light.
 
     Attributes:
@@ -74,7 +74,7 @@ class ShadowRows(Rows):
         return dr.select(lit, place - along * light, self.mi.Vector3f(0, 0, -1))
 
 
-class GroundShadows(Sight):
+class GroundShadows(RayQuery):
     """Shows how much of the light each hit keeps from the ground."""
 
     channels = 1
@@ -89,7 +89,7 @@ class GroundShadows(Sight):
         """Rows in the light of this ground."""
         return ShadowRows(self.mi, self.dr, values, camera, plane=self.plane)
 
-    def colors(self, tracer: LayerTracer, rows: Rows, place: Place, hit: Any, lit: Any) -> list[Any]:
+    def colors(self, tracer: LayerTracer, rows: Instances, place: Place, hit: Any, lit: Any) -> list[Any]:
         """All of it, whatever was hit."""
         return [1.0]
 
@@ -101,7 +101,7 @@ class Blockers:
         self.mi, self.dr, self.tracer, self.num_slots = mi, dr, tracer, num_slots
         self.table: Any = None
 
-    def find(self, rows: Rows, place: Place, depth_m: Any) -> None:
+    def find(self, rows: Instances, place: Place, depth_m: Any) -> None:
         """Trace a ray from every hit through every other slot whose bounding sphere it passes."""
         mi, dr, n = self.mi, self.dr, self.num_slots
         num_hits = len(depth_m)
@@ -116,7 +116,7 @@ class Blockers:
             dr.scatter(self.table, dr.select(record.is_valid(), mi.Float(1), 0), kept)
         dr.eval(self.table)
 
-    def lit(self, rows: Rows, place: Place) -> Any:
+    def lit(self, rows: Instances, place: Place) -> Any:
         """Share of the light that reaches each hit: what the confidences of all that is in between let through."""
         mi, dr, n = self.mi, self.dr, self.num_slots
         first, image = dr.arange(mi.UInt32, len(self.table) // n) * n, place.row // n
@@ -125,7 +125,7 @@ class Blockers:
             lit *= 1 - rows.confidence(image * n + slot) * dr.gather(mi.Float, self.table, first + slot)
         return lit
 
-    def _ray(self, rows: Rows, place: Place, depth_m: Any, lane: Any) -> tuple[Any, Any]:
+    def _ray(self, rows: Instances, place: Place, depth_m: Any, lane: Any) -> tuple[Any, Any]:
         """Row and ray of a lane (hit, slot), in that slot's frame."""
         mi, dr, n = self.mi, self.dr, self.num_slots
         hit = lane // n

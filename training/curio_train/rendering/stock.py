@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from curio_train.data.meshes import Mesh
-from curio_train.rendering.scene import linear_from_srgb, mesh_shape
+from curio_train.meshes.meshes import Mesh
+from curio_train.rendering.parts import linear_from_srgb, mesh_shape
 from curio_train.rendering.topology import adjacency
 
 OPENCV_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])

@@ -1,7 +1,7 @@
 """The registry of worlds.
 
-A world NAME is a module ``worlds/NAME.py`` with a function ``build(options) -> World``, and a line here that names its
-options. Nothing is imported before it is asked for, so that listing the worlds costs no torch.
+A new world is a module with a function ``build(options) -> World``, a class of options in ``worlds/options.py``, and a
+line here. The module of a world is imported only when that world is built, so that listing the worlds costs no torch.
 """
 
 from __future__ import annotations
@@ -24,6 +24,17 @@ from curio_train.worlds.options import (
 if TYPE_CHECKING:
     from curio_train.worlds.base import World
 
+_MODULES = {
+    "circles": "generated.circles",
+    "spheres": "generated.spheres",
+    "chairs": "generated.chairs",
+    "varied": "generated.varied",
+    "multi": "generated.multi",
+    "light": "generated.light",
+    "linemod": "single_object.linemod",
+    "capture": "single_object.capture",
+}
+
 WORLDS: dict[str, type[WorldOptions]] = {
     "circles": CirclesOptions,
     "spheres": SpheresOptions,
@@ -39,5 +50,5 @@ WORLDS: dict[str, type[WorldOptions]] = {
 def build(options: WorldOptions) -> World:
     """The world that these options describe."""
     name = next(name for name, kind in WORLDS.items() if isinstance(options, kind))
-    world: World = importlib.import_module(f"curio_train.worlds.{name}").build(options)
+    world: World = importlib.import_module(f"curio_train.worlds.{_MODULES[name]}").build(options)
     return world

@@ -4,7 +4,7 @@ A new world is one file: a subclass of :class:`World` and a line in ``worlds/__i
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -14,18 +14,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from curio_train.config import NetworkConfig, Reading
+from curio_train.config import DecoderKind, NetworkConfig
 from curio_train.data.bop import ModelInfo
 from curio_train.errors import UsageError
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.metrics.assignment import scene_error
-from curio_train.networks.look import Look
-from curio_train.networks.pose import PoseNetwork
+from curio_train.networks.base import StageNetwork
+from curio_train.networks.paper.pose import PoseNetwork
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 
 if TYPE_CHECKING:
-    from curio_train.data.meshes import Mesh
-    from curio_train.worlds.lessons import Lessons
+    from curio_train.meshes.meshes import Mesh
 
 Split = Literal["train", "validation", "test"]
 
@@ -147,13 +146,13 @@ class World(ABC):
     camera: Camera
     objects: tuple[ObjectKind, ...]
     mesh: "Mesh | None" = None
-    readings: ClassVar[frozenset[Reading]] = frozenset({"whole"})
+    readings: ClassVar[frozenset[DecoderKind]] = frozenset({"whole"})
     """How its images can be read (``NetworkConfig.reading``)."""
     colors_interchangeable: ClassVar[bool] = False
     """Whether scenes with their colours' channels exchanged are as likely, and look like their images so changed."""
 
     @property
-    def looks(self) -> tuple["World", ...]:
+    def stages(self) -> tuple["World", ...]:
         """What is looked at, one after the other, to read one image: worlds with images and codes of their own.
 
         All but gazes read an image at one look, and are that look themselves.
@@ -165,7 +164,7 @@ class World(ABC):
         """Which look each training step teaches, over and over."""
         return (0,)
 
-    def network(self, config: NetworkConfig) -> Look:
+    def network(self, config: NetworkConfig) -> StageNetwork:
         """What reads this world's images at one look.
 
         Raises:
@@ -173,7 +172,7 @@ class World(ABC):
         """
         return PoseNetwork(self.layout, self.camera.width, config)
 
-    def assemble(self, networks: Sequence[Look]) -> nn.Module:
+    def assemble(self, networks: Sequence[StageNetwork]) -> nn.Module:
         """The networks of all looks as one, from image to scene code: what is exported."""
         (network,) = networks
         return network
@@ -230,24 +229,13 @@ class World(ABC):
     def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:
         """Images [batch, 3, height, width] in sRGB of a batch of codes, differentiable in every field."""
 
-    def disturb(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
+    def augment(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
         """What lies between renderings and the data, done to renderings that the network learns to read (sleep)."""
         return images
 
     def compared(self, images: Tensor) -> Tensor:
         """What image loss and critic see of images and of renderings: all of them, in most worlds."""
         return images
-
-    def lessons(self, predict: Callable[[Tensor], SceneCode]) -> "Lessons | None":
-        """Photographs for self-training: read, refined, and cut for the last look; None in most worlds.
-
-        Args:
-            predict: Reads images [batch, 3, height, width] in [0, 1].
-
-        Raises:
-            DataError: A photograph cannot be read, or is not of the camera's size.
-        """
-        return None
 
     def views(self) -> tuple["View", ...]:
         """Unlabelled photographs to judge by: from the own camera, and of the same scenes from a second one.

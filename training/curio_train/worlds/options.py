@@ -10,7 +10,7 @@ import tyro
 from curio_train.config import Method, WorldOptions
 from curio_train.errors import UsageError
 
-_GAZE_RECIPE: Mapping[str, Any] = {
+_TWO_STAGE_RECIPE: Mapping[str, Any] = {
     "matrix_learning_rate": 0.01,
     "learning_rate": 1e-3,
     "warm_up_steps": 100,
@@ -78,7 +78,7 @@ class LinemodOptions(WorldOptions):
     """
 
     default_method: ClassVar[Method] = "sleep"
-    default_recipe: ClassVar[Mapping[str, Any]] = _GAZE_RECIPE
+    default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     class_name: Annotated[str, tyro.conf.arg(name="class")]
     data: Path | None = None
@@ -129,7 +129,7 @@ class CaptureOptions(WorldOptions):
     """
 
     default_method: ClassVar[Method] = "sleep"
-    default_recipe: ClassVar[Mapping[str, Any]] = _GAZE_RECIPE
+    default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     mesh: tuple[Path, ...]
     camera: Path

@@ -1,0 +1,266 @@
+"""``curio-detect``: poses in many images, through a model on this machine or behind a server."""
+
+import os
+import re
+import shlex
+import signal
+import sys
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+
+import tyro
+
+from curio_serve.arguments import parse
+from curio_serve.cores import num_cores
+from curio_serve.errors import CameraError, CurioError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from curio_proto.v1.model_spec_pb2 import ModelSpec
+
+    from curio_serve.batch.estimators import Estimator, Settings
+    from curio_serve.batch.formats import ImageLines, ResultFormat
+    from curio_serve.batch.sources import SourceImage
+    from curio_serve.client import PoseClient
+
+_SERVED_MODEL = re.compile(r"(?P<address>(?:\[[^\]]+\]|[^/:\[\]]+):\d{1,5})/(?P<model>[^/]+(?:/\d+)?)")
+
+
+@dataclass(frozen=True)
+class DetectArguments:
+    """Find a model's objects in images and write one JSON object an image, in the order of the images.
+
+    Poses are cam_from_obj in metres, in OpenCV's camera frame (x right, y down, z forward). An image that cannot be
+    read gets a line with its error, stops nothing, and makes the exit status 1. After a stop of any kind, run the same
+    command again: it goes on after the last complete image.
+    """
+
+    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
+    """Model folder (its latest version), version folder or .onnx file; if no such path, a server's HOST:PORT/NAME."""
+    images: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="IMAGES...")]
+    """Files, folders (and those below; of a BOP scene its photographs), globs, videos, or - for a list on stdin."""
+    camera: Path | None = None
+    """Intrinsics: camera JSON, BOP's camera.json or scene_camera.json, OpenCV YAML. 2D worlds need none."""
+    out: Path | None = None
+    """Result file. One that exists is gone on with, where it is of the same model and images. None: stdout."""
+    overwrite: bool = False
+    """Replace the result file instead."""
+    format: Literal["jsonl", "csv", "bop"] = "jsonl"
+    """JSON Lines; CSV, a row a detection; BOP's results in millimetres, for images <scene>/rgb/<image>.png."""
+    obj_id: int | None = None
+    """Object id in BOP's results. None: that of the LineMOD class the object is named after."""
+    overlays: Path | None = None
+    """Folder for pictures with boxes and axes drawn in, laid out like the images."""
+    min_confidence: float = 0.0
+    """Leave out detections below, 0 to 1."""
+    max_detections: int | None = None
+    """Keep that many of an image, the most confident. None: all."""
+    exif_rotation: bool = False
+    """Turn images as EXIF says, and K with them. Otherwise pixels are taken as stored, to which K belongs."""
+    jobs: int = num_cores()
+    """Images worked on at the same time; by default the number of cores that there are for it."""
+    ray: str | None = None
+    """Do it on a Ray cluster: HOST:PORT, auto for the one this machine is in, local for this machine's processors."""
+    token_file: Path | None = None
+    """File with the bearer token that the server asks for."""
+    server_ca: Path | None = None
+    """Authority (PEM) that signed the server's certificate; turns TLS on."""
+    tls_certificate: Path | None = None
+    """Our own certificate (PEM), for a server that asks for one."""
+    tls_key: Path | None = None
+    """Key of our certificate (PEM)."""
+
+
+def main() -> NoReturn:
+    """Entry point of the command."""
+    arguments: DetectArguments = parse(DetectArguments, prog="curio-detect")
+    # Both by name: a process started in the background inherits an ignored SIGINT, and Python then leaves it so.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _terminate)
+    try:
+        status = run(arguments)
+    except BrokenPipeError:
+        # whoever read our standard output has what it wanted; Python's own flush at exit must not fail on it again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        status = 1
+    except CurioError as exc:
+        print(f"curio-detect: error: {exc}", file=sys.stderr)
+        status = exc.exit_status
+    except KeyboardInterrupt as exc:
+        print(f"\ncurio-detect: stopped. {_how_to_go_on(arguments)}", file=sys.stderr)
+        status = 128 + (exc.args[0] if exc.args else signal.SIGINT)
+    sys.exit(status)
+
+
+def run(arguments: DetectArguments) -> int:
+    """Does the work and returns the exit status: 1 where an image has no answer.
+
+    Raises:
+        UsageError: The call cannot be carried out.
+        CurioError: The work as a whole failed.
+    """
+    # Heavy packages only now: --help does without.
+    import cv2
+
+    from curio_serve.batch.cluster import over_cluster
+    from curio_serve.batch.parallel import in_order
+    from curio_serve.batch.progress import Progress
+    from curio_serve.batch.result_file import ResultFile
+    from curio_serve.batch.sources import check_arguments, images
+
+    _check_numbers(arguments)
+    check_arguments(arguments.images)
+    cv2.setNumThreads(1)  # the images are what runs in parallel
+    settings = _settings(arguments)
+    estimator = _estimator(arguments, settings)
+    form = _format(arguments, estimator.spec)
+    _check_camera(arguments, estimator)
+    model = (estimator.name, estimator.version)
+    with ResultFile(arguments.out, form, model, overwrite=arguments.overwrite) as output:
+        remaining = output.unanswered(images(arguments.images))
+        if arguments.ray is None:
+            results = in_order(partial(_answer, estimator, form), remaining, arguments.jobs)
+        else:  # other nodes have another working folder
+            is_path = os.path.exists(arguments.model)
+            there = replace(arguments, model=os.path.abspath(arguments.model)) if is_path else arguments
+            results = over_cluster(arguments.ray, partial(_answering, there, settings), remaining)
+        with (
+            closing(results),
+            Progress(output.num_images, output.num_errors, is_shown=arguments.out is not None) as progress,
+        ):
+            for result in results:
+                output.write(result)
+                progress.count(result)
+        if output.num_images == 0:
+            raise UsageError(
+                f"no images in {' '.join(arguments.images)}; looked for .jpg, .jpeg, .png and .webp in folders, "
+                "sub-folders included"
+            )
+        progress.report(output.label)
+        return 1 if output.num_errors else 0
+
+
+def _check_numbers(arguments: DetectArguments) -> None:
+    if arguments.jobs < 1:
+        raise UsageError(f"--jobs {arguments.jobs}: expected at least 1")
+    if not 0 <= arguments.min_confidence <= 1:
+        raise UsageError(f"--min-confidence {arguments.min_confidence}: expected 0 to 1")
+    if arguments.max_detections is not None and arguments.max_detections < 1:
+        raise UsageError(f"--max-detections {arguments.max_detections}: expected at least 1")
+    if arguments.obj_id is not None and (arguments.format != "bop" or arguments.obj_id < 1):
+        raise UsageError(f"--obj-id {arguments.obj_id}: expected a number from 1, together with --format bop")
+
+
+def _settings(arguments: DetectArguments) -> "Settings":
+    from curio_serve.batch.estimators import Settings
+    from curio_serve.batch.sources import common_folder
+    from curio_serve.imaging.camera_files import read_camera_file
+
+    try:
+        cameras = None if arguments.camera is None else read_camera_file(arguments.camera)
+    except CameraError as exc:
+        raise UsageError(f"--camera: {exc}") from exc
+    if arguments.overlays is not None:
+        _check_overlays(arguments.overlays, arguments.images)
+    return Settings(
+        cameras,
+        arguments.min_confidence,
+        arguments.max_detections,
+        arguments.exif_rotation,
+        arguments.overlays and arguments.overlays.absolute(),
+        common_folder(arguments.images),
+    )
+
+
+def _check_overlays(folder: Path, images: tuple[str, ...]) -> None:
+    """Refuse drawings that would land on the images, or be taken for images by this run or the next."""
+    from curio_serve.batch.sources import common_folder
+
+    target = Path(os.path.abspath(folder))
+    for argument in images:
+        source = common_folder([argument])
+        if target == source or (not os.path.isfile(argument) and argument != "-" and target.is_relative_to(source)):
+            raise UsageError(f"--overlays {folder} lies within the images' own folder {source}; choose one outside it")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise UsageError(f"--overlays {folder}: cannot be made: {exc.strerror}") from exc
+
+
+def _estimator(arguments: DetectArguments, settings: "Settings") -> "Estimator":
+    """The model on this machine or behind a server."""
+    from curio_serve.batch.estimators import LocalEstimator, RemoteEstimator
+    from curio_serve.models.model_folder import open_model
+
+    if os.path.exists(arguments.model):
+        return LocalEstimator(open_model(arguments.model), settings)
+    served = _SERVED_MODEL.fullmatch(arguments.model)
+    if served is None:
+        raise UsageError(
+            f"MODEL {arguments.model}: no such folder or file, nor HOST:PORT/NAME of a server; expected a folder that "
+            "curio-export wrote, such as models/ape"
+        )
+    return RemoteEstimator(_client(arguments, served["address"]), served["model"], settings)
+
+
+def _answering(arguments: DetectArguments, settings: "Settings") -> "Callable[[SourceImage], ImageLines]":
+    """What answers images in another process."""
+    estimator = _estimator(arguments, settings)
+    return partial(_answer, estimator, _format(arguments, estimator.spec))
+
+
+def _answer(estimator: "Estimator", form: "ResultFormat", image: "SourceImage") -> "ImageLines":
+    """What is written of an image. One thread that made the lines of all images would keep the others waiting."""
+    return form.lines(estimator(image))
+
+
+def _client(arguments: DetectArguments, address: str) -> "PoseClient":
+    from curio_serve.client import PoseClient, Tls
+
+    tls = None
+    if arguments.server_ca is not None:
+        tls = Tls(arguments.server_ca, arguments.tls_certificate, arguments.tls_key)
+    elif arguments.tls_certificate is not None or arguments.tls_key is not None:
+        raise UsageError("--tls-certificate and --tls-key need --server-ca: they are shown over TLS only")
+    try:
+        token = "" if arguments.token_file is None else arguments.token_file.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as exc:
+        raise UsageError(f"--token-file {arguments.token_file} cannot be read: {exc}") from exc
+    # Patient: a busy or restarting server shall not end a run over many images.
+    return PoseClient(address, timeout_s=60.0, max_attempts=50, tls=tls, token=token)
+
+
+def _check_camera(arguments: DetectArguments, estimator: "Estimator") -> None:
+    canonical = estimator.canonical
+    if arguments.camera is None and canonical.matrix is not None and not canonical.is_default:
+        raise UsageError(
+            f"model {estimator.name} needs the intrinsics of the camera that took the images; give --camera FILE "
+            "(camera JSON, BOP's camera.json or scene_camera.json, or OpenCV YAML)"
+        )
+
+
+def _format(arguments: DetectArguments, spec: "ModelSpec") -> "ResultFormat":
+    from curio_serve.batch.formats import Bop, Csv, JsonLines, bop_object_ids
+
+    if arguments.format == "jsonl":
+        return JsonLines()
+    if arguments.format == "csv":
+        return Csv()
+    if not spec.camera.camera_matrix:
+        raise UsageError(f"--format bop is for poses in space; the model's world {spec.world!r} is flat")
+    return Bop(bop_object_ids([kind.name for kind in spec.objects], arguments.obj_id))
+
+
+def _how_to_go_on(arguments: DetectArguments) -> str:
+    if arguments.out is None:
+        return "Standard output cannot be gone on with; give --out FILE to be able to."
+    command = [part for part in sys.argv[1:] if part not in ("--overwrite", "--no-overwrite")]
+    return f"{arguments.out} holds complete images; to go on: {shlex.join(['curio-detect', *command])}"
+
+
+def _terminate(number: int, _: object) -> NoReturn:
+    raise KeyboardInterrupt(number)

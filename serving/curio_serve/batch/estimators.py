@@ -1,0 +1,226 @@
+"""One image in, one result out, whether the model is a file on this machine or answers behind a server.
+
+What is wrong with one image (its bytes, its K) becomes that result's ``error``; what is wrong with everything (the
+server is gone, the disk is full) is raised.
+"""
+
+import os
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+from curio_proto.v1.detector_pb2 import RegionResult
+from curio_proto.v1.model_spec_pb2 import ModelSpec
+
+from curio_serve.batch.formats import ImageResult
+from curio_serve.batch.sources import SourceImage
+from curio_serve.errors import ArgumentError, CameraError, ImageError, InternalError, OutputError
+from curio_serve.imaging import image as images
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.camera_files import CameraFile
+from curio_serve.imaging.image_header import Header
+from curio_serve.imaging.overlay import draw
+from curio_serve.models.detector import Detector
+from curio_serve.models.model import Model, canonical_camera
+
+if TYPE_CHECKING:
+    from curio_serve.client import PoseClient
+
+_OF_ONE_IMAGE = (ImageError, CameraError, ArgumentError, InternalError)
+_DRAWN_SUFFIXES = (".jpg", ".jpeg", ".png")
+_FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What holds for all images of a run.
+
+    Attributes:
+        cameras: Their intrinsics; None for 2D worlds and models that allow a default.
+        min_confidence: Detections below are left out.
+        max_detections: Most confident first; None: all.
+        apply_exif_rotation: Turn pixels, and K with them.
+        overlays: Where drawings go; None: nowhere.
+        sources_root: Folder below which the images' paths are told apart.
+    """
+
+    cameras: CameraFile | None = None
+    min_confidence: float = 0.0
+    max_detections: int | None = None
+    apply_exif_rotation: bool = False
+    overlays: Path | None = None
+    sources_root: Path = Path("/")
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What a model saw in one image.
+
+    Attributes:
+        camera: The one that was used, of the frame as turned.
+        frame: Where the frame was decoded here in its full size.
+    """
+
+    width: int
+    height: int
+    camera: PinholeCamera | None
+    results: Sequence[RegionResult]
+    decode_ms: float | None
+    inference_ms: float
+    frame: images.Frame | None = None
+
+
+class Estimator(ABC):
+    """Answers images one at a time; safe to share between threads.
+
+    Attributes:
+        name: Of the model.
+        version: Of the model.
+        spec: What the model says about itself.
+    """
+
+    def __init__(self, name: str, version: int, spec: ModelSpec, settings: Settings) -> None:
+        self.name, self.version, self.spec = name, version, spec
+        self.settings = settings
+        self.canonical = canonical_camera(spec, name)
+
+    def __call__(self, image: SourceImage) -> ImageResult:
+        """The image's detections, drawn where that is asked for, or what is wrong with it.
+
+        Raises:
+            OutputError: The drawing cannot be written.
+            ServiceError: The server is out of reach or overloaded.
+            RequestError: The server refuses what would be the same for every image.
+        """
+        try:
+            data = b"" if image.pixels is not None else image.read()
+            seen = self._look(image, data, self._camera(image))
+            if self.settings.overlays is not None:
+                self._draw(self.settings.overlays, image, data, seen)
+        except _OF_ONE_IMAGE as exc:
+            return ImageResult(image.name, self.name, self.version, error=str(exc))
+        return ImageResult(
+            image.name,
+            self.name,
+            self.version,
+            seen.width,
+            seen.height,
+            () if seen.camera is None else seen.camera.matrix.ravel().tolist(),
+            seen.results,
+            seen.decode_ms,
+            seen.inference_ms,
+        )
+
+    @abstractmethod
+    def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> _Seen:
+        """Detects in a video's frame or in the bytes of an image file; the camera is that of the stored pixels."""
+
+    def _camera(self, image: SourceImage) -> PinholeCamera | None:
+        if self.canonical.matrix is None or self.settings.cameras is None:
+            return None
+        return self.settings.cameras.camera_for(image.relative_name)
+
+    def _frame(
+        self, image: SourceImage, data: bytes, header: Header | None = None, max_reduction: int = 1
+    ) -> images.Frame:
+        if image.pixels is None:
+            turn = self.settings.apply_exif_rotation
+            return images.decode(data, header=header, max_reduction=max_reduction, apply_exif_rotation=turn)
+        height, width = image.pixels.shape[:2]
+        images.check_size(width, height)
+        return images.Frame(image.pixels, width, height)
+
+    def _draw(self, folder: Path, image: SourceImage, data: bytes, seen: _Seen) -> None:
+        frame = seen.frame or self._frame(image, data)
+        pixels = draw(frame.pixels, seen.results, self.spec, seen.camera)
+        path = _drawing_path(folder, image, self.settings.sources_root)
+        parameters = _FAST_PNG if path.suffix.lower() == ".png" else []
+        is_encoded, encoded = cv2.imencode(path.suffix, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), parameters)
+        if not is_encoded:
+            raise OutputError(f"{path}: a drawing of {seen.width}x{seen.height} pixels cannot be encoded")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(encoded.tobytes())
+        except OSError as exc:
+            raise OutputError(f"--overlays: {path} cannot be written: {exc.strerror}") from exc
+
+
+class LocalEstimator(Estimator):
+    """Runs a model in this process."""
+
+    def __init__(self, model: Model, settings: Settings) -> None:
+        super().__init__(model.name, model.version, model.spec, settings)
+        self._detector = Detector(model)
+
+    def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> _Seen:
+        started = time.perf_counter()
+        header, reduction = None, 1
+        if image.pixels is None:
+            header = images.open_header(data)
+            reduction = self._detector.reduction(camera, header.width, header.height)
+        frame = self._frame(image, data, header, reduction)
+        camera = _turned(camera, frame) or self.canonical.for_frame(frame.width, frame.height)
+        decoded = time.perf_counter()
+        results = self._detector.detect(
+            frame.pixels,
+            camera,
+            min_confidence=self.settings.min_confidence,
+            max_detections=self.settings.max_detections,
+            reduction=frame.reduction,
+        )
+        decode_ms = None if image.pixels is not None else 1000 * (decoded - started)
+        inference_ms = 1000 * (time.perf_counter() - decoded)
+        full_size = frame if frame.reduction == 1 else None
+        return _Seen(frame.width, frame.height, camera, results, decode_ms, inference_ms, full_size)
+
+
+class RemoteEstimator(Estimator):
+    """Asks a server; the model's version is settled once, so that a file of results is of one model.
+
+    Args:
+        client: Connected to the server.
+        model: ``name`` (the latest version now) or ``name/version``.
+        settings: For all images.
+        timeout_s: For the question which model that is: a wrong address shall not take long to be told.
+    """
+
+    def __init__(self, client: "PoseClient", model: str, settings: Settings, *, timeout_s: float = 5.0) -> None:
+        found = client.get_model(model, timeout_s=timeout_s)
+        super().__init__(model.partition("/")[0], found.version, found.spec, settings)
+        self._client = client
+
+    def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> _Seen:
+        payload = data if image.pixels is None else image.pixels
+        if self.settings.apply_exif_rotation and image.pixels is None:
+            frame = self._frame(image, data)  # turned here, so that the K written down is the turned one
+            payload, camera = frame.pixels, _turned(camera, frame)
+        answer = self._client.detect(
+            f"{self.name}/{self.version}",
+            payload,
+            camera,
+            min_confidence=self.settings.min_confidence,
+            max_detections=self.settings.max_detections,
+        )
+        camera = camera or self.canonical.for_frame(answer.width, answer.height)
+        spent = answer.milliseconds
+        return _Seen(answer.width, answer.height, camera, answer.results, spent.decode, spent.inference)
+
+
+def _turned(camera: PinholeCamera | None, frame: images.Frame) -> PinholeCamera | None:
+    """The camera of a decoded frame, from that of its stored pixels."""
+    if camera is None or not frame.quarter_turns:
+        return camera
+    stored = (frame.height, frame.width) if frame.quarter_turns % 2 else (frame.width, frame.height)
+    camera.check_frame(*stored)
+    return camera.turned(frame.quarter_turns, *stored)
+
+
+def _drawing_path(folder: Path, image: SourceImage, root: Path) -> Path:
+    """Mirrors the image's path below the folder, so that no two drawings meet."""
+    path = Path(os.path.abspath(image.relative_name))
+    target = folder / path.relative_to(root if path.is_relative_to(root) else path.anchor)
+    return target if target.suffix.lower() in _DRAWN_SUFFIXES else target.with_name(target.name + ".jpg")

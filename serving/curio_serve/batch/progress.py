@@ -1,0 +1,71 @@
+"""What ``curio-detect`` tells on standard error: a bar on a terminal, and what it came to at the end."""
+
+import sys
+import time
+from typing import TYPE_CHECKING, Self
+
+from curio_serve.batch.formats import ImageLines
+
+if TYPE_CHECKING:
+    from curio_serve.batch.progress_bar import Bar
+
+_NUM_PROBLEMS_SHOWN = 20
+
+
+class Progress:
+    """Counts images while they are answered.
+
+    Args:
+        num_before: Images answered by earlier runs.
+        num_errors_before: Of these, without an answer.
+        is_shown: Whether there may be a bar at all; it appears on a terminal alone.
+    """
+
+    def __init__(self, num_before: int, num_errors_before: int, *, is_shown: bool) -> None:
+        self._bar = _bar(num_before, num_errors_before) if is_shown and sys.stderr.isatty() else None
+        self._num_before = num_before
+        self._num_new = 0
+        self._num_errors = num_errors_before
+        self._problems: list[str] = []
+        self._start_s = time.perf_counter()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def count(self, lines: ImageLines) -> None:
+        """One more image."""
+        self._num_new += 1
+        if lines.error:
+            self._num_errors += 1
+            if len(self._problems) < _NUM_PROBLEMS_SHOWN:
+                self._problems.append(f"{lines.image}: {lines.error}")
+        if self._bar is not None:
+            self._bar.advance(self._num_errors)
+
+    def report(self, label: str) -> None:
+        """Sums up, with the first problems of this run."""
+        seconds = time.perf_counter() - self._start_s
+        before = f" after {self._num_before} of earlier runs" if self._num_before else ""
+        _say(f"{self._num_new} images{before} in {seconds:.1f} s ({self._num_new / seconds:.1f} images/s) to {label}")
+        if self._num_errors:
+            _say(
+                f"{self._num_errors} images have no answer:" if self._problems else f"{self._num_errors} have no answer"
+            )
+        for problem in self._problems:
+            print(f"  {problem}", file=sys.stderr)
+        if len(self._problems) < self._num_errors and self._problems:
+            print(f"  ... and {self._num_errors - len(self._problems)} more", file=sys.stderr)
+
+
+def _bar(num_images: int, num_errors: int) -> "Bar":
+    from curio_serve.batch.progress_bar import Bar
+
+    return Bar(num_images, num_errors)
+
+
+def _say(text: str) -> None:
+    print(f"curio-detect: {text}", file=sys.stderr)

@@ -1,0 +1,7 @@
+"""A client for the pose service, blocking and asynchronous."""
+
+from curio_serve.client.client import AsyncPoseClient, PoseClient, Tls
+from curio_serve.client.request import detect_request
+from curio_serve.client.retries import error_from_answer
+
+__all__ = ["AsyncPoseClient", "PoseClient", "Tls", "detect_request", "error_from_answer"]

@@ -1,0 +1,259 @@
+"""A client for the pose service, blocking and asynchronous.
+
+    with PoseClient("127.0.0.1:8500") as client:
+        answer = client.detect("ape", "frame.jpg", camera="camera.json")
+
+Every call has a deadline. A call is repeated only where that is safe and of use: detection changes nothing, so it is
+tried again when the server was out of reach, or when its queue was full and it said when to come back; never past the
+deadline. Failures come back as the exceptions that the server raised (:mod:`curio_serve.errors`).
+"""
+
+import asyncio
+import time
+from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import grpc
+from curio_proto.v1 import detector_pb2 as messages
+from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
+
+from curio_serve.client.request import CameraLike, ImageLike, RegionLike, detect_request, selector
+from curio_serve.client.retries import Attempts, error_from_call
+from curio_serve.errors import UsageError
+
+# Connect again soon after a server was replaced; gRPC's own first pause is a second.
+_CHANNEL_OPTIONS = (("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_reconnect_backoff_ms", 2000))
+
+
+@dataclass(frozen=True)
+class Tls:
+    """Files (PEM) for an encrypted connection.
+
+    Attributes:
+        root_certificates: Who may have signed the server's certificate; None: the system's authorities.
+        certificate: Our own certificate, where the server asks for one.
+        private_key: Its key.
+    """
+
+    root_certificates: Path | None = None
+    certificate: Path | None = None
+    private_key: Path | None = None
+
+    def credentials(self) -> grpc.ChannelCredentials:
+        """What gRPC makes of the files.
+
+        Raises:
+            UsageError: One cannot be read, or certificate and key do not come together.
+        """
+        if (self.certificate is None) != (self.private_key is None):
+            raise UsageError("a client certificate and its private key belong together; one of them is missing")
+        roots, key, chain = (_read(path) for path in (self.root_certificates, self.private_key, self.certificate))
+        return grpc.ssl_channel_credentials(roots, key, chain)
+
+
+class _Client:
+    """What both clients have in common: where the server is and how a call is made, not when."""
+
+    def __init__(
+        self, address: str, *, timeout_s: float = 10.0, max_attempts: int = 5, tls: Tls | None = None, token: str = ""
+    ) -> None:
+        """Does not connect yet: the first call does.
+
+        Args:
+            address: ``host:port``.
+            timeout_s: Deadline of a call, all its attempts together, where the call names no other.
+            max_attempts: How often a call is tried at most.
+            tls: Encrypt; None: plain, for servers on the loopback.
+            token: Bearer token, where the server asks for one.
+        """
+        self.address = address
+        self._timeout_s = timeout_s
+        self._max_attempts = max_attempts
+        self._tls = tls
+        self._metadata = (("authorization", f"Bearer {token}"),) if token else ()
+
+    def _attempts(self, timeout_s: float | None) -> Attempts:
+        return Attempts(self.address, self._timeout_s if timeout_s is None else timeout_s, self._max_attempts)
+
+
+class PoseClient(_Client):
+    """Blocking client; safe to share between threads."""
+
+    def __init__(
+        self, address: str, *, timeout_s: float = 10.0, max_attempts: int = 5, tls: Tls | None = None, token: str = ""
+    ) -> None:
+        super().__init__(address, timeout_s=timeout_s, max_attempts=max_attempts, tls=tls, token=token)
+        if tls is None:
+            self._channel = grpc.insecure_channel(address, _CHANNEL_OPTIONS)
+        else:
+            self._channel = grpc.secure_channel(address, tls.credentials(), _CHANNEL_OPTIONS)
+        self._stub = PoseDetectorStub(self._channel)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the connection and every call in flight."""
+        self._channel.close()
+
+    def detect(
+        self,
+        model: str | Iterable[str],
+        image: ImageLike,
+        camera: CameraLike = None,
+        *,
+        regions: Iterable[RegionLike] = (),
+        min_confidence: float | None = None,
+        max_detections: int | None = None,
+        apply_exif_rotation: bool = False,
+        request_id: str = "",
+        timeout_s: float | None = None,
+    ) -> messages.DetectResponse:
+        """Poses in one image.
+
+        Args:
+            model: Name, or ``name/version``; several for several objects in one call.
+            image: Path of a JPEG, PNG or WebP file, its bytes, or pixels uint8 RGB [height, width, 3].
+            camera: Camera file, :class:`~curio_serve.imaging.camera.PinholeCamera` or K [3, 3] in pixels; None for
+                models that need none.
+            regions: Where to look, each (x, y, width, height) in pixels; none: everywhere.
+            min_confidence: Leave out what is below; None: the server's own threshold.
+            max_detections: Most confident first, a region and model; None: no limit.
+            apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
+            request_id: Comes back with the answer; empty: the server makes one up.
+            timeout_s: Deadline of this call.
+
+        Raises:
+            CurioError: What the server raised, or that it is out of reach.
+        """
+        request = detect_request(
+            model,
+            image,
+            camera,
+            regions=regions,
+            min_confidence=min_confidence,
+            max_detections=max_detections,
+            apply_exif_rotation=apply_exif_rotation,
+            request_id=request_id,
+        )
+        return self._call(self._stub.Detect, request, timeout_s)
+
+    def detect_stream(
+        self, requests: Iterable[messages.DetectRequest], *, timeout_s: float
+    ) -> Iterator[messages.DetectResponse]:
+        """Answers in the order of the requests (see :func:`detect_request`), over one connection; never repeated.
+
+        A frame that could not be answered has an answer without results, whose `error` says why
+        (:func:`error_from_answer`); the stream goes on.
+
+        Args:
+            requests: May be endless; sent as the server takes them.
+            timeout_s: Deadline of the whole stream.
+
+        Raises:
+            CurioError: The stream as a whole failed, or the server is out of reach.
+        """
+        call = self._stub.DetectStream(iter(requests), timeout=timeout_s, metadata=self._metadata)
+        try:
+            yield from call
+        except grpc.RpcError as exc:
+            raise error_from_call(exc, self.address) from exc
+        finally:
+            call.cancel()  # the caller may have stopped listening early
+
+    def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
+        """What the server has loaded."""
+        return list(self._call(self._stub.ListModels, messages.ListModelsRequest(), timeout_s).models)
+
+    def get_model(self, model: str, *, timeout_s: float | None = None) -> messages.GetModelResponse:
+        """Specification and version of a model, ``name`` (the latest) or ``name/version``."""
+        return self._call(self._stub.GetModel, messages.GetModelRequest(model=selector(model)), timeout_s)
+
+    def _call(self, method: Any, request: Any, timeout_s: float | None) -> Any:
+        attempts = self._attempts(timeout_s)
+        while True:
+            try:
+                return method(request, timeout=attempts.remaining_s, metadata=self._metadata)
+            except grpc.RpcError as exc:
+                pause_s = attempts.pause_after(exc)
+            time.sleep(pause_s)
+
+
+class AsyncPoseClient(_Client):
+    """The same for asyncio; arguments and errors are those of :class:`PoseClient`."""
+
+    def __init__(
+        self, address: str, *, timeout_s: float = 10.0, max_attempts: int = 5, tls: Tls | None = None, token: str = ""
+    ) -> None:
+        super().__init__(address, timeout_s=timeout_s, max_attempts=max_attempts, tls=tls, token=token)
+        if tls is None:
+            self._channel = grpc.aio.insecure_channel(address, _CHANNEL_OPTIONS)
+        else:
+            self._channel = grpc.aio.secure_channel(address, tls.credentials(), _CHANNEL_OPTIONS)
+        self._stub = PoseDetectorStub(self._channel)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Ends the connection and every call in flight."""
+        await self._channel.close()
+
+    async def detect(
+        self,
+        model: str | Iterable[str],
+        image: ImageLike,
+        camera: CameraLike = None,
+        *,
+        timeout_s: float | None = None,
+        **options: Any,
+    ) -> messages.DetectResponse:
+        """Poses in one image; ``options`` are the keyword arguments of :meth:`PoseClient.detect`."""
+        return await self._call(self._stub.Detect, detect_request(model, image, camera, **options), timeout_s)
+
+    async def detect_stream(
+        self, requests: AsyncIterable[messages.DetectRequest], *, timeout_s: float
+    ) -> AsyncIterator[messages.DetectResponse]:
+        """Answers in the order of the requests; see :meth:`PoseClient.detect_stream`."""
+        call = self._stub.DetectStream(requests, timeout=timeout_s, metadata=self._metadata)
+        try:
+            async for answer in call:
+                yield answer
+        except grpc.RpcError as exc:
+            raise error_from_call(exc, self.address) from exc
+        finally:
+            call.cancel()
+
+    async def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
+        """What the server has loaded."""
+        return list((await self._call(self._stub.ListModels, messages.ListModelsRequest(), timeout_s)).models)
+
+    async def get_model(self, model: str, *, timeout_s: float | None = None) -> messages.GetModelResponse:
+        """Specification and version of a model, ``name`` (the latest) or ``name/version``."""
+        return await self._call(self._stub.GetModel, messages.GetModelRequest(model=selector(model)), timeout_s)
+
+    async def _call(self, method: Any, request: Any, timeout_s: float | None) -> Any:
+        attempts = self._attempts(timeout_s)
+        while True:
+            try:
+                return await method(request, timeout=attempts.remaining_s, metadata=self._metadata)
+            except grpc.RpcError as exc:
+                pause_s = attempts.pause_after(exc)
+            await asyncio.sleep(pause_s)
+
+
+def _read(path: Path | None) -> bytes | None:
+    if path is None:
+        return None
+    try:
+        return path.read_bytes()
+    except OSError as exc:
+        raise UsageError(f"{path}: cannot be read: {exc.strerror}") from exc

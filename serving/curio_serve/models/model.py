@@ -1,0 +1,281 @@
+"""A loaded model: an ONNX file opened by onnxruntime, with its specification checked against its graph.
+
+The only file that imports onnxruntime, and that when a model is loaded.
+"""
+
+import hashlib
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from curio_proto.v1.model_spec_pb2 import Field, ModelSpec
+
+from curio_serve.errors import CameraError, InternalError, ModelError
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.view import CanonicalCamera
+from curio_serve.models.batching import Batcher
+from curio_serve.models.spec import read_spec
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+INPUT = "image"
+Outputs = Mapping[str, np.ndarray]
+
+# Shape of each output after [batch, num_slots] or [batch], and whether it is one a slot.
+_OUTPUT_SHAPES: dict[str, tuple[tuple[int, ...], bool]] = {
+    "translation_m": ((3,), True),
+    "rotation_6d": ((6,), True),
+    "rotation": ((3, 3), True),
+    "color": ((3,), True),
+    "confidence": ((), True),
+    "light": ((3,), False),
+}
+# What the exporter may derive from another field, so that the spec need not list it.
+_DERIVED = {"rotation", "rotation_6d"}
+
+
+@dataclass(frozen=True)
+class Runtime:
+    """How networks are run.
+
+    Attributes:
+        providers: onnxruntime's execution providers in order of preference.
+        max_batch: Most images of several calls in one run; 1: every call runs on its own.
+    """
+
+    providers: tuple[str, ...] = ("CPUExecutionProvider",)
+    max_batch: int = 1
+
+
+DEFAULT_RUNTIME = Runtime()
+
+
+@dataclass(frozen=True, eq=False)
+class Slot:
+    """One row of the per-object outputs.
+
+    Attributes:
+        object: Name of the kind of object it holds.
+        box_corners: 8 points (x, y, z), object frame, metres (image widths in 2D worlds); none where the spec has none.
+    """
+
+    object: str
+    box_corners: Sequence[Sequence[float]]
+
+
+class Model:
+    """An exported network, ready to run; safe to share between threads.
+
+    Attributes:
+        name: What clients ask for.
+        version: Of the model folder; 0 for a file outside one.
+        spec: As stored in the file.
+        camera: What its input shows.
+        slots: One for each row of the per-object outputs.
+        sha256: Of the file, hexadecimal.
+    """
+
+    def __init__(
+        self,
+        session: "onnxruntime.InferenceSession",
+        spec: ModelSpec,
+        name: str,
+        version: int,
+        sha256: str,
+        max_batch: int = 1,
+    ) -> None:
+        self.name, self.version, self.spec, self.sha256 = name, version, spec, sha256
+        self.camera = canonical_camera(spec, name)
+        self.slots = slots(spec, name)
+        self.output_names: Sequence[str] = [output.name for output in session.get_outputs()]
+        self._session = session
+        self._run_many = Batcher(self._run, max_batch) if max_batch > 1 else self._run
+
+    @property
+    def output_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of each output, without the batch."""
+        return {name: _shape(name, self.spec.num_slots) for name in self.output_names}
+
+    @property
+    def label(self) -> str:
+        """Name and version, for messages."""
+        return f"{self.name}/{self.version}" if self.version else self.name
+
+    def run(self, images: np.ndarray) -> Outputs:
+        """Run the network.
+
+        Args:
+            images: uint8 RGB [batch, height, width, 3] of the size of ``camera``.
+
+        Returns:
+            Physical outputs by name, float32, as section 4 of the design has them.
+
+        Raises:
+            InternalError: The network answered with values that are not finite, or the runtime failed.
+        """
+        values = self._run_many(images)
+        for name, value in zip(self.output_names, values, strict=True):
+            # As plain numbers, because there are few: NumPy's two calls take several times as long.
+            if not all(map(math.isfinite, value.ravel().tolist())):
+                raise InternalError(f"model {self.label}: its output {name} is not finite for this image")
+        return dict(zip(self.output_names, values, strict=True))
+
+    def _run(self, images: np.ndarray) -> Sequence[np.ndarray]:
+        try:
+            outputs: Sequence[np.ndarray] = self._session.run(None, {INPUT: images})
+        except _runtime_errors() as exc:
+            raise InternalError(f"model {self.label}: onnxruntime failed on a batch of {len(images)}: {exc}") from exc
+        return outputs
+
+
+def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
+    """Read, check and open an ONNX file.
+
+    Args:
+        path: The file.
+        name: What clients ask for; empty: the name in its spec.
+        version: Of the model folder.
+        runtime: How the network is run.
+
+    Raises:
+        ModelError: Says which promise the file breaks.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as exc:
+        raise ModelError(f"model file {path} cannot be read: {exc.strerror}; expected an .onnx file") from exc
+    spec = read_spec(data, str(path))
+    session = _open(data, path, runtime.providers)
+    model = Model(
+        session, spec, name or spec.name or path.stem, version, hashlib.sha256(data).hexdigest(), runtime.max_batch
+    )
+    _check_graph(session, model)
+    _check_answer(model)
+    return model
+
+
+def _open(data: bytes, path: Path, providers: Sequence[str]) -> "onnxruntime.InferenceSession":
+    """One thread a call: parallel calls share the session, which holds the weights once."""
+    # Before the import: unless told not to, onnxruntime from 1.29 on writes an identifier into the user's cache folder
+    # and uploads events to its makers (its Privacy.md).
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    import onnxruntime
+
+    missing = set(providers) - set(onnxruntime.get_available_providers())
+    if missing:
+        raise ModelError(
+            f"--providers: {sorted(missing)} not found; this onnxruntime has {onnxruntime.get_available_providers()}"
+        )
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=list(providers))
+    except _runtime_errors() as exc:
+        raise ModelError(f"{path}: onnxruntime refuses the graph: {exc}") from exc
+
+
+def _runtime_errors() -> tuple[type[Exception], ...]:
+    """Onnxruntime's exceptions, which share no base."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as runtime
+
+    names = ("Fail", "InvalidArgument", "InvalidGraph", "InvalidProtobuf", "NotImplemented", "NoModel", "EPFail")
+    return (runtime.RuntimeException, *(getattr(runtime, name) for name in names))
+
+
+def _check_graph(session: "onnxruntime.InferenceSession", model: Model) -> None:
+    """Names and types of input and outputs are those the spec promises."""
+    inputs = [(i.name, i.type, i.shape[1:]) for i in session.get_inputs()]
+    expected = [(INPUT, "tensor(uint8)", [model.camera.height, model.camera.width, 3])]
+    if inputs != expected:
+        raise ModelError(f"model {model.label}: its inputs are {inputs}; its spec promises {expected}")
+    promised = {field.name for field in model.spec.fields}
+    found = set(model.output_names)
+    if missing := promised - found:
+        raise ModelError(f"model {model.label}: its spec promises {sorted(missing)}, its graph gives {sorted(found)}")
+    if unknown := found - promised - _DERIVED:
+        raise ModelError(f"model {model.label}: its graph gives {sorted(unknown)}, which its spec does not describe")
+    if strange := found - _OUTPUT_SHAPES.keys():
+        raise ModelError(f"model {model.label}: unknown outputs {sorted(strange)}; known are {sorted(_OUTPUT_SHAPES)}")
+    if "translation_m" not in found or len(found & _DERIVED) == 1:
+        raise ModelError(
+            f"model {model.label}: its graph gives {sorted(found)}; expected translation_m, "
+            "and rotation and rotation_6d both or neither"
+        )
+    for field in model.spec.fields:
+        _check_field(field, model)
+
+
+def _shape(name: str, num_slots: int) -> tuple[int, ...]:
+    shape, per_object = _OUTPUT_SHAPES[name]
+    return (num_slots, *shape) if per_object else shape
+
+
+def _check_field(field: Field, model: Model) -> None:
+    shape, per_object = _OUTPUT_SHAPES[field.name]
+    if field.per_object != per_object or field.size != int(np.prod(shape)):
+        raise ModelError(
+            f"model {model.label}: field {field.name} has size {field.size}, per_object {field.per_object}; "
+            f"expected {int(np.prod(shape))}, {per_object}"
+        )
+
+
+def _check_answer(model: Model) -> None:
+    """Two images through the graph: the shapes are right, and the batch is free."""
+    images = np.full((2, model.camera.height, model.camera.width, 3), 128, np.uint8)
+    try:
+        outputs = model.run(images)
+    except InternalError as exc:
+        raise ModelError(f"a grey image cannot pass the graph: {exc}") from exc
+    for name, value in outputs.items():
+        expected = (2, *_shape(name, model.spec.num_slots))
+        if value.shape != expected or value.dtype != np.float32:
+            raise ModelError(f"model {model.label}: {name} is {value.dtype} {value.shape}; expected float32 {expected}")
+
+
+def canonical_camera(spec: ModelSpec, name: str) -> CanonicalCamera:
+    """The camera of a spec.
+
+    Raises:
+        ModelError: Its size or K* is impossible.
+    """
+    camera, values = spec.camera, list(spec.camera.camera_matrix)
+    if not (camera.width and camera.height) or len(values) not in (0, 9):
+        raise ModelError(
+            f"model {name}: its spec has a camera of {camera.width}x{camera.height} pixels with {len(values)} values "
+            "of K*; expected a size and 9 values (none in 2D worlds)"
+        )
+    if not values:
+        return CanonicalCamera(camera.width, camera.height)
+    try:
+        matrix = PinholeCamera(np.reshape(values, (3, 3))).matrix
+    except CameraError as exc:
+        raise ModelError(f"model {name}: its spec's {exc}") from exc
+    return CanonicalCamera(camera.width, camera.height, matrix, camera.is_default)
+
+
+def slots(spec: ModelSpec, name: str) -> tuple[Slot, ...]:
+    """Which object each row of the outputs belongs to.
+
+    Raises:
+        ModelError: A row belongs to no object or to two, or a box has not 8 corners.
+    """
+    rows: dict[int, Slot] = {}
+    for kind in spec.objects:
+        values = list(kind.box_corners_m)
+        if len(values) not in (0, 24):
+            raise ModelError(f"model {name}: the box of {kind.name} has {len(values)} values; expected 8 corners x 3")
+        corners = list(zip(values[0::3], values[1::3], values[2::3], strict=True))
+        for row in kind.slots:
+            if row in rows:
+                raise ModelError(f"model {name}: slot {row} belongs to both {rows[row].object} and {kind.name}")
+            rows[row] = Slot(kind.name, corners)
+    if not spec.num_slots or sorted(rows) != list(range(spec.num_slots)):
+        raise ModelError(f"model {name}: {spec.num_slots} slots, but its objects name the slots {sorted(rows)}")
+    return tuple(rows[row] for row in range(spec.num_slots))

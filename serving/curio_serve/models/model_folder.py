@@ -1,0 +1,164 @@
+"""A model's folder in Triton's layout: ``<name>/{config.pbtxt, CARD.md, SHA256SUMS, <version>/model.onnx}``.
+
+What it promises beside the ONNX file is checked here: the file's hash, that Triton would serve the same tensors, and,
+where a version has ``golden.npz`` (``image`` uint8 [height, width, 3] and the outputs for it by name, without a batch),
+that the network gives those outputs on this machine.
+"""
+
+import re
+import stat
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from curio_proto.files.triton_config_pb2 import TritonConfig, TritonType
+from google.protobuf import text_format
+
+from curio_serve.errors import InternalError, ModelError
+from curio_serve.models.model import DEFAULT_RUNTIME, INPUT, Model, Runtime, load
+
+MODEL_FILE = "model.onnx"
+GOLDEN_FILE = "golden.npz"
+_GOLDEN_TOLERANCE = 1e-3  # metres, image widths, entries of matrices; float16 weights on another processor stay below
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+
+def is_model_name(name: str) -> bool:
+    """Whether a folder may be called so: letters, digits, ``_``, ``-``, ``.``, at most 64, no leading dot."""
+    return _NAME.fullmatch(name) is not None
+
+
+def versions(folder: Path) -> list[int]:
+    """Versions in a model's folder, ascending.
+
+    Raises:
+        ModelError: It cannot be read.
+    """
+    try:
+        return sorted(
+            int(entry.name)
+            for entry in folder.iterdir()
+            if entry.name.isdecimal() and int(entry.name) > 0 and _has_model(entry)
+        )
+    except OSError as exc:
+        raise ModelError(f"model folder {folder} cannot be read: {exc.strerror}") from exc
+
+
+def _has_model(version: Path) -> bool:
+    """Whether a version's folder has a model, or may have: what cannot be looked at is for the load to say."""
+    try:
+        return stat.S_ISREG((version / MODEL_FILE).stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+
+
+def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
+    """Load one version of a model's folder.
+
+    Raises:
+        ModelError: Says which promise it breaks.
+    """
+    path = folder / str(version) / MODEL_FILE
+    model = load(path, folder.name, version, runtime)
+    try:
+        _check_sum(folder, f"{version}/{MODEL_FILE}", model.sha256)
+        _check_config(folder, model)
+        _check_golden(folder / str(version) / GOLDEN_FILE, model)
+    except OSError as exc:
+        raise ModelError(f"{exc.filename} cannot be read: {exc.strerror}") from exc
+    return model
+
+
+def open_model(path: str | Path) -> Model:
+    """Load what a command line calls MODEL: a model's folder (latest version), a version's folder or an .onnx file.
+
+    Raises:
+        ModelError: There is no model, or it cannot be used.
+    """
+    path = Path(path)
+    if path.is_file():
+        return load(path)
+    if not path.is_dir():
+        raise ModelError(f"no model at {path}; expected a model folder, a version folder or an .onnx file")
+    resolved = path.resolve()
+    if (path / MODEL_FILE).is_file():
+        if resolved.name.isdecimal():
+            return load_version(resolved.parent, int(resolved.name))
+        return load(path / MODEL_FILE)
+    found = versions(path)
+    if not found:
+        raise ModelError(f"no model in {path}; expected {path}/<version>/{MODEL_FILE}, as curio-export writes it")
+    return load_version(resolved, found[-1])
+
+
+def _check_sum(folder: Path, file: str, sha256: str) -> None:
+    """Compare with SHA256SUMS (``sha256sum``'s format), where the folder has one."""
+    sums = folder / "SHA256SUMS"
+    if not sums.is_file():
+        return
+    lines = (line.split(maxsplit=1) for line in sums.read_text(encoding="utf-8", errors="replace").splitlines())
+    expected = {parts[1].strip().lstrip("*").removeprefix("./"): parts[0].lower() for parts in lines if len(parts) == 2}
+    if file not in expected:
+        raise ModelError(f"{sums} does not list {file}; it lists {sorted(expected)}. Export again, or add its line")
+    if expected[file] != sha256:
+        raise ModelError(
+            f"{folder / file} has SHA-256 {sha256[:12]}…, but SHA256SUMS says {expected[file][:12]}…: "
+            "the file is damaged or was replaced; copy it again"
+        )
+
+
+def _check_config(folder: Path, model: Model) -> None:
+    """Compare config.pbtxt, where the folder has one, with the graph."""
+    path = folder / "config.pbtxt"
+    if not path.is_file():
+        return
+    try:
+        config = text_format.Parse(path.read_text(encoding="utf-8"), TritonConfig(), allow_unknown_field=True)
+    except (text_format.ParseError, UnicodeDecodeError) as exc:
+        raise ModelError(f"{path} is not a Triton model configuration: {exc}") from exc
+    if config.name not in ("", folder.name):
+        raise ModelError(f"{path}: name is {config.name!r}; Triton wants the folder's, {folder.name!r}")
+    if "onnxruntime" not in (config.backend, config.platform.removesuffix("_onnx")):
+        raise ModelError(f'{path}: backend is {config.backend or config.platform!r}; expected "onnxruntime"')
+    if config.max_batch_size < 1:
+        raise ModelError(f"{path}: max_batch_size is {config.max_batch_size}; expected at least 1: the batch is free")
+    inputs = {t.name: (t.data_type, list(t.dims)) for t in config.input}
+    expected = {INPUT: (TritonType.TYPE_UINT8, [model.camera.height, model.camera.width, 3])}
+    if inputs != expected:
+        raise ModelError(
+            f"{path}: inputs are {inputs}; the graph has {expected} (type {TritonType.TYPE_UINT8} is UINT8)"
+        )
+    outputs = {t.name: (t.data_type, list(t.dims)) for t in config.output}
+    expected = {name: (TritonType.TYPE_FP32, list(shape)) for name, shape in model.output_shapes.items()}
+    if outputs != expected:
+        raise ModelError(f"{path}: outputs are {outputs}; the graph has {expected}")
+
+
+def _check_golden(path: Path, model: Model) -> None:
+    """Run the golden image, where the version has one, and compare the outputs with those stored beside it."""
+    if not path.is_file():
+        return
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            expected = dict(file)
+    except (ValueError, EOFError, zipfile.BadZipFile) as exc:
+        raise ModelError(f"{path} is not an archive of arrays: {exc}; export the model again") from exc
+    image, size = expected.pop(INPUT, None), (model.camera.height, model.camera.width, 3)
+    if image is None or image.shape != size or image.dtype != np.uint8 or not expected:
+        found = None if image is None else f"{image.dtype} {image.shape}"
+        raise ModelError(f"{path}: image is {found}, outputs {sorted(expected)}; expected uint8 {size} and an output")
+    try:
+        outputs = model.run(image[None])
+    except InternalError as exc:
+        raise ModelError(f"{path}: the golden image cannot pass the graph: {exc}") from exc
+    for name, value in expected.items():
+        if name not in outputs or outputs[name][0].shape != value.shape:
+            raise ModelError(f"{path}: {name} {value.shape} is no output of the graph, which has {model.output_shapes}")
+        off = float(np.abs(outputs[name][0] - value).max(initial=0))
+        if not off <= _GOLDEN_TOLERANCE:
+            raise ModelError(
+                f"{path}: the network's {name} is {off:.3g} off for the golden image; at most {_GOLDEN_TOLERANCE:g} is "
+                "accepted: this file, or this machine's runtime, does not compute what was exported"
+            )

@@ -1,0 +1,174 @@
+"""The models a server offers: found in a folder, loaded, and swapped while serving.
+
+A model is ``<root>/<name>/<version>/model.onnx``. What is loaded is one immutable table, replaced as a whole, so a call
+sees the old or the new state and never something between. A candidate that comes while serving is first loaded in a
+child process with bounded memory and time; one that fails leaves what serves untouched.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from curio_serve.errors import ModelError, ModelNotFound
+from curio_serve.models.model import DEFAULT_RUNTIME, Model, Runtime
+from curio_serve.models.model_folder import GOLDEN_FILE, MODEL_FILE, is_model_name, load_version, versions
+
+Key = tuple[str, int]
+Signature = tuple[tuple[int, int, int], ...]
+_FOLDER = 0  # in place of a version: the model's folder itself
+
+
+@dataclass(frozen=True)
+class Change:
+    """What became of one version at a look into the folder.
+
+    Attributes:
+        name: Of the model.
+        version: Of the model; 0: its folder cannot be read.
+        event: "loaded", "unloaded" or "refused".
+        reason: Why it was refused.
+    """
+
+    name: str
+    version: int
+    event: str
+    reason: str = ""
+
+
+class Repository:
+    """Models under one folder."""
+
+    def __init__(self, root: Path, num_versions: int = 2, runtime: Runtime = DEFAULT_RUNTIME) -> None:
+        """Nothing is loaded yet: see :meth:`refresh`.
+
+        Args:
+            root: Folder of models.
+            num_versions: Newest versions of each model to keep.
+            runtime: How networks are run.
+        """
+        self._root, self._num_versions, self._runtime = root, num_versions, runtime
+        self._models: Mapping[str, Mapping[int, Model]] = {}
+        self._seen: dict[Key, Signature] = {}
+
+    def get(self, name: str, version: int = 0) -> Model:
+        """A loaded model; version 0 is the latest.
+
+        Raises:
+            ModelNotFound: Lists what is there.
+        """
+        loaded = self._models.get(name)
+        if not loaded:
+            raise ModelNotFound(f"no model {name[:64]!r}; loaded are {sorted(self._models)}")
+        if version and version not in loaded:
+            raise ModelNotFound(f"model {name!r} has no version {version}; loaded are {sorted(loaded)}")
+        return loaded[version or max(loaded)]
+
+    def __iter__(self) -> Iterator[tuple[str, Mapping[int, Model]]]:
+        """Name and versions of each model, by name."""
+        return iter(sorted(self._models.items()))
+
+    def refresh(self, check: Callable[[Path, int], None] | None = None) -> list[Change]:
+        """Look into the folder, load what is new or changed and drop what is gone.
+
+        Args:
+            check: Called with the model's folder and the version before this process opens the file; raises ModelError.
+
+        Returns:
+            What changed. A refused candidate is not tried again until its files change.
+
+        Raises:
+            ModelError: The folder itself cannot be read.
+        """
+        changes: list[Change] = []
+        models: dict[str, Mapping[int, Model]] = {}
+        seen: dict[Key, Signature] = {}
+        for folder in self._folders():
+            if loaded := self._versions(folder, check, seen, changes):
+                models[folder.name] = loaded
+        for name, previous in self._models.items():
+            changes += [Change(name, v, "unloaded") for v in previous if v not in models.get(name, {})]
+        self._seen, self._models = seen, models
+        return changes
+
+    def _versions(
+        self,
+        folder: Path,
+        check: Callable[[Path, int], None] | None,
+        seen: dict[Key, Signature],
+        changes: list[Change],
+    ) -> Mapping[int, Model]:
+        """What shall serve of a model: its newest versions that can; where its folder cannot be read, what serves now.
+
+        Args:
+            folder: Of the model.
+            check: See :meth:`refresh`.
+            seen: Gets what was found.
+            changes: Gets what changed.
+        """
+        name = folder.name
+        try:
+            found = versions(folder)
+        except ModelError as exc:
+            seen |= {key: signature for key, signature in self._seen.items() if key[0] == name}
+            if (name, _FOLDER) not in seen:
+                changes.append(Change(name, _FOLDER, "refused", str(exc)))
+            seen[name, _FOLDER] = ()
+            return self._models.get(name, {})
+        loaded: dict[int, Model] = {}
+        for version in reversed(found):
+            if len(loaded) == self._num_versions:
+                break
+            seen[name, version] = _signature(folder, version)
+            model = self._current(folder, version, seen[name, version], check, changes)
+            if model is not None:
+                loaded[version] = model
+        return loaded
+
+    def _current(
+        self,
+        folder: Path,
+        version: int,
+        signature: Signature,
+        check: Callable[[Path, int], None] | None,
+        changes: list[Change],
+    ) -> Model | None:
+        """What shall serve a version: loaded anew if its files changed; else, or if that fails, what serves now."""
+        present = self._models.get(folder.name, {}).get(version)
+        if self._seen.get((folder.name, version)) == signature:
+            return present
+        try:
+            if check is not None:
+                check(folder, version)
+            model = load_version(folder, version, self._runtime)
+        except ModelError as exc:
+            changes.append(Change(folder.name, version, "refused", str(exc)))
+            return present
+        changes.append(Change(folder.name, version, "loaded"))
+        return model
+
+    def _folders(self) -> list[Path]:
+        try:
+            return sorted(folder for folder in self._root.iterdir() if is_model_name(folder.name) and folder.is_dir())
+        except OSError as exc:
+            raise ModelError(
+                f"models folder {self._root} cannot be read: {exc.strerror}; "
+                f"expected a folder with <name>/<version>/{MODEL_FILE}"
+            ) from exc
+
+
+def _signature(folder: Path, version: int) -> Signature:
+    files = (
+        *(folder / str(version) / name for name in (MODEL_FILE, GOLDEN_FILE)),
+        folder / "SHA256SUMS",
+        folder / "config.pbtxt",
+    )
+    signature = []
+    for file in files:
+        try:
+            stat = file.stat()
+        except OSError:
+            signature.append((0, 0, 0))
+        else:
+            # When it was last changed in any way: another owner or mode may be what makes it fit to be read.
+            signature.append((stat.st_ctime_ns, stat.st_size, stat.st_ino))
+    return tuple(signature)

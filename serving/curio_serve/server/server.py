@@ -1,0 +1,220 @@
+"""The server's life: open the port, load the models, watch for new ones, drain, leave."""
+
+import contextlib
+import logging
+import socket
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import grpc
+from curio_proto.inference import inference_pb2
+from curio_proto.v1 import detector_pb2
+from grpc_health.v1 import health, health_pb2
+from grpc_reflection.v1alpha import reflection, reflection_pb2
+from prometheus_client import CollectorRegistry, start_http_server
+
+from curio_serve.api.admission import WorkQueue
+from curio_serve.api.kserve import InferenceService
+from curio_serve.api.pose_detector import Limits, PoseService
+from curio_serve.api.registration import register
+from curio_serve.cores import num_cores
+from curio_serve.errors import ModelError, Unavailable, UsageError
+from curio_serve.models.model import Runtime
+from curio_serve.models.model_check import ChildCheck
+from curio_serve.models.repository import Change, Repository
+from curio_serve.server.config import ServeConfig
+from curio_serve.server.security import TokenInterceptor, Tokens, read_tokens, server_credentials
+from curio_serve.telemetry import Metrics, log
+
+_POSE = detector_pb2.DESCRIPTOR.services_by_name["PoseDetector"]
+_INFERENCE = inference_pb2.DESCRIPTOR.services_by_name["GRPCInferenceService"]
+_HEALTH = health_pb2.DESCRIPTOR.services_by_name["Health"]
+_REFLECTION = reflection_pb2.DESCRIPTOR.services_by_name["ServerReflection"]
+_SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
+
+
+_DEVICE_BATCH = 8  # of a GPU provider
+
+
+class PoseServer:
+    """One server: :meth:`start`, then :meth:`serve_until_stopped`, which :meth:`stop` ends from anywhere."""
+
+    def __init__(self, config: ServeConfig) -> None:
+        self.config = config
+        registry = CollectorRegistry()
+        self._registry = registry
+        self._metrics = Metrics(registry)
+        on_cpu = config.providers == ("CPUExecutionProvider",)
+        batch = config.batch or (1 if on_cpu else _DEVICE_BATCH)
+        self._repository = Repository(config.models, config.versions, Runtime(config.providers, batch))
+        # Calls that wait for a batch leave their core to others, which decode meanwhile.
+        workers = config.workers or num_cores() + (batch if batch > 1 else 0)
+        self._work = WorkQueue(workers, config.queue, self._metrics)
+        # Watchers of health wait without a thread each.
+        watchers = ThreadPoolExecutor(1)
+        self._health = health.HealthServicer(experimental_non_blocking=True, experimental_thread_pool=watchers)
+        self._inference = InferenceService(self._repository, self._work, self._metrics)
+        self._check = ChildCheck()
+        self._server: grpc.Server | None = None
+        self._stopped = threading.Event()
+
+    def start(self) -> list[str]:
+        """Load the models and open the ports.
+
+        Returns:
+            The addresses that answer: gRPC's, and the metrics' URL where they are on.
+
+        Raises:
+            ModelError: No model can be loaded.
+            Unavailable: A port is taken.
+            UsageError: A certificate, key or token file cannot be used.
+        """
+        # Frames run in parallel already, one a core; OpenCV's own threads would only get in their way.
+        cv2.setNumThreads(1)
+        self._report(self._repository.refresh())
+        if not list(self._repository):
+            raise ModelError(
+                f"no model could be loaded from {self.config.models}; the log says why each was refused. "
+                "Export one with curio-export"
+            )
+        self._server = self._build()
+        addresses = [self._open_port(self._server)]
+        if self.config.metrics_port is not None:
+            addresses.append(self._open_metrics(self.config.metrics_port))
+        self._server.start()
+        self._announce()
+        return addresses
+
+    def _build(self) -> grpc.Server:
+        config = self.config
+        tokens = Tokens(read_tokens(config.token_file) if config.token_file else ())
+        server = grpc.server(
+            # Threads are made as calls need them, so their number follows the load; one that waits takes 16 kB.
+            ThreadPoolExecutor(config.max_calls, thread_name_prefix="curio-call"),
+            interceptors=[TokenInterceptor(tokens)],
+            options=channel_options(config),
+            maximum_concurrent_rpcs=config.max_calls,
+        )
+        limits = Limits(
+            config.max_pixels,
+            config.max_regions,
+            config.max_models,
+            config.max_streams,
+            config.min_confidence,
+            config.full_decode,
+        )
+        pose = PoseService(self._repository, self._work, limits, self._metrics)
+        register(server, _POSE, pose)
+        register(server, _INFERENCE, self._inference)
+        register(server, _HEALTH, self._health)
+        names = [service.full_name for service in (_POSE, _INFERENCE, _HEALTH, _REFLECTION)]
+        register(server, _REFLECTION, reflection.ReflectionServicer(names))
+        return server
+
+    def _open_port(self, server: grpc.Server) -> str:
+        host, port = self.config.host, self.config.port
+        address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        credentials = server_credentials(self.config)
+        try:
+            bound = server.add_secure_port(address, credentials) if credentials else server.add_insecure_port(address)
+        except RuntimeError as exc:
+            if reason := _why_not(host, port):
+                raise Unavailable(f"cannot listen on {address}: {reason}; choose another --host or --port") from exc
+            raise UsageError(
+                f"--tls-certificate {self.config.tls_certificate} and --tls-key {self.config.tls_key} cannot be used; "
+                "expected PEM files of a certificate (chain) and its own key"
+            ) from exc
+        return f"{address.rsplit(':', 1)[0]}:{bound}"
+
+    def _open_metrics(self, port: int) -> str:
+        try:
+            http, _thread = start_http_server(port, addr=self.config.host, registry=self._registry)
+        except OSError as exc:
+            raise Unavailable(
+                f"cannot serve metrics on port {port}: {exc.strerror}; choose another --metrics-port"
+            ) from exc
+        return f"http://{self.config.host}:{http.server_port}/metrics"
+
+    def _announce(self) -> None:
+        """Health of the whole and of each service and model."""
+        names = [name for name, _ in self._repository]
+        for name in ("", _POSE.full_name, _INFERENCE.full_name, *names):
+            self._health.set(name, _SERVING)
+
+    def serve_until_stopped(self) -> None:
+        """Answer calls until :meth:`stop`, which may have come during :meth:`start`; then drain."""
+        watcher = threading.Thread(target=self._watch, name="curio-watch")
+        watcher.start()
+        try:
+            self._stopped.wait()
+        finally:
+            self._stopped.set()
+            self._drain()
+            self._check.stop()
+            watcher.join()
+            log(logging.INFO, "stopped")
+
+    def stop(self) -> None:
+        """Begin to drain."""
+        self._stopped.set()
+
+    def _drain(self) -> None:
+        """Refuse new calls and let accepted ones finish."""
+        if self._server is None:
+            return
+        log(logging.INFO, "draining", grace_s=self.config.grace_s)
+        self._inference.drain()
+        self._health.enter_graceful_shutdown()
+        self._server.stop(self.config.grace_s).wait()
+
+    def _watch(self) -> None:
+        """Pick up new model versions for as long as the server lives."""
+        while self.config.refresh_s and not self._stopped.wait(self.config.refresh_s):
+            before = {name for name, _ in self._repository}
+            try:
+                self._report(self._repository.refresh(self._check))
+            except ModelError as exc:
+                log(logging.ERROR, "models folder unreadable; serving what is loaded", reason=str(exc))
+                continue
+            self._announce()
+            for gone in before - {name for name, _ in self._repository}:
+                self._health.set(gone, _NOT_SERVING)
+
+    def _report(self, changes: list[Change]) -> None:
+        for change in changes:
+            refused = change.event == "refused"
+            reason = {"reason": change.reason} if refused else {}
+            level = logging.ERROR if refused else logging.INFO
+            log(level, f"model {change.event}", model=change.name, version=change.version, **reason)
+            self._metrics.refused_models.inc(refused)
+        self._metrics.models.set(sum(len(loaded) for _, loaded in self._repository))
+
+
+def channel_options(config: ServeConfig) -> list[tuple[str, int]]:
+    """What gRPC itself shall enforce on every connection."""
+    return [
+        # Two servers on one port would share its calls without a word.
+        ("grpc.so_reuseport", 0),
+        ("grpc.max_receive_message_length", config.max_message_mb << 20),
+        ("grpc.max_send_message_length", 64 << 20),
+        ("grpc.max_metadata_size", 16 << 10),
+        # Well above the queue: a call that is refused early counts until its client has heard of it, and calls beyond
+        # this limit are reset without a word of when to come back.
+        ("grpc.max_concurrent_streams", 512),
+        # Half-open connections are found out; idle clients may ping, but not more often than every 10 s.
+        ("grpc.keepalive_time_ms", 60_000),
+        ("grpc.keepalive_timeout_ms", 20_000),
+        ("grpc.keepalive_permit_without_calls", 1),
+        ("grpc.http2.min_ping_interval_without_data_ms", 10_000),
+    ]
+
+
+def _why_not(host: str, port: int) -> str:
+    """Why an address cannot be listened on, or nothing: gRPC keeps the operating system's reason to itself."""
+    with contextlib.closing(socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)) as probe:
+        try:
+            probe.bind((host, port))
+        except OSError as exc:
+            return exc.strerror or str(exc)
+    return ""

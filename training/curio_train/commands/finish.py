@@ -1,0 +1,55 @@
+"""What a finished run leaves beside itself: a report, and of one's own part a model that can be served."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from curio_train.config import RunConfig
+from curio_train.errors import CurioError, ExportError
+from curio_train.worlds.options import CaptureOptions
+
+MODELS_FOLDER = "models"
+"""In the folder of a run of one's own part: its exported models."""
+
+
+def end(run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None]) -> str:
+    """Write the report and, of one's own part, the next version of RUN/models/NAME.
+
+    Args:
+        run: The run folder.
+        config: Its configuration.
+        cache: Where worlds keep their image sets.
+        warn: Told where the report could not be made; the run has succeeded all the same.
+
+    Returns:
+        How to go on, for the user.
+
+    Raises:
+        ExportError: No model could be made. The run is whole.
+    """
+    from curio_train.evaluation.report import report_training
+
+    try:
+        report_training(run, cache)
+    except CurioError as exc:
+        warn(str(exc))
+    if not isinstance(config.world, CaptureOptions):
+        return f"to serve it: curio-export {run} --out models/, then curio-serve models/"
+    return _exported(run, config.world.camera)
+
+
+def _exported(run: Path, camera: Path) -> str:
+    from curio_train.export.graph import export
+
+    models = run / MODELS_FOLDER
+    try:
+        done = export(run, models)
+    except CurioError as exc:
+        raise ExportError(
+            f"{run} is trained and whole, but no model could be made of it: {exc}. Once that is put right: "
+            f"curio-export {run} --out {models}"
+        ) from exc
+    return (
+        f"{done.path}: the model, {done.num_bytes / 1e6:.1f} MB; what it finds in the photographs: {run}/report.html\n"
+        f"to serve it: curio-serve {models}\n"
+        f"to try it:   curio-detect {done.path.parent} PHOTOS --camera {camera} --out poses.jsonl --overlays overlays/"
+    )

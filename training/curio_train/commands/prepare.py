@@ -1,0 +1,87 @@
+"""What a world's options need before anything is trained: data is fetched, files of one's own are examined.
+
+What is found out here is written into the run's configuration, so that a run keeps it whatever becomes of the files.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from curio_train.config import NetworkConfig, RunConfig
+from curio_train.worlds.options import CaptureOptions, LinemodOptions
+
+
+def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: Callable[[str], None]) -> RunConfig:
+    """The configuration of a new run, ready to be trained.
+
+    Args:
+        config: As called.
+        cache: Where downloads are kept.
+        warn: Told of what is doubtful.
+        tell: Told of what was found out.
+
+    Raises:
+        DataError: A download failed, or files of one's own are certain not to work.
+    """
+    options = config.world
+    if isinstance(options, LinemodOptions) and options.photos is None:
+        config = replace(config, recipe=replace(config.recipe, self_training=0.0))  # so that the model says so
+    if isinstance(options, LinemodOptions) and options.data is None and options.download:
+        from curio_train.data.download import download_linemod
+
+        config = replace(config, world=replace(options, data=download_linemod(cache), download=False))
+    if isinstance(config.world, LinemodOptions):
+        _refuse_unreadable(config.world)
+    if isinstance(options, CaptureOptions):
+        from curio_train.doctor.before_training import refuse_unfit
+
+        for doubt in refuse_unfit(options):
+            warn(doubt)
+        return replace(config, world=_with_paint(options, tell), network=_usual_network(config, options))
+    return config
+
+
+def _usual_network(config: RunConfig, options: CaptureOptions) -> NetworkConfig:
+    """Parts on a plane are read by cells, unless the call, the paper, or wake–sleep wants it otherwise."""
+    if options.plane is None or config.network.reading is not None:
+        return config.network
+    whole = config.preset == "paper" or config.terms > {"sleep"}
+    return replace(config.network, reading="whole" if whole else "cells")
+
+
+def _refuse_unreadable(options: LinemodOptions) -> None:
+    """Frames for self-training are first needed when most of the budget is spent: too late to hear of a broken one."""
+    if options.photos is None or options.data is None:
+        return
+    from curio_train.data.bop import BopDataset
+    from curio_train.data.photographs import Photographs, read_frame
+    from curio_train.worlds.single_object.linemod import read_camera_poses
+
+    camera = BopDataset(options.data).camera
+    paths = Photographs(options.photos).paths
+    for path in paths:
+        read_frame(path, camera)
+    if options.views is not None:
+        read_camera_poses(options.views, paths)
+
+
+def _with_paint(options: CaptureOptions, tell: Callable[[str], None]) -> CaptureOptions:
+    """Off the plane an unpainted part is drawn in the colour that photographs over a plate show."""
+    from curio_train.camera import load_intrinsics
+    from curio_train.data.part_color import find_color, is_unpainted
+    from curio_train.meshes.meshes import load_mesh
+
+    if options.plane is not None or options.paint is not None:
+        return options
+    if not is_unpainted(load_mesh(options.mesh[0], options.mesh_unit)):
+        return options
+    anyway = "it is learned in any colour, which takes longer; --paint '#8a6f4c' says which it has"
+    if options.background is None:
+        tell(f"the part's colour is not known without --background, a photograph of the empty scene: {anyway}")
+        return options
+    found = find_color(options.photos, options.background, load_intrinsics(options.camera))
+    if found is None:
+        tell(f"the part's colour was not found where the photographs differ from {options.background}: {anyway}")
+        return options
+    tell(f"the part's colour, from {found.num_used} of {found.num_compared} photographs: {found.hex}")
+    return replace(options, paint=found.hex)

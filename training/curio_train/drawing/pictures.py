@@ -1,0 +1,226 @@
+"""Pictures of scenes for people: the training renderer at full resolution, or stock Mitsuba's path tracer."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from curio_train.camera import scale_matrix
+from curio_train.data.photographs import read_photograph
+from curio_train.drawing.scenes import Placed, Scene
+from curio_train.errors import DataError, UsageError
+from curio_train.geometry import Pose
+from curio_train.meshes.meshes import Mesh
+from curio_train.rendering.ground import Ground
+from curio_train.rendering.path_tracing import path_traced
+from curio_train.rendering.renderer import Renderer
+from curio_train.rendering.stock import PosedMesh
+from curio_train.worlds.generated.mesh_world import MeshWorld
+
+AMBIENT = 0.4
+LIGHT = (-0.25, -0.45, -0.5)
+"""Of scenes whose light nobody knows: from behind the camera, above its left shoulder."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneContext:
+    """What a scene itself does not say.
+
+    Attributes:
+        meshes: By the object's name; the one named "" stands for every object without its own.
+        ambient: Radiance from everywhere.
+        light: Camera frame, towards the light [3], where the scene has none.
+        center_m: Camera frame, what the camera is carried round; None: the middle of the objects.
+        up: Camera frame, the axis that it is carried round.
+        ground: What the objects stand on, camera frame, or None.
+    """
+
+    meshes: Mapping[str, Mesh]
+    ambient: float = AMBIENT
+    light: np.ndarray | None = None
+    center_m: np.ndarray | None = None
+    up: tuple[float, ...] = (0.0, -1.0, 0.0)
+    ground: Ground | None = None
+
+    @classmethod
+    def of_world(cls, world: MeshWorld) -> "SceneContext":
+        """Those of a generated world."""
+        turn, shift = world.stage.cam_from_world
+        return cls(
+            {kind.name: kind.mesh for kind in world.kinds},
+            world.stage.ambient,
+            turn @ np.array(world.stage.sun),
+            turn @ np.array(world.stage.center_m) + shift,
+            tuple((turn @ np.array(world.stage.up)).tolist()),
+            world.ground(world.stage.cam_from_world),
+        )
+
+    def mesh(self, kind: str) -> Mesh:
+        """The mesh of an object.
+
+        Raises:
+            DataError: None has its name.
+        """
+        found = self.meshes.get(kind, self.meshes.get(""))
+        if found is None:
+            raise DataError(f"no mesh for object {kind!r}, only for {', '.join(self.meshes)}; add --mesh {kind}=FILE")
+        return found
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a scene is to be drawn.
+
+    Attributes:
+        height: Of the picture, pixels; None: the scene's own.
+        turn_deg: How far the camera is carried round the objects; 90 is the novel view of the paper's image error.
+        over_photograph: Draw over the photograph that the objects were found in.
+        path_traced: By stock Mitsuba's path tracer, with the light that surfaces give each other.
+        samples: A pixel.
+    """
+
+    height: int | None = None
+    turn_deg: float = 0.0
+    over_photograph: bool = False
+    path_traced: bool = False
+    samples: int = 64
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be drawn."""
+        if self.samples < 1 or (self.height is not None and self.height < 1):
+            raise UsageError(f"found --samples {self.samples} and --height {self.height}, expected at least 1")
+        if self.over_photograph and self.turn_deg:
+            raise UsageError("--over-photograph and --turn-deg exclude each other: the photograph shows one side alone")
+
+
+def picture(scene: Scene, around: SceneContext, wish: RenderOptions) -> np.ndarray:
+    """Draw a scene: [height, width, 3] uint8 sRGB.
+
+    Raises:
+        DataError: An object without a mesh, or a photograph that is missing or of another size.
+        RendererError: No usable libLLVM, or a mesh that cannot be rendered.
+    """
+    scene, around = _resized(scene, wish.height), _with_light(scene, around)
+    behind = _photograph(scene) if wish.over_photograph else None
+    if behind is not None:
+        around = replace(around, ground=None)
+    scene, around = _carried(scene, around, wish.turn_deg)
+    draw = _path_traced if wish.path_traced else _rendered
+    image = draw(scene, around, behind, wish.samples)
+    return np.asarray((image.clip(0, 1) * 255 + 0.5).astype(np.uint8))
+
+
+def _resized(scene: Scene, height: int | None) -> Scene:
+    if height is None:
+        return scene
+    width = max(1, round(scene.width * height / scene.height))
+    matrix = scale_matrix(scene.camera_matrix, (scene.width, scene.height), (width, height))
+    return replace(scene, width=width, height=height, camera_matrix=matrix)
+
+
+def _with_light(scene: Scene, around: SceneContext) -> SceneContext:
+    known = scene.light if scene.light is not None else around.light
+    return replace(around, light=np.array(LIGHT) if known is None else known)
+
+
+def _photograph(scene: Scene) -> np.ndarray:
+    """Of the scene's size, [height, width, 3] in [0, 1]."""
+    if scene.photograph is None:
+        raise DataError(f"{scene.name} is a scene code, which has no photograph; leave out --over-photograph")
+    pixels = read_photograph(scene.photograph)
+    shape = pixels.shape[1] / pixels.shape[0]
+    if abs(shape * scene.height / scene.width - 1) > 0.02:
+        raise DataError(
+            f"{scene.photograph}: found {pixels.shape[1]}x{pixels.shape[0]} pixels, expected the shape of the frame "
+            f"that was detected in, {scene.width}x{scene.height}; is it another file by now?"
+        )
+    return cv2.resize(pixels, (scene.width, scene.height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+
+
+def _carried(scene: Scene, around: SceneContext, turn_deg: float) -> tuple[Scene, SceneContext]:
+    """Everything as the camera sees it that was carried round the middle, still looking at it."""
+    places = [item.pose.translation_m for item in scene.objects]
+    center = np.mean(places, axis=0) if around.center_m is None and places else around.center_m
+    if turn_deg == 0 or center is None:
+        return scene, around
+    turn = Rotation.from_rotvec(-np.radians(turn_deg) * np.array(around.up)).as_matrix()
+    objects = tuple(
+        replace(item, pose=Pose(turn @ item.pose.rotation, turn @ (item.pose.translation_m - center) + center))
+        for item in scene.objects
+    )
+    ground = around.ground
+    if ground is not None:
+        up = turn @ ground.up
+        # The centre's height over the ground stays; the camera's is that plus its own over the centre.
+        ground = replace(ground, up=up, camera_height_m=ground.camera_height_m + float((ground.up - up) @ center))
+    assert around.light is not None  # settled before
+    return replace(scene, objects=objects), replace(around, light=turn @ around.light, ground=ground)
+
+
+def _rendered(scene: Scene, around: SceneContext, behind: np.ndarray | None, samples: int) -> np.ndarray:
+    light = torch.tensor(around.light, dtype=torch.float32)[None]
+    blank = torch.zeros(1, 1, scene.height, scene.width)
+    background = blank.expand(1, 3, -1, -1) if behind is None else torch.from_numpy(behind).permute(2, 0, 1)[None]
+    if not scene.objects:
+        empty = background if around.ground is None else around.ground.image(around.ambient, light, blank)
+        return empty[0].permute(1, 2, 0).numpy()
+    kinds = list(dict.fromkeys(item.kind for item in scene.objects))
+    meshes, slots = tuple(around.mesh(kind) for kind in kinds), tuple(kinds.index(item.kind) for item in scene.objects)
+    shadows = around.ground is not None
+    renderer = _renderer(meshes, slots, scene.width, scene.height, around.ambient, samples, shadows)
+    seen: dict[str, Any] = {
+        "rotation": _stack([item.pose.rotation for item in scene.objects]),
+        "translation_m": _stack([item.pose.translation_m for item in scene.objects]),
+        "camera_matrix": scene.camera_matrix,
+        "light": light,
+        "confidence": _stack([item.confidence for item in scene.objects]),
+    }
+    if around.ground is not None:
+        background = around.ground.image(around.ambient, light, renderer.shadows(**seen, ground=around.ground))
+    image: Tensor = renderer(**seen, backgrounds=background, color=_stack([item.color_srgb for item in scene.objects]))
+    return image[0].permute(1, 2, 0).numpy()
+
+
+@functools.lru_cache(maxsize=4)
+def _renderer(
+    meshes: tuple[Mesh, ...],
+    slots: tuple[int, ...],
+    width: int,
+    height: int,
+    ambient: float,
+    samples: int,
+    shadows: bool,
+) -> Renderer:
+    """Scenes of one file mostly show the same objects."""
+    return Renderer(meshes, slots, width, height, ambient=ambient, samples_per_pixel=samples, object_shadows=shadows)
+
+
+def _stack(values: Sequence[object]) -> Tensor:
+    return torch.tensor(np.array(values), dtype=torch.float32)[None]
+
+
+def _path_traced(scene: Scene, around: SceneContext, behind: np.ndarray | None, samples: int) -> np.ndarray:
+    assert around.light is not None  # settled before
+    objects = [_posed(item, around) for item in scene.objects]
+    image = path_traced(
+        objects,
+        scene.camera_matrix,
+        scene.width,
+        scene.height,
+        ambient=around.ambient,
+        light=around.light,
+        ground=around.ground,
+        samples_per_pixel=samples,
+    )
+    color, alpha = image[..., :3], image[..., 3:]
+    return color * alpha + (0 if behind is None else behind) * (1 - alpha)
+
+
+def _posed(item: Placed, around: SceneContext) -> PosedMesh:
+    return PosedMesh(around.mesh(item.kind), *item.pose, item.color_srgb, item.confidence)

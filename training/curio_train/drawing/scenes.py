@@ -1,0 +1,177 @@
+"""Scenes to be drawn for people: lines of ``curio-detect`` and scene codes, read from JSON."""
+
+import dataclasses
+import functools
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from curio_train.camera import check_matrix
+from curio_train.errors import DataError
+from curio_train.geometry import Pose
+from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION
+from curio_train.worlds import WORLDS, build
+from curio_train.worlds.generated.mesh_world import MeshWorld
+
+EXPECTED = 'a line of curio-detect with "detections", or {"world": NAME, "code": {FIELD: numbers}}'
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """One object of a scene.
+
+    Attributes:
+        kind: Its name, by which its mesh is found.
+        pose: cam_from_obj, metres.
+        color_srgb: Albedo [3] that multiplies the mesh's own.
+        confidence: Its opacity.
+    """
+
+    kind: str
+    pose: Pose
+    color_srgb: tuple[float, ...] = (1.0, 1.0, 1.0)
+    confidence: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Objects before a camera.
+
+    Attributes:
+        name: For the picture's file.
+        width: Of the image that the camera matrix belongs to, pixels.
+        height: Likewise.
+        camera_matrix: K [3, 3].
+        objects: In the camera's frame.
+        light: Camera frame, towards the light [3], or None: not known.
+        photograph: That the objects were found in, or None.
+        world: Name of the generated world that the scene is a code of, or None.
+    """
+
+    name: str
+    width: int
+    height: int
+    camera_matrix: np.ndarray
+    objects: tuple[Placed, ...]
+    light: np.ndarray | None
+    photograph: Path | None = None
+    world: str | None = None
+
+
+@functools.cache
+def mesh_world(name: str) -> MeshWorld:
+    """The generated world of that name.
+
+    Raises:
+        DataError: There is none, or it is not a world of generated meshes.
+    """
+    known = [kind for kind, options in WORLDS.items() if not dataclasses.fields(options)]
+    world = build(WORLDS[name]()) if name in known else None
+    if not isinstance(world, MeshWorld):
+        solid = [kind for kind in known if kind != "circles"]
+        raise DataError(f"world {name!r} has no meshes of its own; expected one of {', '.join(solid)}")
+    return world
+
+
+def read_scenes(path: Path) -> Iterator[Scene]:
+    """The scenes of a JSON Lines file, or of one JSON object, in their order; lines that report an error are left out.
+
+    Raises:
+        DataError: The file cannot be read, or a line is no scene; it is named.
+    """
+    for number, record in _records(path):
+        where = f"{path}, line {number}"
+        if not isinstance(record, dict) or not {"detections", "code", "error"} & record.keys():
+            raise DataError(f"{where}: found {_short(record)}, expected {EXPECTED}")
+        if "error" in record:
+            continue
+        try:
+            yield _from_code(record, number) if "code" in record else _from_detections(record, number, where)
+        except (KeyError, TypeError, ValueError) as exc:
+            raise DataError(f"{where}: not a scene ({type(exc).__name__}: {exc}); expected {EXPECTED}") from exc
+
+
+def _records(path: Path) -> Iterator[tuple[int, Any]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as exc:
+        raise DataError(f"{path}: cannot be read ({exc}); expected {EXPECTED}") from exc
+    if not text.strip():
+        raise DataError(f"{path}: the file is empty; expected {EXPECTED}")
+    try:
+        yield 1, json.loads(text)
+        return
+    except ValueError:
+        pass  # more than one line, or damaged: the lines below tell
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip():
+            try:
+                yield number, json.loads(line)
+            except ValueError as exc:
+                raise DataError(f"{path}, line {number}: not JSON ({exc}); expected {EXPECTED}") from exc
+
+
+def _from_detections(record: Mapping[str, Any], number: int, where: str) -> Scene:
+    if record["camera_matrix"] is None:
+        raise DataError(f"{where}: it has no camera_matrix, so it is flat; expected poses in three dimensions")
+    width, height = int(record["width"]), int(record["height"])
+    light = record.get("light")
+    return Scene(
+        f"{number:06d}-{Path(record['image']).stem}",
+        width,
+        height,
+        check_matrix(record["camera_matrix"], width, height, f"{where}, camera_matrix"),
+        tuple(_placed(detection) for detection in record["detections"]),
+        None if light is None else _numbers(light, (3,), "light"),
+        Path(record["image"]),
+    )
+
+
+def _placed(detection: Mapping[str, Any]) -> Placed:
+    rotation, color = detection["rotation"], detection["color"]
+    return Placed(
+        str(detection["object"]),
+        Pose(
+            np.eye(3) if rotation is None else _numbers(rotation, (3, 3), "rotation"),
+            _numbers(detection["translation_m"], (3,), "translation_m"),
+        ),
+        (1.0, 1.0, 1.0) if color is None else tuple(_numbers(color, (3,), "color").tolist()),
+        float(detection["confidence"]),
+    )
+
+
+def _from_code(record: Mapping[str, Any], number: int) -> Scene:
+    world = mesh_world(str(record["world"]))
+    code = {name: torch.tensor([values], dtype=torch.float32) for name, values in record["code"].items()}
+    world.layout.check(code)
+    seen = {name: values[0].double().numpy() for name, values in world.exported(code).items()}
+    slots = len(seen[TRANSLATION])
+    rotation = seen.get("rotation", np.broadcast_to(np.eye(3), (slots, 3, 3)))
+    color, confidence = seen.get(COLOR, np.ones((slots, 3))), seen.get(CONFIDENCE, np.ones(slots))
+    kinds = {slot: kind.name for kind in world.objects for slot in kind.slots}
+    objects = [
+        Placed(kinds[i], Pose(rotation[i], seen[TRANSLATION][i]), tuple(color[i].tolist()), float(confidence[i]))
+        for i in range(slots)
+    ]
+    camera = world.camera
+    assert camera.matrix is not None  # every stage has a pinhole camera
+    name = f"{number:06d}-{world.name}"
+    light = seen.get(LIGHT)
+    return Scene(name, camera.width, camera.height, camera.matrix, tuple(objects), light, world=world.name)
+
+
+def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
+    found = np.asarray(values, dtype=np.float64)
+    if found.shape != shape or not np.isfinite(found).all():
+        raise ValueError(f"{name} is {_short(values)}, expected finite numbers of shape {list(shape)}")
+    return found
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,0 +1,99 @@
+"""The LineMOD runs and models in a folder, each with what made it."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from curio_train.errors import DataError, UsageError
+from curio_train.export.folder import MODEL_FILE, find_model
+from curio_train.export.onnx import OnnxModel
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.configuration import CONFIG_FILE, to_portable
+from curio_train.worlds.options import LinemodOptions
+
+SELF_TRAINED = ", self-trained"
+"""What follows the method's name where real frames without labels were learned from."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A run or a model of one LineMOD class.
+
+    Attributes:
+        path: Its folder.
+        name: The class.
+        method: That trained it; ``, self-trained`` follows where unlabelled real frames took part.
+        weights_sha256: Of the last checkpoint's tensors, or of the model file.
+    """
+
+    path: Path
+    name: str
+    method: str
+    weights_sha256: str
+
+
+def candidates(folder: Path, flag: str = "--runs", *, of_any_method: bool = True) -> list[Candidate]:
+    """The LineMOD runs and models in a folder, or the one that it is.
+
+    Args:
+        folder: Where they lie.
+        flag: That named it, for messages.
+        of_any_method: A class may be there once a method; else once.
+
+    Raises:
+        UsageError: There is none, or there are several of one kind.
+        CheckpointError: A run is damaged or has no checkpoint.
+        ExportError: A model is damaged.
+    """
+    found = list(_found(folder))
+    if not found:
+        raise UsageError(f"{flag} {folder}: found no run folder and no model of linemod; expected one a class")
+    first: dict[str, Candidate] = {}
+    for one in found:
+        kind = f"{one.name} by {one.method}" if of_any_method else one.name
+        other = first.setdefault(kind, one)
+        if other is not one:
+            expected = "one run a class and method" if of_any_method else "one of each object"
+            raise UsageError(
+                f"{flag} {folder}: found {other.path.name} and {one.path.name}, both {kind}; expected {expected}"
+            )
+    return found
+
+
+def _found(folder: Path) -> Iterator[Candidate]:
+    for path in [folder, *sorted(folder.glob("*"))]:
+        if (path / CONFIG_FILE).exists():
+            run = RunFolder.open(path)
+            if isinstance(run.config.world, LinemodOptions) and run.checkpoints():
+                weights = run.checkpoints()[-1] / "tensors.safetensors"
+                yield Candidate(
+                    path, run.config.world.class_name, _method(to_portable(run.config)), files_sha256(weights)
+                )
+        elif any(path.glob(f"[0-9]*/{MODEL_FILE}")):
+            file = find_model(path)
+            spec = OnnxModel.open(file).spec
+            if spec.world == "linemod":
+                yield Candidate(path, spec.objects[0].name, _method(json.loads(spec.recipe)), files_sha256(file))
+
+
+def _method(making: Mapping[str, Any]) -> str:
+    """Models that are older than self-training say nothing of it."""
+    return str(making["method"]) + (SELF_TRAINED if making["recipe"].get("self_training") else "")
+
+
+def files_sha256(*files: Path) -> str:
+    """SHA-256 of the contents of some files, one after the other.
+
+    Raises:
+        DataError: One cannot be read.
+    """
+    digest = hashlib.sha256()
+    for file in files:
+        try:
+            digest.update(file.read_bytes())
+        except OSError as exc:
+            raise DataError(f"{file}: cannot be read ({exc.strerror})") from exc
+    return digest.hexdigest()

@@ -1,0 +1,148 @@
+"""What a person should know of one version of a model, as a section of CARD.md."""
+
+import json
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from curio_proto.v1.model_spec_pb2 import ModelSpec
+
+from curio_train.config import METHODS, RunConfig
+from curio_train.learning.runs.provenance import RunSession
+from curio_train.learning.state import TrainingProgress
+from curio_train.worlds.base import ObjectKind
+
+EVALUATION_FILE = "evaluation.json"
+"""What ``curio-eval`` leaves in a run folder, and a card quotes."""
+
+_SUPERVISION = {
+    "label": "true scene codes of training images",
+    "sleep": "codes of its own making, rendered; no label of the data",
+}
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a version comes from.
+
+    Attributes:
+        run: The run folder.
+        config: What was learned and how.
+        sitting: The first sitting of training.
+        course: How far it came.
+        weights: How they are stored, and what that costs.
+    """
+
+    run: Path
+    config: RunConfig
+    sitting: RunSession
+    course: TrainingProgress
+    weights: str
+
+
+def card(
+    version: int, spec: ModelSpec, shapes: Mapping[str, Sequence[int]], objects: Sequence[ObjectKind], made: Provenance
+) -> str:
+    """A section of Markdown.
+
+    Args:
+        version: Of the model.
+        spec: Its specification.
+        shapes: Of the outputs, the batch left out.
+        objects: Of the world, for their attribution.
+        made: Where it comes from.
+    """
+    evaluation = read_evaluation(made.run, made.course.all_images)
+    parts = [
+        f"## Version {version}\n",
+        _table(("", ""), _origin(version, spec, made)),
+        _table(("output", "shape", "unit", "frame"), _outputs(spec, shapes)),
+        _table(("object", "diameter", "mesh SHA-256", "source and licence of the mesh"), _objects(spec, objects)),
+        _metrics(evaluation) if evaluation else "Not evaluated when it was exported.\n",
+    ]
+    if evaluation and "real" in evaluation:
+        parts.append(_real_frames(evaluation))
+    return "\n".join(parts)
+
+
+def read_evaluation(run: Path, images: int) -> dict[str, Any] | None:
+    """The result that curio-eval left in a run folder, if it is of the network that has seen ``images`` images."""
+    try:
+        found = json.loads((run / EVALUATION_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) and found.get("images_seen") == images else None
+
+
+def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[str, str]]:
+    terms = METHODS[made.config.method]
+    supervision = [text for term, text in _SUPERVISION.items() if term in terms] or ["none: images alone"]
+    yield "world", spec.world
+    yield "method", f"{made.config.method}, preset {made.config.preset}, seed {made.config.seed}"
+    yield "supervision", "; ".join(supervision)
+    yield "training", f"`{portable(made.sitting.command)}`"
+    yield "commit", made.sitting.commit or "not from a git checkout"
+    before, course = made.config.init, made.course
+    since = f", {course.images:,} of them since it was {before.name}" if before else ""
+    yield "images seen", f"{course.all_images:,}{since}"
+    since = f", {course.seconds / 60:.1f} of them since it was {before.name}" if before else ""
+    yield "training time", f"{course.all_seconds / 60:.1f} minutes{since}"
+    yield "machine", made.sitting.machine
+    yield "input", f"`image`, uint8 RGB [batch, {spec.camera.height}, {spec.camera.width}, 3]"
+    yield "weights", made.weights
+    yield "to train it further", f"`curio-train {spec.world} --init models/{spec.name}/{version}`, other flags as above"
+    yield "torch to onnxruntime", f"differ by at most {spec.parity_max_abs_error:.2g} in any output"
+
+
+def portable(command: str) -> str:
+    """A command as typed, of each folder or file that is named from a machine's root only the last part."""
+    return shlex.join(_last_part(word) for word in shlex.split(command))
+
+
+def _last_part(word: str) -> str:
+    flag, sign, value = word.partition("=") if word.startswith("--") else ("", "", word)
+    from_root = value.startswith(("/", "~"))
+    return f"{flag}{sign}{Path(value).name}" if from_root else word
+
+
+def _outputs(spec: ModelSpec, shapes: Mapping[str, Sequence[int]]) -> Iterable[tuple[str, ...]]:
+    fields = {field.name: field for field in spec.fields}
+    for name, shape in shapes.items():
+        field = fields.get(name)
+        sizes = ", ".join(["batch", *map(str, shape)])
+        yield f"`{name}`", f"[{sizes}]", field.unit if field else "1", (field.frame if field else "camera") or "–"
+
+
+def _objects(spec: ModelSpec, objects: Sequence[ObjectKind]) -> Iterable[tuple[str, ...]]:
+    unit = "m" if spec.camera.camera_matrix else "image widths"
+    for kind in objects:
+        digest = f"`{kind.mesh_sha256}`" if kind.mesh_sha256 else "–"
+        yield kind.name, f"{kind.diameter_m:.4g} {unit}", digest, kind.attribution or "–"
+
+
+def _metrics(evaluation: Mapping[str, Any]) -> str:
+    untrained = evaluation.get("untrained", {})
+    rows = [
+        (name, f"{value:.4g}", f"{untrained[name]:.4g}" if name in untrained else "–")
+        for name, value in evaluation["metrics"].items()
+    ]
+    head = f"On {evaluation['num_images']} held-out images of the {evaluation['split']} split:\n"
+    return f"{head}\n{_table(('metric', 'this model', 'untrained network'), rows)}"
+
+
+def _real_frames(evaluation: Mapping[str, Any]) -> str:
+    """Of the frames of a data set, whose labels are for scoring alone."""
+    real, refined = evaluation["real"], evaluation.get("refined", {}).get("real", {}).get("metrics", {})
+    rows = [
+        (name, f"{value:.4g}", f"{refined[name]:.4g}" if name in refined else "–")
+        for name, value in real["metrics"].items()
+    ]
+    head = f"On {real['num_targets']} targets in real frames of {real['dataset']} ({real['split_name']}):\n"
+    return f"{head}\n{_table(('metric', 'this model', 'after render-and-compare'), rows)}"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)

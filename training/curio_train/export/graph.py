@@ -1,0 +1,304 @@
+"""From a run to a model that any runtime can serve: encoder and heads alone, checked against the trained network."""
+
+import copy
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec, ObjectModel, Symmetry
+from curio_proto.v1.model_spec_pb2 import Field as FieldSpec
+from jaxtyping import Bool
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from curio_train.errors import ExportError
+from curio_train.export.card import Provenance, card
+from curio_train.export.folder import GOLDEN_FILE, MODEL_FILE, WEIGHTS_FILE, ModelFolder, triton_config
+from curio_train.export.onnx import SCHEMA_VERSION, OnnxModel, put_spec, store_half, to_onnx
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.configuration import to_portable
+from curio_train.learning.runs.initial import weights_file
+from curio_train.learning.runs.provenance import run_sessions
+from curio_train.scene_code import Field
+from curio_train.worlds import build
+from curio_train.worlds.base import ObjectKind, World
+
+LARGEST_PARITY_ERROR = 1e-4
+"""Largest absolute difference between torch and onnxruntime that an export may have, in any output."""
+
+_NUM_CHECK_IMAGES = 8  # of either kind
+_CHECK_SEED = (20_210,)
+_PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
+_LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
+_NUM_JITTERED = 16  # a tie is missed once in 2 to the power of this
+_LEAST_SETTLED = 0.25  # of the check images
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What became of an export.
+
+    Attributes:
+        path: The version's folder.
+        parity_error: Largest absolute difference between the network, its weights rounded as stored, and onnxruntime.
+        rounding_error: Largest absolute difference between that network and the one that was trained; 0 in float32.
+        num_bytes: Of model.onnx.
+    """
+
+    path: Path
+    parity_error: float
+    rounding_error: float
+    num_bytes: int
+
+
+class Graph(nn.Module):
+    """What is traced: pixels as a camera gives them in, physical quantities out."""
+
+    def __init__(self, network: nn.Module, world: World) -> None:
+        super().__init__()
+        self.network = network
+        self._world = world
+        self.eval()
+
+    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+        return tuple(self.outputs(image).values())
+
+    def outputs(self, image: Tensor) -> dict[str, Tensor]:
+        """Of uint8 images [batch, height, width, 3], by name."""
+        return self.read(image.permute(0, 3, 1, 2).float() / 255)
+
+    def read(self, pixels: Tensor) -> dict[str, Tensor]:
+        """Of pixels [batch, 3, height, width] in [0, 1]."""
+        return self._world.exported(self.network(pixels))
+
+
+def export(run: Path, out: Path, name: str | None = None, *, half: bool = False) -> Exported:
+    """Write the network of a run as the next version of a model.
+
+    Args:
+        run: The run folder. Its training images are not needed.
+        out: Folder of models.
+        name: Of the model; the world's choice unless given (a LineMOD model is named after its class).
+        half: Store weights as float16, half as large; they are computed with in float32.
+
+    Raises:
+        UsageError: The name cannot be a model's, or the folder is something else.
+        CheckpointError: The run is missing, damaged or without a checkpoint.
+        ExportError: torch and onnxruntime disagree, or the model cannot be written; nothing is left behind.
+    """
+    folder = RunFolder.open(run)
+    world = build(folder.config.world)
+    target = ModelFolder.named(out, world.model_name if name is None else name)
+    state = folder.trained(world)
+    trained = Graph(state.pose.network, world)
+    deployed = Graph(_deployable(state.pose.network, half), world)
+    images = check_images(world)
+    with torch.no_grad():
+        learned, expected = trained.outputs(images), deployed.outputs(images)
+    rounding_error = largest_difference(learned, expected) if half else 0.0
+
+    shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
+    config = triton_config(target.path.name, tuple(images.shape[1:]), shapes)
+    target.refuse_other_tensors(config)
+
+    model = to_onnx(deployed, world.camera.width, world.camera.height, list(expected))
+    if half:
+        store_half(model)
+    spec = model_spec(world, target.path.name)
+    spec.recipe = json.dumps(to_portable(folder.config))
+    first = run_sessions(run)[0]
+    spec.commit, spec.images_seen, spec.training_seconds = (
+        first.commit,
+        state.course.all_images,
+        state.course.all_seconds,
+    )
+    put_spec(model, spec)
+
+    found = OnnxModel(model.SerializeToString(), "the exported graph")(images.numpy())
+    known = settled(deployed if half else trained, images)
+    answers, found = ({name: v[known] for name, v in of.items()} for of in (expected if half else learned, found))
+    spec.parity_max_abs_error = refuse_disparity(answers, found)
+    put_spec(model, spec)
+    version = target.next_version()
+    made = Provenance(run, folder.config, first, state.course, _weights(half, rounding_error))
+    text = card(version, spec, shapes, world.objects, made)
+    files = {
+        MODEL_FILE: model.SerializeToString(),
+        GOLDEN_FILE: _golden(images[known], found),
+        WEIGHTS_FILE: weights_file(state, folder.config, half=half),
+    }
+    path = target.add(version, files, config, text)
+    return Exported(path, spec.parity_max_abs_error, rounding_error, model.ByteSize())
+
+
+def _golden(images: Tensor, outputs: Mapping[str, Tensor]) -> bytes:
+    """The first of the images and what onnxruntime made of it, by name, without a batch."""
+    file = io.BytesIO()
+    answers = {name: values[0].numpy() for name, values in outputs.items()}
+    np.savez_compressed(file, allow_pickle=False, image=images[0].numpy(), **answers)
+    return file.getvalue()
+
+
+def _weights(half: bool, rounding_error: float) -> str:
+    if not half:
+        return "float32"
+    return f"stored as float16, computed with in float32; outputs differ by at most {rounding_error:.2g} by that"
+
+
+def _deployable(network: nn.Module, half: bool) -> nn.Module:
+    """The network as it is deployed: batch norm folded into the convolutions, weights rounded as they are stored."""
+    network = copy.deepcopy(network).eval()
+    for module in network.modules():
+        if isinstance(module, nn.Sequential):
+            _fold(module)
+    if half:
+        for parameter in network.parameters():
+            parameter.data = parameter.data.half().float()
+            if not parameter.isfinite().all():
+                raise ExportError("a weight is too large for float16; export without --half")
+    return network
+
+
+def _fold(layers: nn.Sequential) -> None:
+    for number in range(len(layers) - 1):
+        convolution, norm = layers[number], layers[number + 1]
+        if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+            layers[number], layers[number + 1] = fuse_conv_bn_eval(convolution, norm), nn.Identity()
+
+
+@torch.no_grad()
+def check_images(world: World) -> Tensor:
+    """Images that torch and onnxruntime have to agree on, uint8 [batch, height, width, 3]: over black, then over noise.
+
+    The noise is smooth and never without objects: a gaze that moves by the last digit sees something else between white
+    pixels, and where nothing is to be found the last digit decides between places that are equally unlikely.
+    """
+    code = world.sample(_NUM_CHECK_IMAGES, _CHECK_SEED)
+    size = (world.camera.height, world.camera.width)
+    coarse = np.random.default_rng(_CHECK_SEED).random((_NUM_CHECK_IMAGES, 3, *(side // 8 for side in size)))
+    noise = F.interpolate(torch.from_numpy(coarse).float(), size, mode="bilinear")
+    images = torch.cat([world.render(code).cpu(), world.render(code, noise).cpu()]).clamp(0, 1)
+    return (images * 255).round().byte().permute(0, 2, 3, 1).contiguous()
+
+
+@torch.no_grad()
+def settled(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
+    """Which images can tell whether a runtime computes the same: their last digits do not move the answer.
+
+    Where the answer is a choice among equals (the likeliest cell, say, of a network that has learned next to nothing),
+    rounding decides, and torch differs from itself on another machine. It rounds in every layer, and cells that read
+    the same pixels almost alike are moved together by these: so layers are jittered, too.
+
+    Args:
+        graph: The network that is exported.
+        images: uint8 [batch, height, width, 3].
+
+    Raises:
+        ExportError: Too few can.
+    """
+    answers, generator = graph.outputs(images), torch.Generator().manual_seed(*_CHECK_SEED)
+    pixels = images.permute(0, 3, 1, 2).float() / 255
+    known = torch.ones(len(images), dtype=torch.bool)
+    with _unsteady(graph.network, generator):
+        for _ in range(_NUM_JITTERED):
+            jittered = graph.read(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
+            for name, values in answers.items():
+                known &= (values - jittered[name]).abs().flatten(1).amax(dim=1) <= LARGEST_PARITY_ERROR
+    if known.float().mean() < _LEAST_SETTLED:
+        raise ExportError(
+            f"the network's answers to {int((~known).sum())} of {len(images)} check images change with their last "
+            "digits or are not finite; nothing was written. Has the training diverged, or hardly begun?"
+        )
+    return known
+
+
+@contextmanager
+def _unsteady(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
+    """Within this, every layer is off by about as much as rounding in some other order can make it."""
+
+    def off(_layer: nn.Module, _given: object, said: Tensor) -> Tensor:
+        return said * (1 + _LAYER_JITTER * torch.randn(said.shape, generator=generator))
+
+    layers = [module for module in network.modules() if module is not network and not list(module.children())]
+    hooks = [layer.register_forward_hook(off) for layer in layers]
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def largest_difference(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
+    """Largest absolute difference of two sets of outputs; infinite where one is not finite or shapes differ."""
+    largest = 0.0
+    for name, values in one.items():
+        if name not in other or values.shape != other[name].shape:
+            return float("inf")
+        difference = (values.double() - other[name].double()).abs().max().item()
+        largest = max(largest, difference if np.isfinite(difference) else float("inf"))
+    return largest
+
+
+def refuse_disparity(expected: dict[str, Tensor], found: dict[str, Tensor]) -> float:
+    """The parity error.
+
+    Raises:
+        ExportError: It is too large; says in which output.
+    """
+    errors = {name: largest_difference({name: values}, found) for name, values in expected.items()}
+    worst = max(errors, key=lambda name: errors[name])
+    if errors[worst] > LARGEST_PARITY_ERROR:
+        raise ExportError(
+            f"torch and onnxruntime differ by {errors[worst]:.3g} in {worst}, expected at most "
+            f"{LARGEST_PARITY_ERROR:g}; nothing was written. Has the training diverged?"
+        )
+    return errors[worst]
+
+
+def model_spec(world: World, name: str) -> ModelSpec:
+    """What a model of this world says about itself, but for where it comes from."""
+    camera = world.camera
+    matrix: Sequence[float] = [] if camera.matrix is None else np.asarray(camera.matrix, float).ravel().tolist()
+    return ModelSpec(
+        schema_version=SCHEMA_VERSION,
+        name=name,
+        world=world.name,
+        num_slots=world.layout.num_slots,
+        fields=[_field_spec(field) for field in world.exported_fields],
+        objects=[_object_model(kind) for kind in world.objects],
+        camera=CanonicalCamera(
+            width=camera.width, height=camera.height, camera_matrix=matrix, is_default=camera.is_default
+        ),
+    )
+
+
+def _field_spec(field: Field) -> FieldSpec:
+    return FieldSpec(
+        name=field.name,
+        size=field.size,
+        per_object=field.per_object,
+        unit=field.unit,
+        frame=field.frame,
+        lower=field.lower,
+        upper=field.upper,
+        activation=field.activation,
+    )
+
+
+def _object_model(kind: ObjectKind) -> ObjectModel:
+    discrete = [Symmetry(transform=np.asarray(matrix, float).ravel()) for matrix in kind.symmetries]
+    continuous = [Symmetry(axis=axis, offset_m=offset) for axis, offset in kind.symmetry_axes]
+    return ObjectModel(
+        name=kind.name,
+        mesh_sha256=kind.mesh_sha256,
+        diameter_m=kind.diameter_m,
+        box_corners_m=np.asarray(kind.box_corners_m, float).ravel(),
+        symmetries=discrete + continuous,
+        slots=kind.slots,
+    )

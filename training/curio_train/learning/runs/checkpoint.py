@@ -1,0 +1,175 @@
+"""The run folder: configuration and checkpoints, written so that no crash can leave half of one.
+
+::
+
+    RUN/config.json
+        checkpoints/00001200/tensors.safetensors     weights, buffers, Adam's moments
+                             course.json             see Course
+        checkpoints/00001400/…                       the last two are kept
+        history.jsonl  samples.png  tensorboard/     written by ``progress``
+"""
+
+import json
+import os
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from curio_train.config import RunConfig
+from curio_train.errors import CheckpointError, UsageError
+from curio_train.learning.runs.configuration import CONFIG_FILE, load_config, to_json
+from curio_train.learning.state import TrainingProgress, TrainState
+from curio_train.worlds.base import World
+
+_NUM_KEPT = 2
+
+
+class RunFolder:
+    """Where a run lives.
+
+    Attributes:
+        path: The folder.
+        config: What the run was started with.
+    """
+
+    def __init__(self, path: Path, config: RunConfig) -> None:
+        self.path = path
+        self.config = config
+
+    @staticmethod
+    def open(path: Path) -> "RunFolder":
+        """An existing run.
+
+        Raises:
+            CheckpointError: The folder holds none, or its configuration is damaged.
+        """
+        return RunFolder(path, load_config(path))
+
+    def write_config(self, *, new: bool) -> None:
+        """Write the configuration, of a new run or with the budgets of a resumed one.
+
+        Raises:
+            UsageError: The run is to be new and the folder holds one already.
+            CheckpointError: The folder cannot be written.
+        """
+        file = self.path / CONFIG_FILE
+        if new and file.exists():
+            raise UsageError(
+                f"{self.path} holds a run already; go on with it by --resume {self.path}, or name another folder: --out"
+            )
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            draft = file.with_suffix(".tmp")
+            _write_synced(draft, json.dumps(to_json(self.config), indent=2).encode())
+            draft.replace(file)
+            _sync_folder(self.path)
+        except OSError as exc:
+            raise CheckpointError(
+                f"cannot write the run folder {self.path}: {exc.strerror}; name another: --out"
+            ) from exc
+
+    def checkpoints(self) -> list[Path]:
+        """Complete checkpoints, oldest first."""
+        return sorted(path for path in (self.path / "checkpoints").glob("[0-9]*") if path.is_dir())
+
+    def save(self, state: TrainState) -> None:
+        """Write a checkpoint, then drop all but the last two.
+
+        Raises:
+            CheckpointError: It could not be written (disk full, …). The earlier ones are untouched.
+        """
+        target = self.path / "checkpoints" / f"{state.course.step:08d}"
+        draft = target.with_name("draft.tmp")
+        try:
+            shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed while writing
+            draft.mkdir(parents=True)
+            tensors = {name: value.detach().cpu().contiguous() for name, value in state.tensors().items()}
+            _write_synced(draft / "tensors.safetensors", save(tensors))
+            _write_synced(draft / "course.json", json.dumps(asdict(state.course)).encode())
+            _sync_folder(draft)
+            if not target.exists():  # the same step is the same checkpoint
+                draft.rename(target)
+            _sync_folder(target.parent)
+        except OSError as exc:
+            shutil.rmtree(draft, ignore_errors=True)
+            raise CheckpointError(self._not_written(target, exc)) from exc
+        for old in self.checkpoints()[:-_NUM_KEPT]:
+            shutil.rmtree(old, ignore_errors=True)
+
+    def restore(self, state: TrainState) -> None:
+        """Bring ``state`` to the last checkpoint; without any it stays at the start.
+
+        Raises:
+            CheckpointError: The last checkpoint is damaged, or of other networks.
+        """
+        if not self.checkpoints():
+            return
+        tensors, course = self.last()
+        try:
+            state.load(tensors, course)
+        except RuntimeError as exc:
+            raise CheckpointError(_unreadable(self.checkpoints()[-1], exc)) from exc
+
+    def last(self) -> tuple[dict[str, Tensor], TrainingProgress]:
+        """The last checkpoint: all tensors of the :class:`TrainState` by name, and how far the run was.
+
+        Raises:
+            CheckpointError: There is no checkpoint, or it is damaged.
+        """
+        checkpoints = self.checkpoints()
+        if not checkpoints:
+            raise CheckpointError(f"{self.path} has no checkpoint yet; train it first: --resume {self.path}")
+        last = checkpoints[-1]
+        try:
+            course = TrainingProgress(**json.loads((last / "course.json").read_bytes()))
+            return load((last / "tensors.safetensors").read_bytes()), course
+        except (OSError, ValueError, TypeError, SafetensorError) as exc:
+            raise CheckpointError(_unreadable(last, exc)) from exc
+
+    def trained(self, world: World) -> TrainState:
+        """The last checkpoint on the CPU with the network in evaluation mode: what is exported and scored.
+
+        Raises:
+            CheckpointError: There is no checkpoint yet, or it cannot be read.
+        """
+        tensors, course = self.last()
+        state = TrainState(self.config, world, torch.device("cpu"))
+        try:
+            state.load(tensors, course)
+        except RuntimeError as exc:
+            raise CheckpointError(_unreadable(self.checkpoints()[-1], exc)) from exc
+        state.pose.network.eval()
+        return state
+
+    def _not_written(self, target: Path, exc: OSError) -> str:
+        kept = self.checkpoints()
+        remains = (
+            f"{kept[-1]} is intact: make room, then go on with --resume {self.path}"
+            if kept
+            else "there is no earlier one"
+        )
+        return f"cannot write checkpoint {target}: {exc.strerror}; {remains}"
+
+
+def _unreadable(checkpoint: Path, exc: Exception) -> str:
+    return f"checkpoint {checkpoint} cannot be read ({exc}); delete this folder to go on from the one before it"
+
+
+def _write_synced(path: Path, content: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync_folder(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

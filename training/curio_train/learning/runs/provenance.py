@@ -1,0 +1,109 @@
+"""Where a run comes from: each sitting of training leaves a line in the run folder, for cards and result files.
+
+::
+
+    RUN/sittings.jsonl    command, commit, machine, start
+"""
+
+import datetime
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from curio_train.errors import CheckpointError
+
+_FILE = "sittings.jsonl"
+
+
+@dataclass(frozen=True)
+class RunSession:
+    """One call of a command.
+
+    Attributes:
+        command: As typed.
+        commit: Of the code, with "-dirty" where it had changes; empty where it does not run from a git checkout.
+        machine: Processor, number of cores this process may use, GPU.
+        started: UTC, ISO 8601.
+    """
+
+    command: str
+    commit: str
+    machine: str
+    started: str
+
+
+def this_session() -> RunSession:
+    """What this process is."""
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    return RunSession(command, commit(), machine(), now)
+
+
+def record_session(run: Path) -> None:
+    """Add this process to a run's sittings.
+
+    Raises:
+        CheckpointError: The folder cannot be written.
+    """
+    try:
+        with (run / _FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(asdict(this_session())) + "\n")
+    except OSError as exc:
+        raise CheckpointError(f"cannot write {run / _FILE}: {exc.strerror}; name another run folder: --out") from exc
+
+
+def run_sessions(run: Path) -> list[RunSession]:
+    """A run's sittings, oldest first.
+
+    Raises:
+        CheckpointError: They cannot be read.
+    """
+    try:
+        lines = (run / _FILE).read_text(encoding="utf-8").splitlines()
+        found = [
+            RunSession(**json.loads(line)) for line in lines if line.endswith("}")
+        ]  # the rest was cut off by a kill
+    except (OSError, ValueError, TypeError) as exc:
+        raise CheckpointError(f"{run / _FILE} cannot be read ({exc}); is {run} a whole run folder?") from exc
+    if not found:
+        raise CheckpointError(f"{run / _FILE} has no whole line, expected one a sitting; is {run} a whole run folder?")
+    return found
+
+
+def commit() -> str:
+    """Of this package's source, see :class:`RunSession`."""
+    here = Path(__file__).resolve()
+    if _git(here.parent, "ls-files", here.name) == "":
+        return ""  # not in a checkout, or in one that does not track it (a venv inside another project)
+    changes = _git(here.parent, "status", "--porcelain", "--untracked-files=no")
+    return _git(here.parent, "rev-parse", "HEAD") + ("-dirty" if changes else "")
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def machine() -> str:
+    """This machine, see :class:`RunSession`."""
+    names = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
+    return ", ".join([_processor(), f"{len(os.sched_getaffinity(0))} cores", *names])
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()

@@ -1,0 +1,179 @@
+"""Mesh files as the renderer wants them: in metres, checked, with their colours.
+
+Units are settled here, once: nothing behind :func:`load_mesh` knows millimetres.
+"""
+
+import hashlib
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+
+from curio_train.errors import MeshError
+from curio_train.meshes.extent import box_corners, diameter
+
+Unit = Literal["m", "cm", "mm", "inch"]
+METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+SMALLEST_M, LARGEST_M = 0.001, 20.0
+SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
+
+# What trimesh's readers let through on damaged files, found by feeding them such.
+_READER_ERRORS = (ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError, OSError, MemoryError)
+_TRIMESH_DEFAULT_COLOR = (102, 102, 102)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles with colours, in the object frame (the file's), metres.
+
+    Attributes:
+        vertices_m: [num_vertices, 3] float64, all of them used by a face.
+        faces: [num_faces, 3] int64.
+        vertex_colors_srgb: [num_vertices, 3] in [0, 1], or None: no colour is known, or ``texture`` has it.
+        uv: [num_vertices, 2] with v upwards from the texture's lower edge, or None. A vertex on a seam occurs once a
+            side, so vertices of equal position are common in textured meshes.
+        texture: [height, width, 3] uint8 sRGB, or None.
+        sha256: Of the file's bytes; of the arrays' bytes for a generated shape.
+    """
+
+    vertices_m: np.ndarray
+    faces: np.ndarray
+    vertex_colors_srgb: np.ndarray | None = None
+    uv: np.ndarray | None = None
+    texture: np.ndarray | None = None
+    sha256: str = field(default="")
+
+    def __post_init__(self) -> None:
+        """Name generated shapes after their content."""
+        if not self.sha256:
+            content = self.vertices_m.astype("<f8").tobytes() + self.faces.astype("<i8").tobytes()
+            object.__setattr__(self, "sha256", hashlib.sha256(content).hexdigest())
+
+    @cached_property
+    def diameter_m(self) -> float:
+        """Largest distance of two vertices."""
+        return diameter(self.vertices_m)
+
+    @cached_property
+    def box_corners_m(self) -> np.ndarray:
+        """Corners [8, 3] of the axis-aligned box, in the order of :func:`~curio_train.meshes.extent.box_corners`."""
+        return box_corners(self.vertices_m)
+
+
+def load_mesh(path: Path, unit: Unit | None = None) -> Mesh:
+    """Read a PLY, OBJ, STL, glTF or OFF file; the parts of a glTF scene become one mesh.
+
+    Faces without area are kept: they are part of the file and the renderer passes over them. A colour or factor that
+    a material has beside its texture is not applied.
+
+    Args:
+        path: The file.
+        unit: Of its coordinates (``--mesh-unit``). Default: the file's own where it names one (glTF is always in
+            metres), else metres. BOP's PLY files are in "mm" and don't say so.
+
+    Raises:
+        MeshError: Missing, empty, no mesh, without faces, broken coordinates or indices, or of impossible size.
+    """
+    content = _read(path)
+    loaded = _parse(path, content)
+    if path.suffix.lower() == ".stl":
+        loaded.merge_vertices()  # STL repeats the corners of every triangle
+    _check(path, loaded)
+    loaded.remove_unreferenced_vertices()  # stray points would count towards the diameter
+    colors, uv, texture = _appearance(path, loaded)
+    read_unit = unit or _unit_of(path, loaded)
+    mesh = Mesh(
+        vertices_m=np.asarray(loaded.vertices, dtype=np.float64) * METRES[read_unit],
+        faces=np.asarray(loaded.faces, dtype=np.int64),
+        vertex_colors_srgb=colors,
+        uv=uv,
+        texture=texture,
+        sha256=hashlib.sha256(content).hexdigest(),
+    )
+    _check_size(path, mesh, read_unit, given=unit is not None)
+    return mesh
+
+
+def _read(path: Path) -> bytes:
+    if path.suffix.lower() not in SUFFIXES:
+        raise MeshError(f"{path}: unknown kind of mesh {path.suffix!r}; expected one of {' '.join(SUFFIXES)}")
+    try:
+        content = path.read_bytes()
+    except OSError as exc:
+        raise MeshError(f"{path}: the mesh cannot be read ({exc.strerror})") from exc
+    if not content:
+        raise MeshError(f"{path}: the mesh file is empty (0 bytes); copy or download it again")
+    return content
+
+
+def _parse(path: Path, content: bytes) -> Any:
+    kind = path.suffix.lower().lstrip(".")
+    resolver = trimesh.resolvers.FilePathResolver(str(path))  # materials and textures lie beside the mesh
+    try:
+        return trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
+    except _READER_ERRORS as exc:
+        # Without its optional packages for odd encodings trimesh names those; they would not make a mesh of garbage.
+        reason = "garbled text" if isinstance(exc, ImportError) else exc
+        raise MeshError(f"{path}: not a readable {kind.upper()} mesh ({reason}); is the file complete?") from exc
+
+
+def _check(path: Path, loaded: Any) -> None:
+    vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+    if len(faces) == 0:
+        raise MeshError(f"{path}: found {len(vertices)} vertices and no faces; a surface is needed, not a point cloud")
+    num_broken = int((~np.isfinite(vertices).all(axis=1)).sum())
+    if num_broken:
+        raise MeshError(f"{path}: {num_broken} of {len(vertices)} vertices are NaN or infinite; repair the mesh")
+    low, high = int(faces.min()), int(faces.max())
+    if low < 0 or high >= len(vertices):
+        wrong = low if low < 0 else high
+        raise MeshError(f"{path}: a face names vertex {wrong}, but there are {len(vertices)}; is the file complete?")
+
+
+def _unit_of(path: Path, loaded: Any) -> str:
+    """The unit the file names; metres where it names none or one we don't know."""
+    if path.suffix.lower() in (".glb", ".gltf"):
+        return "m"
+    named = {"meters": "m", "millimeters": "mm", "centimeters": "cm", "inches": "inch", "in": "inch"}
+    unit = str(loaded.units)
+    return named.get(unit, unit if unit in METRES else "m")
+
+
+def _check_size(path: Path, mesh: Mesh, unit: str, *, given: bool) -> None:
+    if SMALLEST_M <= mesh.diameter_m <= LARGEST_M:
+        return
+    fitting = [
+        name for name, scale in METRES.items() if SMALLEST_M <= mesh.diameter_m / METRES[unit] * scale <= LARGEST_M
+    ]
+    found = f"{mesh.diameter_m / METRES[unit]:.6g} {unit} = {mesh.diameter_m:.6g} m"
+    source = f"--mesh-unit {unit}" if given else f"read as {unit}; the file names no other unit"
+    remedy = f"set --mesh-unit to {' or '.join(fitting)}" if fitting else "rescale the mesh"
+    raise MeshError(
+        f"{path}: found a diameter of {found} ({source}), expected {SMALLEST_M:g} to {LARGEST_M:g} m; {remedy}"
+    )
+
+
+def _appearance(path: Path, loaded: Any) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+    """Vertex colours, texture coordinates and texture; colours of faces are averaged at their corners."""
+    visual = loaded.visual
+    if visual.kind in ("vertex", "face"):
+        return np.asarray(visual.vertex_colors)[:, :3] / 255.0, None, None
+    if visual.kind != "texture":
+        return None, None, None
+    material = visual.material
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is not None and visual.uv is not None:
+        try:
+            texture = np.asarray(image.convert("RGB"))  # decodes only now
+        except (OSError, ValueError) as exc:
+            raise MeshError(f"{path}: its texture cannot be decoded ({exc})") from exc
+        return None, np.asarray(visual.uv, dtype=np.float64), texture
+    color = np.asarray(material.main_color)[:3]
+    if tuple(color) == _TRIMESH_DEFAULT_COLOR:
+        return None, None, None
+    return np.tile(color / 255.0, (len(loaded.vertices), 1)), None, None

@@ -1,0 +1,71 @@
+"""Which point of an object each patch of an image sees: the renderer, with coordinates for colours."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from curio_train.meshes.meshes import Mesh
+from curio_train.rendering.renderer import Renderer, linear_from_srgb
+
+_MIDDLE, _REACH = 0.55, 0.4
+"""Coordinates are stored as linear colours from 0.15 to 0.95: never 0, which is where nothing is seen."""
+
+_LEAST_SEEN = 0.5  # of a patch's area
+
+
+class ObjectCoordinateMap:
+    """Renders the surface of a mesh in its own coordinates.
+
+    Attributes:
+        center_m: Middle of the mesh's box, [3].
+        half_extent_m: Half of its longest side: what a coordinate of 1 means.
+    """
+
+    def __init__(self, mesh: Mesh, side: int) -> None:
+        """Build for images of ``side`` x ``side`` patches."""
+        lower, upper = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
+        self.center_m, self.half_extent_m = (lower + upper) / 2, float((upper - lower).max() / 2)
+        linear = _MIDDLE + _REACH * (mesh.vertices_m - self.center_m) / self.half_extent_m
+        painted = dataclasses.replace(
+            mesh, vertex_colors_srgb=_srgb_from_linear(linear), uv=None, texture=None, sha256=""
+        )
+        self._renderer = Renderer([painted], [0], side, side, ambient=1.0)
+        self._side = side
+
+    @torch.no_grad()
+    def __call__(
+        self, rotation: Float[Tensor, "batch 3 3"], translation_m: Float[Tensor, "batch 3"], matrices: np.ndarray
+    ) -> tuple[Float[Tensor, "batch 3 side side"], Bool[Tensor, "batch side side"]]:
+        """Points of the object that patches see, and which patches see it.
+
+        Args:
+            rotation: cam_from_obj.
+            translation_m: cam_from_obj.
+            matrices: K of each image, [batch, 3, 3], in patches.
+
+        Returns:
+            Coordinates in half extents from the middle of the box, −1 to 1, of what a patch sees of the object however
+            little that is; where it is not seen they mean nothing. And where it fills half of a patch or more.
+        """
+        over_black, over_white = (self._draw(rotation, translation_m, matrices, shade) for shade in (0.0, 1.0))
+        share = (1 - (over_white - over_black).mean(dim=1, keepdim=True)).clamp(min=1e-3)
+        linear = linear_from_srgb((over_black / share).clamp(0, 1))
+        return (linear - _MIDDLE) / _REACH, share[:, 0] >= _LEAST_SEEN
+
+    def _draw(self, rotation: Tensor, translation_m: Tensor, matrices: np.ndarray, shade: float) -> Tensor:
+        count = len(rotation)
+        return self._renderer(
+            rotation[:, None],
+            translation_m[:, None],
+            camera_matrix=matrices,
+            backgrounds=translation_m.new_full((count, 3, self._side, self._side), shade),
+            light=translation_m.new_tensor([[0.0, 0.0, -1e-6]]).expand(count, 3),
+            seed=0,  # both pictures have their samples in the same places
+        )
+
+
+def _srgb_from_linear(linear: np.ndarray) -> np.ndarray:
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
