@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Suppress
 from curio_train.errors import UsageError
 
 Term = Literal["image", "curiosity", "sleep", "label"]
-Method = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic"]
+Method = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic", "templates"]
 Preset = Literal["laptop", "paper"]
 DecoderKind = Literal["whole", "cells"]
 
@@ -24,6 +24,7 @@ METHODS: Mapping[Method, frozenset[Term]] = {
     "sleep": frozenset({"sleep"}),
     "wake_sleep": frozenset({"image", "sleep"}),
     "wake_sleep_critic": frozenset({"image", "curiosity", "sleep"}),
+    "templates": frozenset(),
 }
 """The loss terms of each method; the paper's own are the first three."""
 
@@ -194,7 +195,8 @@ class RunConfig:
         world: The world's own options.
         method: our: image loss and critic. noncur: image loss alone. super: true scene codes. Beyond the paper,
             sleep: renderings of codes from the world's known range, to regress. wake_sleep: image loss, and sleep
-            with half of the codes around own predictions. wake_sleep_critic: that and the critic.
+            with half of the codes around own predictions. wake_sleep_critic: that and the critic. templates: no training
+            at all; renderings of the object are compared with frames by pretrained features.
         labels: Share of the training images that --method super sees, with their true codes (paper: 0.05, 0.1, 1).
         preset: Hyperparameters to start from: laptop (measured on two cores) or paper (the paper's).
         seed: Of the initial weights and every random draw.

@@ -140,11 +140,16 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_train.commands.finish import end
     from curio_train.commands.prepare import prepared
     from curio_train.learning.loop import Outcome
-    from curio_train.learning.runs.session import learn
+    from curio_train.learning.runs.session import draw_templates, learn
 
     session = command.session
     config = command.config if session.resume else prepared(command.config, session.cache, _warn, _tell)
     path = session.resume or session.out or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
+    if config.method == "templates":
+        seconds = draw_templates(config, path, session.cache).seconds
+        print(f"{path}: templates drawn and described in {seconds:.0f} s")
+        _tell(end(path, config, session.cache, _warn))
+        return 0
     outcome, course = learn(
         config,
         path,

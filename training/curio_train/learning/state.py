@@ -11,6 +11,7 @@ from curio_train.config import RunConfig
 from curio_train.errors import UsageError
 from curio_train.learning.muon import Muon
 from curio_train.networks.paper.critic import Critic
+from curio_train.templates.build import template_network
 from curio_train.worlds.base import World
 
 N = TypeVar("N", bound=nn.Module)
@@ -126,14 +127,16 @@ class TrainState:
             raise UsageError(f"--reading {reading}: images of {world.name} cannot be read so; leave it out")
         torch.manual_seed(config.seed)
         self.course = TrainingProgress()
-        self.stages = [look.network(config.network) for look in world.stages]
+        templates = config.method == "templates"
+        self.stages = [] if templates else [look.network(config.network) for look in world.stages]
         if config.terms > {"sleep"} and not self.stages[0].has_raw_values:
             raise UsageError(
                 f"--method {config.method} dreams around what it reads, which cells do not allow: expected --method "
                 "sleep, or --reading whole"
             )
         recipe = config.recipe
-        self.pose = Learner(world.assemble(self.stages).to(device), recipe.learning_rate, recipe.matrix_learning_rate)
+        network = template_network(world) if templates else world.assemble(self.stages)
+        self.pose = Learner(network.to(device), recipe.learning_rate, recipe.matrix_learning_rate)
         self.critic: Learner[Critic] | None = None
         if "curiosity" in config.terms:
             critic = Critic(config.network.critic, config.network.critic_normalisation).to(device)

@@ -84,7 +84,10 @@ def weights_file(state: TrainState, config: RunConfig, *, half: bool) -> bytes:
     """
     tensors = {name: value.contiguous() for name, value in state.pose.network.state_dict().items()}
     if half:
-        tensors = {name: value.half() if value.dim() > 1 else value for name, value in tensors.items()}
+        tensors = {
+            name: value.half() if value.dim() > 1 and value.is_floating_point() else value
+            for name, value in tensors.items()
+        }
         if not all(value.isfinite().all() for value in tensors.values()):
             raise ExportError("a weight is too large for float16; export without --half")
     notes = {
@@ -100,7 +103,7 @@ def uses_synthetic_labels(config: RunConfig) -> bool:
 
     A network that began as another, of which nothing is known any more, counts as so taught.
     """
-    if config.terms & {"label", "sleep"}:
+    if config.terms & {"label", "sleep"} or config.method == "templates":
         return True
     if config.init is None:
         return False

@@ -1,8 +1,11 @@
 """One sitting of training: from a configuration to a run folder, new or resumed."""
 
+import time
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Literal
+
+import torch
 
 from curio_train.config import RunConfig
 from curio_train.learning.loop import Outcome, Trainer, train
@@ -12,9 +15,37 @@ from curio_train.learning.runs.initial import begin_with
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.progress import reporting
 from curio_train.learning.runs.provenance import record_session
-from curio_train.learning.state import TrainingProgress
+from curio_train.learning.state import TrainingProgress, TrainState
 from curio_train.learning.threads import choose_threads
+from curio_train.templates.build import fill
+from curio_train.templates.calibration import calibrate
 from curio_train.worlds import build
+from curio_train.worlds.single_object.world import SingleObjectWorld
+
+
+def draw_templates(config: RunConfig, path: Path, cache: Path) -> TrainingProgress:
+    """Make the run folder of a method that draws templates instead of training.
+
+    Args:
+        config: Of the object.
+        path: The run folder, a new one.
+        cache: Where worlds keep the image sets they draw once.
+
+    Raises:
+        CurioError: Any of this package's errors; the folder then has no checkpoint.
+    """
+    world = build(config.world)
+    state = TrainState(config, world, torch.device("cpu"))
+    run, network = RunFolder(path, config), state.pose.network
+    assert isinstance(world, SingleObjectWorld)  # a template network has been made for it
+    begin = time.monotonic()
+    fill(network, world, cache)
+    calibrate(network, world, cache)
+    state.course.seconds = time.monotonic() - begin
+    run.write_config(new=True)
+    record_session(path)
+    run.save(state)
+    return state.course
 
 
 def learn(
