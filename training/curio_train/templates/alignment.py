@@ -18,6 +18,8 @@ _DAMPING = 1e-2  # of the Hessian's diagonal
 _RIDGE = 1e-6
 _LARGEST_STEP = 0.2  # radians and diameters together
 _OUTLIER = 0.5  # squared distance of descriptors at which a point counts a quarter (Geman and McClure 1985)
+_CROSS = [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]]
+"""A vector times this is its cross-product matrix, row by row."""
 
 
 class Aligned(NamedTuple):
@@ -126,13 +128,9 @@ def _solve(hessian: Float[Tensor, "batch 6 6"], gradient: Float[Tensor, "batch 6
 
 
 def _turn(vector: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
-    """The rotation by a short rotation vector, through the unit quaternion (1, v / 2)."""
+    """The rotation by a short rotation vector, by Cayley's formula."""
     half = vector / 2
-    x, y, z = (half / (1 + half.square().sum(dim=1, keepdim=True)).sqrt()).unbind(1)
-    w = (1 - x * x - y * y - z * z).sqrt()
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    cross = (half @ vector.new_tensor(_CROSS)).unflatten(1, (3, 3))
+    scale = 2 / (1 + half.square().sum(dim=1))
+    identity = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return identity + scale[:, None, None] * (cross + cross @ cross)

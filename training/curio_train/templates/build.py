@@ -1,5 +1,6 @@
 """A template network made from a mesh: templates drawn, described and compressed; nothing is trained."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from torch import Tensor
 from curio_train.errors import UsageError
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.templates.bank import NUM_POINTS, RANK, Bank
-from curio_train.templates.drawing import LOOKS, draw, draw_as_crop
+from curio_train.templates.drawing import LOOKS, CropEasel, Easel
 from curio_train.templates.geometry import (
     CROP_PX,
     FILL,
@@ -94,11 +95,13 @@ def _fill_localiser(
     for depth in geometry.depths_m:
         cells = geometry.kernel_cells(depth)
         side = (cells + 2 * _PAD_CELLS - 1) * COARSE_STRIDE + 1
-        drawn = draw(world.object.mesh, rotations, depth, geometry.focal_px / FRAME_STRIDE, side)
+        easel = Easel(world.object.mesh, depth, geometry.focal_px / FRAME_STRIDE, side)
+        drawn = [easel.draw(some) for some in rotations.split(_BATCH)]
         kernel = slice(_PAD_CELLS, _PAD_CELLS + cells)
-        seen = torch.cat([trunk(some)[1] for some in drawn.over(torch.tensor(0.5)).split(_BATCH)])
+        seen = torch.cat([trunk(some.over(0, torch.tensor(0.5)))[1] for some in drawn])
+        alpha = torch.cat([some.alpha for some in drawn])
         features.append(seen[:, :, kernel, kernel])
-        masks.append(drawn.alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE][:, :, kernel, kernel])
+        masks.append(alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE][:, :, kernel, kernel])
     flat = torch.cat([of_depth.flatten(2) for of_depth in features], dim=2)[..., None]
     mask = torch.cat([of_depth.flatten(2) for of_depth in masks], dim=2)[..., None]
     localiser.descriptors.compress(whitening, flat, mask)
@@ -122,28 +125,34 @@ def _standardise(localiser: Localiser, descriptors: Tensor) -> None:
 
 def _fill_bank(bank: Bank, trunk: Trunk, geometry: Geometry, world: SingleObjectWorld, crops: Tensor) -> None:
     """Descriptors averaged over lamps and backgrounds: what changes with either counts less."""
-    mesh, depth, random = world.object.mesh, geometry.typical_m, np.random.default_rng(_SEED)
+    depth, random = geometry.typical_m, np.random.default_rng(_SEED)
     focal_px = FILL * CROP_PX * depth / geometry.diameter_m
-    fine, coarse, alpha = [], [], torch.zeros(())
-    for lamp, exposure in LOOKS:
-        drawn = draw_as_crop(mesh, bank.rotations, depth, (geometry.focal_px, focal_px), CROP_PX, lamp)
-        behind = crops[torch.from_numpy(random.integers(0, len(crops), len(drawn.color)))]
-        maps = [trunk(some) for some in drawn.over(behind, exposure).split(_BATCH)]
-        fine.append(torch.cat([one for one, _ in maps]))
-        coarse.append(torch.cat([one for _, one in maps]))
-        alpha = drawn.alpha
+    easel = CropEasel(world.object.mesh, depth, geometry.focal_px, focal_px, CROP_PX)
+    fine, coarse, alphas = [], [], []  # features of every look, batch after batch
+    for rotations in bank.rotations.split(_BATCH):
+        drawn = easel.draw(rotations)
+        behind = [crops[torch.from_numpy(random.integers(0, len(crops), len(rotations)))] for _ in LOOKS]
+        seen = [trunk(drawn.over(n, behind[n], exposure)) for n, (_, exposure) in enumerate(LOOKS)]
+        fine.append(torch.stack([one for one, _ in seen]))
+        coarse.append(torch.stack([one for _, one in seen]))
+        alphas.append(drawn.alpha)
     background = [trunk(some) for some in crops.split(_BATCH)]
+    alpha, of_coarse = torch.cat(alphas), torch.cat(coarse, dim=1)
     covered = alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE]
-    bank.coarse.compress(bank.coarse.whiten(torch.cat([one for _, one in background])), coarse[0], covered)
-    filters, weights = _low_rank(_mean_cosine(sum(bank.coarse(f) for f in coarse), covered), RANK)
+    bank.coarse.compress(bank.coarse.whiten(torch.cat([one for _, one in background])), of_coarse[0], covered)
+    filters, weights = _low_rank(_mean_cosine(_sum(bank.coarse(look) for look in of_coarse), covered), RANK)
     bank.filters.copy_(filters)
     bank.weights.copy_(weights)
     inside = _inside(alpha)
-    of_object = fine[0].movedim(1, 0)[:, inside].mean(dim=1)
+    of_object = torch.cat([some[0] for some in fine]).movedim(1, 0)[:, inside].mean(dim=1)
     bank.fine.mean.copy_((torch.cat([one for one, _ in background]).mean(dim=(0, 2, 3)) + of_object) / 2)
-    described = F.normalize(sum(bank.fine(f) for f in fine), dim=1)
+    described = torch.cat([F.normalize(_sum(bank.fine(look) for look in some), dim=1) for some in fine])
     points = _surface_points(world, bank.rotations, depth, focal_px)
     _store_points(bank, inside, described, points / geometry.diameter_m)
+
+
+def _sum(of_looks: Iterable[Tensor]) -> Tensor:
+    return torch.stack(list(of_looks)).sum(dim=0)
 
 
 def _inside(alpha: Float[Tensor, "templates 1 side side"]) -> Bool[Tensor, "templates cells cells"]:

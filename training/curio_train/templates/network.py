@@ -99,7 +99,7 @@ class TemplateNetwork(nn.Module):
 
     def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], Evidence]:
         """The code without its confidence, and what that is made of."""
-        best = self._best(self._aligned(images, self._hypotheses(images)), len(images))
+        best = self._best(self._aligned(images, self._hypotheses(images)), images.shape[0])
         last, spread = self._averaged(images, best)
         evidence = Evidence(
             torch.stack([10 * last.score, -100 * spread], dim=1), torch.stack([10 * last.score, last.place], dim=1)
@@ -107,7 +107,7 @@ class TemplateNetwork(nn.Module):
         return {
             TRANSLATION: (last.position_m * self.depth_factor)[:, None],
             ROTATION_6D: rotation_6d_from_matrix(last.rotation)[:, None],
-            LIGHT: self._lamp.expand(len(images), 3),
+            LIGHT: self._lamp.expand(images.shape[0], 3),
         }, evidence
 
     def _hypotheses(self, images: Float[Tensor, "batch 3 height width"]) -> Poses:
@@ -121,7 +121,7 @@ class TemplateNetwork(nn.Module):
         back, depth = (of_all.unflatten(0, (-1, NUM_CANDIDATES)) for of_all in (back, depth))
         picked = self._pick(scores.unflatten(0, (-1, NUM_CANDIDATES)), places.position_m)
         rotations, positions, found, place = [], [], [], []
-        row = torch.arange(len(images), device=images.device)
+        row = torch.arange(images.shape[0], device=images.device)
         for candidate, template, score in picked:
             slope = offset[row, candidate, template]
             ray = torch.cat([slope, torch.ones_like(slope[:, :1])], dim=1)
@@ -146,14 +146,14 @@ class TemplateNetwork(nn.Module):
             candidate, template = torch.div(best, num, rounding_mode="floor"), best % num
             picked.append((candidate, template, score))
             alike = (turns[template] @ turns.T - 1) / 2 > _ALIKE_COS
-            chosen = positions_m[torch.arange(len(best), device=best.device), candidate]
+            chosen = positions_m[torch.arange(best.shape[0], device=best.device), candidate]
             beside = (positions_m - chosen[:, None]).square().sum(dim=-1) < apart_m**2
             scores = torch.where(beside[:, :, None] & alike[:, None], _SUPPRESSED, scores)
         return picked
 
     def _aligned(self, images: Tensor, poses: Poses) -> Poses:
         """Each hypothesis moved to where the template nearest to it fits best."""
-        crops, back, depth, focal_px = self._crops(images, poses.position_m.unflatten(0, (len(images), -1)), CROP_PX)
+        crops, back, depth, focal_px = self._crops(images, poses.position_m.unflatten(0, (images.shape[0], -1)), CROP_PX)
         maps = with_gradient(self.bank.fine(self.trunk(crops)[0]))
         start = self._in_crop(poses.rotation, back, depth)
         nearest = (start.rotation.flatten(1) @ self.bank.rotations.flatten(1).T).argmax(dim=1)
