@@ -1,4 +1,4 @@
-# setup · demo · test · check · bench · results · proto: each brings the environment up to date first, which costs nothing when it is.
+# setup · demo · test · check · bench · results · proto · docs: each brings the environment up to date first, which costs nothing when it is.
 
 PYTHON ?= python3
 # Any pip requirement, also with options: TORCH="torch==2.13.0 --index-url …" for a build without CUDA.
@@ -14,7 +14,7 @@ BENCHMARKS := $(filter-out benchmarks/demo.py benchmarks/endurance.py benchmarks
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
-.PHONY: setup demo test check bench results proto
+.PHONY: setup demo test check bench results proto docs
 
 setup: $(READY)
 
@@ -44,9 +44,10 @@ $(READY): pyproject.toml
 demo: $(READY)
 	@$(BIN)/python benchmarks/demo.py
 
-# One thread: the tests train tiny networks beside the renderer's own threads, which waiting threads would only slow down.
+# Two processes of one thread each: the tests train tiny networks beside the renderer's own threads, which waiting threads
+# would only slow down.
 test: $(READY)
-	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -n 2 --dist loadfile
 
 check: $(READY)
 	@$(BIN)/ruff check .
@@ -55,6 +56,7 @@ check: $(READY)
 	$(BIN)/lint-imports
 	fresh=$$(mktemp -d); trap 'rm -r "$$fresh"' EXIT
 	$(PROTOC) --python_out="$$fresh" --pyi_out="$$fresh" --grpc_python_out="$$fresh" $(PROTOS)
+	$(BIN)/pytest -q tests/contract/test_docs.py
 	diff -r -x '*.proto' -x __init__.py -x __pycache__ "$$fresh/curio_proto" proto/curio_proto || {
 		echo "check: the generated code above is not what the .proto files give: make proto, then commit" >&2; exit 1; }
 
@@ -72,3 +74,8 @@ bench: $(READY)
 # Tables 2 and 3, hours in all; goes on where it stopped. One world: make results ONLY=circles; other flags in FLAGS.
 results: $(READY)
 	@$(BIN)/python benchmarks/results.py $(if $(ONLY),--only $(ONLY)) $(FLAGS)
+
+# The documentation as a site with API pages, in build/site. Dead links are found by tests/contract/test_docs.py.
+docs: $(READY)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	echo "docs: build/site/index.html"

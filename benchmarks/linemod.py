@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
-from curio_train.commands.cli import answer
+from curio_train.commands.running import answer
 from curio_train.data.bop import BopDataset
 from curio_train.evaluation.candidates import Candidate, candidates
 from curio_train.evaluation.evaluate import evaluate

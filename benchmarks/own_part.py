@@ -96,8 +96,7 @@ def _score(files: Path, poses: Path) -> dict[str, Any]:
     add, turned, confidence = [], [], []
     for answer in found:
         (label,) = labels[f"test/a/{Path(answer['image']).name}"]
-        truth = np.array(label["cam_from_obj"])
-        true, best = Pose(truth[:3, :3], truth[:3, 3]), answer["detections"][0]
+        true, best = Pose.from_matrix(np.array(label["cam_from_obj"])), answer["detections"][0]
         pose = Pose(np.array(best["rotation"]), np.array(best["translation_m"]))
         add.append(add_or_add_s_m(pose, true, mesh.vertices_m, info) / mesh.diameter_m)
         turned.append(rotation_error_deg(pose, true))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from curio_train.commands.cli import answer
+from curio_train.commands.running import answer
 from curio_train.config import PRESETS
 from curio_train.errors import UsageError
 from paper.results import ORDER, WORLDS, collect, load_results, merge, save_results
@@ -23,7 +23,7 @@ from paper.run_queue import QueuedRun, carry_out
 World = Literal["circles", "spheres", "chairs", "varied", "multi", "light"]
 
 # Images that every method of a world sees with preset laptop. Full supervision learns a world's 2,000 images by heart
-# within 32,000 and is no better after 96,000 (docs/experiments.md).
+# within 32,000 and is no better after 96,000 (docs/experiments/).
 BUDGETS = {"circles": 48_000, "spheres": 32_000, "chairs": 32_000, "varied": 32_000, "multi": 32_000, "light": 32_000}
 SEVERAL_SEEDS = {"circles", "spheres"}
 _SEEDED = {"super_1.0", "noncur", "our"}

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import torch
 import tyro
-from curio_train.commands.cli import answer
+from curio_train.commands.running import answer
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.data.bop import BopDataset
 from curio_train.geometry import Pose

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from curio_train.config import PRESETS, NetworkConfig, RunConfig, WorldOptions
 from curio_train.geometry import matrix_from_rotation_6d, random_rotations, rotation_6d_from_matrix
-from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
+from curio_train.learning.trainer import Trainer
 from curio_train.meshes.meshes import Mesh
 from curio_train.meshes.shapes import sphere
 from curio_train.rendering.renderer import Renderer

@@ -15,7 +15,6 @@ from curio_train.errors import UsageError
 from curio_train.evaluation.real_frames import VISIBLE, estimate_frames
 from curio_train.evaluation.subject import Subject
 from curio_train.geometry import Pose
-from curio_train.metrics.poses import transform
 
 _GREEN, _RED = (0, 200, 0), (230, 0, 0)
 _THICKNESS_PX = 2
@@ -67,7 +66,7 @@ def _drawn(
 ) -> np.ndarray:
     """The picture with the edges of the object's box; of an edge that reaches behind the camera nothing."""
     picture = pixels.copy()
-    in_camera = transform(pose, corners_m)
+    in_camera = pose.apply(corners_m)
     for one in range(8):
         for other in (one ^ 1, one ^ 2, one ^ 4):  # corners are numbered by their three coordinates' bits
             ends = in_camera[[one, other]]

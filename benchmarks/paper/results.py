@@ -85,8 +85,8 @@ def _row(world: str, runs: Sequence[Mapping[str, Any]]) -> Row:
         "seconds": round(mean(run["training_seconds"] for run in runs), 1),
         "machine": runs[0]["machine"],
         "commit": runs[-1]["commit"],
-        "label_free": "label" not in terms,
-        "synthetic_labels": "sleep" in terms,
+        "label_free": not terms.label,
+        "synthetic_labels": terms.sleep,
     }
 
 

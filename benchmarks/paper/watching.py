@@ -16,9 +16,10 @@ from typing import Literal
 
 import numpy as np
 import torch
-from curio_train.config import PRESETS, ConvStack, Method, NetworkConfig, RunConfig, WorldOptions
-from curio_train.learning.loop import Trainer, learning_rate_factor
+from curio_train.config import PRESETS, ConvStack, MethodName, NetworkConfig, RunConfig, WorldOptions
+from curio_train.learning.loop import learning_rate_factor
 from curio_train.learning.parallel import Ranks
+from curio_train.learning.trainer import Trainer
 from curio_train.scene_code import COLOR, TRANSLATION, Field, Layout, SceneCode
 from curio_train.worlds.base import Batch, Camera, ImageSource, ObjectKind, Split, World
 from matplotlib import colormaps
@@ -111,7 +112,7 @@ def watch(world: Discs, loss: Loss, watched: Tensor, num_steps: int, every: int,
         every: Steps between two moments.
         seed: Of weights and images.
     """
-    method: Method = "noncur" if loss == "image" else "our"
+    method: MethodName = "noncur" if loss == "image" else "our"
     laptop = PRESETS["laptop"]
     weight = 0.0 if loss == "curiosity" else laptop.image_weight
     recipe = replace(laptop, image_weight=weight, batch_size=32, micro_batch_size=32, precision="float32")

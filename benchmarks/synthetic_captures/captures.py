@@ -26,7 +26,7 @@ from typing import Any
 import cv2
 import numpy as np
 import trimesh
-from curio_train.capture.camera_json import save_intrinsics
+from curio_train.camera import save_intrinsics
 from curio_train.errors import DataError, UsageError
 from scipy.spatial.transform import Rotation
 

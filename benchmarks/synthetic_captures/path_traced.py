@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from curio_train.geometry import Pose
 from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.parts import linear_from_srgb
 from curio_train.rendering.stock import OPENCV_AXES, sensor
@@ -95,8 +96,7 @@ class PathTracedScene:
         """
         mitsuba = self._mitsuba
         for number, (vertices, pose) in enumerate(zip(self._vertices, poses, strict=True)):
-            turn, shift = (np.eye(3), _OUT_OF_SIGHT_M) if pose is None else (pose[:3, :3], pose[:3, 3])
-            placed = vertices @ turn.T + shift
+            placed = vertices + _OUT_OF_SIGHT_M if pose is None else Pose.from_matrix(pose).apply(vertices)
             key = f"thing_{number}.vertex_positions"
             self._parameters[key] = np.ascontiguousarray(placed, dtype=np.float32).ravel()
         world_from_sensor = np.linalg.inv(cam_from_world) @ OPENCV_AXES

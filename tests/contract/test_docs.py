@@ -1,5 +1,6 @@
 """The documents point at things that exist."""
 
+import os
 import re
 from pathlib import Path
 
@@ -28,6 +29,23 @@ def test_relative_links_resolve(root: Path, texts: dict[Path, str], tracked: lis
             target = match[1] or match[2]
             if not ELSEWHERE.match(target) and (root / path.parent / target.split("#")[0]).resolve() not in present:
                 dead.append(f"{path}: {target}")
+    assert not dead, dead
+
+
+def _anchors(text: str) -> set[str]:
+    """Anchors of a document's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ +(.+)$", CODE_BLOCK.sub("", text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_anchors_exist(root: Path, texts: dict[Path, str]) -> None:
+    dead = []
+    for path, text in documents(texts).items():
+        for match in LINK.finditer(CODE_BLOCK.sub("", text)):
+            file, _, anchor = (match[1] or match[2]).partition("#")
+            target = Path(os.path.normpath(path.parent / file)) if file else path
+            if anchor and target in texts and target.suffix == ".md" and anchor not in _anchors(texts[target]):
+                dead.append(f"{path}: {match[1]}")
     assert not dead, dead
 
 

@@ -9,8 +9,8 @@ import pytest
 
 LOADERS = {
     "serving": "from curio_serve.models.model import load; from pathlib import Path; load(Path({path!r}))",
-    "training": "from pathlib import Path; from curio_train.export.onnx import OnnxModel; "
-    "OnnxModel.open(Path({path!r}))",
+    "training": "from pathlib import Path; from curio_train.exported_model import ExportedModel; "
+    "ExportedModel.open(Path({path!r}))",
 }
 # onnxruntime reports on nothing where it takes the machine for a test's.
 HUSHING = {"CI", "ORT_RUNNING_UNIT_TESTS", "ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME"}

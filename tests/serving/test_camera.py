@@ -28,7 +28,7 @@ def _changed(row: int, column: int, value: float) -> np.ndarray:
         (_changed(0, 0, np.nan), "not finite"),
         (_changed(0, 2, np.inf), "not finite"),
         (_changed(0, 1, 3), "skew of 3 px"),
-        (K.T, "last row has to be"),
+        (K.T, "transposed"),
         (K[:2], r"shape \[2, 3\]"),
     ],
 )

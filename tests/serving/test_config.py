@@ -74,7 +74,7 @@ def test_bad_variables_are_named(environment: dict[str, str], words: str) -> Non
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("port = ", "is not TOML"), ("prot = 1", r"unknown keys \['prot'\]"), ("[port]\nx = 1", "port is a table")],
+    [("port = ", "is not TOML"), ("prot = 1", r"unknown keys \['prot'\]"), ("[port]\nx = 1", "port: found a dict")],
 )
 def test_bad_files_are_named(tmp_path: Path, text: str, words: str) -> None:
     file = tmp_path / "serve.toml"

@@ -38,7 +38,7 @@ def write_run() -> Callable[..., Path]:
                 module.weight.data.uniform_(0.5, 2.0, generator=generator)
         for branch in state.pose.network.heads.branches.values():
             branch[-1].weight.data *= spread
-        state.course = TrainingProgress(step=2, images=64, seconds=1.5)
+        state.progress = TrainingProgress(step=2, images=64, seconds=1.5)
         run.save(state)
         return path
 

@@ -160,7 +160,7 @@ SCENE = "test/000001/"
         (SCENE + "scene_camera.json", {}, DataError, "4/cam_K: found no such entry"),
         (SCENE + "scene_camera.json", {"4": {"cam_K": K[:8]}}, DataError, "4/cam_K: found [57.0"),
         (SCENE + "scene_camera.json", {"4": {"cam_K": ["a"] * 9}}, DataError, "expected 9 finite"),
-        (SCENE + "scene_camera.json", {"4": {"cam_K": [0] * 9}}, CameraError, "4/cam_K: its bottom row"),
+        (SCENE + "scene_camera.json", {"4": {"cam_K": [0] * 9}}, CameraError, "4/cam_K: K is"),
         (SCENE + "scene_camera.json", {"4": {"cam_K": [570, 0, 315, 0, 570, 235, 0, 0, 1]}}, CameraError, "64x48"),
         (SCENE + "rgb/000004.jpg", "no image", DataError, "not a readable image"),
         (SCENE + "scene_gt.json", [1], DataError, "expected an object"),
@@ -171,7 +171,7 @@ SCENE = "test/000001/"
         (SCENE + "scene_gt_info.json", {"4": []}, DataError, "4/0/visib_fract: found no such entry"),
         ("models/models_info.json", {}, DataError, "models_info.json, 1: found no such entry"),
         ("models/models_info.json", {"1": {"diameter": None}}, DataError, "1, diameter: found None"),
-        ("camera.json", {"fx": 1}, CameraError, "camera.json, width"),
+        ("camera.json", {"fx": 1}, CameraError, "camera.json: unknown format"),
         ("test_targets_bop19.json", [{"scene_id": 1}], DataError, "0, im_id"),
     ],
 )

@@ -6,9 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from curio_train.camera import load_intrinsics
+from curio_train.camera import load_intrinsics, save_intrinsics
 from curio_train.capture.calibration import Board, calibrate
-from curio_train.capture.camera_json import save_intrinsics
 from curio_train.errors import CameraError, DataError
 from scipy.spatial.transform import Rotation
 

@@ -9,6 +9,7 @@ import torch
 from curio_train import camera
 from curio_train.errors import CameraError
 from curio_train.geometry import rotation_6d_from_matrix
+from curio_train.networks import crop_camera
 from torch.nn.functional import grid_sample
 
 LINEMOD = np.array([[572.4114, 0, 325.2611], [0, 573.57043, 242.04899], [0, 0, 1]])
@@ -25,16 +26,16 @@ def changed(row: int, column: int, value: float) -> np.ndarray:
     ("matrix", "text"),
     [
         (changed(0, 0, 0), "singular"),
-        (changed(1, 1, -573), "negative focal"),
+        (changed(1, 1, -573), "singular or mirrored"),
         (changed(0, 2, np.nan), "not finite"),
-        (changed(2, 2, 2), "bottom row"),
-        (changed(1, 0, 3), "beside the focal lengths"),
+        (changed(2, 2, 2), "last row has to be"),
+        (changed(1, 0, 3), "entry below fx"),
         (LINEMOD.T, "transposed"),
         (changed(0, 2, 2000), "principal point (2000"),
         (np.array([[0.9, 0, 0.5], [0, 1.2, 0.5], [0, 0, 1]]), "must be in pixels"),
-        (LINEMOD[:2], "shape (2, 3)"),
+        (LINEMOD[:2], "shape [2, 3]"),
         ([[1, 2, "x"]], "expected 3x3"),
-        (None, "expected 3x3"),
+        (None, "expected [3, 3]"),
     ],
 )
 def test_refuses(matrix: object, text: str) -> None:
@@ -72,11 +73,14 @@ def test_loads_both_forms(tmp_path: Path) -> None:
     ("content", "text"),
     [
         ("", "not JSON"),
-        ("[1, 2]", "found a list"),
+        ("[1, 2]", "unknown format with list"),
         ({"width": 640, "height": 480}, "expected camera_matrix"),
-        ({"camera_matrix": LINEMOD.tolist(), "height": 480}, "width: found None"),
-        ({"camera_matrix": LINEMOD.tolist(), "width": 640.5, "height": 480}, "width: found 640.5"),
-        ({"camera_matrix": LINEMOD.tolist(), "width": 640, "height": 480, "distortion": [1, 2]}, "expected 5 numbers"),
+        ({"camera_matrix": LINEMOD.tolist(), "height": 480}, "no width and height"),
+        ({"camera_matrix": LINEMOD.tolist(), "width": 640.5, "height": 480}, "width is 640.5"),
+        (
+            {"camera_matrix": LINEMOD.tolist(), "width": 640, "height": 480, "distortion": [1, 2]},
+            "distortion has 2 values",
+        ),
         ({"camera_matrix": LINEMOD.T.tolist(), "width": 640, "height": 480}, "transposed"),
     ],
 )
@@ -107,9 +111,9 @@ def test_scaling_keeps_the_borders() -> None:
 
 def test_projection_is_the_inverse_of_rays() -> None:
     matrix = torch.tensor(LINEMOD)
-    seen = camera.rays(matrix, 5, 4)
+    seen = crop_camera.rays(matrix, 5, 4)
     assert seen.shape == (4, 5, 3)
-    pixels = camera.project(seen.flatten(0, 1) * 3.7, matrix).view(4, 5, 2)
+    pixels = crop_camera.project(seen.flatten(0, 1) * 3.7, matrix).view(4, 5, 2)
     for row in range(4):
         for column in range(5):
             assert pixels[row, column].tolist() == pytest.approx([column, row], abs=1e-9)
@@ -118,35 +122,35 @@ def test_projection_is_the_inverse_of_rays() -> None:
 def test_gaze_puts_the_direction_in_the_centre() -> None:
     matrix = torch.tensor(LINEMOD)[None]
     point = torch.tensor([[0.2, -0.15, 1.1]], dtype=torch.float64)
-    gaze = camera.crop_camera_at(point, torch.tensor([900.0], dtype=torch.float64), 128, matrix)
+    gaze = crop_camera.crop_camera_at(point, torch.tensor([900.0], dtype=torch.float64), 128, matrix)
     seen = (gaze.rotation @ point[..., None])[..., 0]
     assert seen[0].tolist() == pytest.approx([0, 0, point.norm().item()], abs=1e-12)
     # A neighbour of that point reaches the same crop pixel through the homography as through the turned camera.
     neighbour = point + torch.tensor([[0.03, 0.05, -0.02]], dtype=torch.float64)
-    in_frame = torch.cat([camera.project(neighbour, matrix[0]), torch.ones(1, 1, dtype=torch.float64)], dim=-1)
+    in_frame = torch.cat([crop_camera.project(neighbour, matrix[0]), torch.ones(1, 1, dtype=torch.float64)], dim=-1)
     warped = gaze.homography[0] @ in_frame[0]
-    turned = camera.project(neighbour @ gaze.rotation[0].T, gaze.matrix[0])[0]
+    turned = crop_camera.project(neighbour @ gaze.rotation[0].T, gaze.matrix[0])[0]
     assert (warped[:2] / warped[2]).tolist() == pytest.approx(turned.tolist(), abs=1e-9)
 
 
 def test_gaze_ahead_is_a_plain_crop() -> None:
     matrix = torch.tensor([[[100.0, 0, 31.5], [0, 100.0, 23.5], [0, 0, 1]]])
     frame = torch.arange(64 * 48, dtype=torch.float32).view(1, 1, 48, 64)
-    gaze = camera.crop_camera_at(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([100.0]), 16, matrix)
-    grid = camera.sampling_grid(gaze, matrix, 16, 64, 48)
+    gaze = crop_camera.crop_camera_at(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([100.0]), 16, matrix)
+    grid = crop_camera.sampling_grid(gaze, matrix, 16, 64, 48)
     crop = grid_sample(frame, grid, align_corners=False)
     torch.testing.assert_close(crop, frame[..., 16:32, 24:40], atol=0.05, rtol=0)
 
 
 def test_grid_follows_the_homography_and_ignores_what_is_behind() -> None:
     matrix = torch.tensor(LINEMOD, dtype=torch.float32)[None]
-    gaze = camera.crop_camera_at(torch.tensor([[0.5, 0.2, 1.0]]), torch.tensor([300.0]), 32, matrix)
-    grid = camera.sampling_grid(gaze, matrix, 32, *SIZE)[0, 7, 21]
+    gaze = crop_camera.crop_camera_at(torch.tensor([[0.5, 0.2, 1.0]]), torch.tensor([300.0]), 32, matrix)
+    grid = crop_camera.sampling_grid(gaze, matrix, 32, *SIZE)[0, 7, 21]
     frame = (grid + 1) * torch.tensor(SIZE) / 2 - 0.5
     warped = gaze.homography[0] @ torch.tensor([*frame.tolist(), 1.0])
     assert (warped[:2] / warped[2]).tolist() == pytest.approx([21, 7], abs=1e-2)
-    sideways = camera.crop_camera_at(torch.tensor([[1.0, 0.0, 0.01]]), torch.tensor([10.0]), 32, matrix)
-    outside = camera.sampling_grid(sideways, matrix, 32, *SIZE)[0, 16, 31]
+    sideways = crop_camera.crop_camera_at(torch.tensor([[1.0, 0.0, 0.01]]), torch.tensor([10.0]), 32, matrix)
+    outside = crop_camera.sampling_grid(sideways, matrix, 32, *SIZE)[0, 16, 31]
     assert outside.abs().max() > 1
     assert torch.isfinite(outside).all()
 
@@ -154,7 +158,7 @@ def test_grid_follows_the_homography_and_ignores_what_is_behind() -> None:
 def test_gaze_has_gradients_straight_ahead() -> None:
     matrix = torch.tensor(LINEMOD, dtype=torch.float32)[None]
     direction = torch.tensor([[0.0, 0.0, 1.0]], requires_grad=True)
-    gaze = camera.crop_camera_at(direction, torch.tensor([300.0]), 32, matrix)
+    gaze = crop_camera.crop_camera_at(direction, torch.tensor([300.0]), 32, matrix)
     rotation_6d_from_matrix(gaze.rotation).sum().backward()
     assert torch.isfinite(direction.grad).all()
     assert direction.grad.abs().sum() > 0

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import pytest
-from curio_train.commands import cli
+from curio_train.commands import train as train_command
 
 
 def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, str]:
     with pytest.raises(SystemExit) as exit_:
-        cli.train(["capture", "--calibrate", *map(str, flags)])
+        train_command.train(["capture", "--calibrate", *map(str, flags)])
     captured = capsys.readouterr()
     return int(exit_.value.code or 0), captured.out, captured.err
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 import trimesh
 from curio_train.camera import Intrinsics
-from curio_train.commands import cli
+from curio_train.commands import train as train_command
 from curio_train.config import NetworkConfig
 from curio_train.data import backgrounds
 from curio_train.data.background_image import BackgroundImages, MixedBackgrounds
-from curio_train.doctor.before_training import refuse_unfit
+from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, MeshError, UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.subject import load_subject
@@ -249,7 +249,7 @@ def test_files_that_do_not_belong_together_are_refused_all_at_once(folder: Path,
 
 def call(*words: object) -> int:
     with pytest.raises(SystemExit) as exit_:
-        cli.train(["capture", *map(str, words)])
+        train_command.train(["capture", *map(str, words)])
     return int(exit_.value.code or 0)
 
 

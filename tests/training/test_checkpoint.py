@@ -123,7 +123,7 @@ def test_a_full_disk_costs_no_earlier_checkpoint(tmp_path: Path, cache: Path) ->
     run = RunFolder.open(tmp_path / "run")
     before = last_tensors(run.path)
     state = run.trained(Circles())
-    state.course.step += 1
+    state.progress.step += 1
     with largest_file(50_000), pytest.raises(CheckpointError, match=r"cannot write checkpoint .*00000006 is intact"):
         run.save(state)
     assert [path.name for path in run.path.joinpath("checkpoints").iterdir()] == ["00000006"]
@@ -203,9 +203,15 @@ def test_configurations_survive_their_file(tmp_path: Path, config: RunConfig) ->
     [
         (None, "is no run folder"),
         ("{", "is no configuration of this version"),
-        ('{"world": {"name": "atlantis"}}', "is no configuration of this version"),
-        ('{"world": {"name": "circles"}, "methods": "our"}', "is no configuration of this version"),
-        ('{"world": {"name": "circles"}, "labels": 7.0}', "is no share"),
+        ('{"world": {"name": "atlantis"}}', "found the world 'atlantis', expected one of circles"),
+        ('{"world": {}}', "found the world None, expected one of circles"),
+        ('{"world": {"name": "circles"}, "methods": "our"}', r"is no configuration .*\(methods\) @ config"),
+        ('{"world": {"name": "circles", "class": "ape"}}', r"\(class\) @ config.world"),
+        ('{"world": {"name": "circles"}, "method": "ours"}', r"ours not in literal .* @ config.method"),
+        ('{"world": {"name": "circles"}, "seed": "1"}', "found '1', expected int @ config.seed"),
+        ('{"world": {"name": "circles"}, "recipe": {"seed": 1}}', r"\(seed\) @ config.recipe"),
+        ('{"world": {"name": "circles"}, "labels": 7.0}', "is no fraction"),
+        ('{"method": "our"}', "required field missing @ config.world"),
         ("[]", "is no configuration of this version"),
     ],
 )

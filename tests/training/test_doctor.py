@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from curio_train.commands import cli
+from curio_train.commands import doctor as doctor_command
 from curio_train.doctor.examine import Subjects, examine_files
 from curio_train.doctor.machine import examine_machine
 
@@ -14,7 +14,7 @@ from curio_train.doctor.machine import examine_machine
 def run(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, str]]:
     """Exit status, and each subject with its state and text."""
     with pytest.raises(SystemExit) as exit_:
-        cli.doctor(arguments)
+        doctor_command.doctor(arguments)
     lines = capsys.readouterr().out.splitlines()
     findings = {}
     for line in lines:
@@ -61,7 +61,7 @@ def test_a_finding_says_how_sure_it_is_and_what_to_do(tmp_path: Path) -> None:
 
 def test_symmetries_need_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
-        cli.doctor(["--symmetries", str(tmp_path / "out.json"), "--cache", str(tmp_path)])
+        doctor_command.doctor(["--symmetries", str(tmp_path / "out.json"), "--cache", str(tmp_path)])
     assert exit_.value.code == 2
     assert "--mesh" in capsys.readouterr().err
 

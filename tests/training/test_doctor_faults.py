@@ -245,13 +245,20 @@ def test_faults_of_the_plate(files: Files, spoilt: Callable[[], np.ndarray], fau
 
 def export(path: Path, sha256: str, diameter_m: float) -> None:
     """An ONNX file that says it was trained for such a mesh, and for the good camera."""
-    node = onnx.helper.make_node("Identity", ["image"], ["translation_m"])
-    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.UINT8, [1]) for name in node.input]
-    outputs = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.UINT8, [1]) for name in node.output]
-    graph = onnx.helper.make_graph([node], "copy", values, outputs)
+    make, tensor = onnx.helper.make_node, onnx.helper.make_tensor_value_info
+    nodes = [
+        make("Cast", ["image"], ["values"], to=onnx.TensorProto.FLOAT),
+        make("ReduceMean", ["values"], ["mean"], axes=[1, 2], keepdims=0),
+        make("Unsqueeze", ["mean", "one"], ["translation_m"]),
+    ]
+    image = tensor("image", onnx.TensorProto.UINT8, ["batch", HEIGHT, WIDTH, 3])
+    output = tensor("translation_m", onnx.TensorProto.FLOAT, ["batch", 1, 3])
+    one = onnx.helper.make_tensor("one", onnx.TensorProto.INT64, [1], [1])
+    graph = onnx.helper.make_graph(nodes, "mean colour", [image], [output], [one])
     model = onnx.helper.make_model(graph, ir_version=9, opset_imports=[onnx.helper.make_opsetid("", 17)])
-    spec = ModelSpec(schema_version=1, name="part", world="linemod")
-    spec.objects.add(name="part", mesh_sha256=sha256, diameter_m=diameter_m)
+    spec = ModelSpec(schema_version=1, name="part", world="linemod", num_slots=1)
+    spec.fields.add(name="translation_m", size=3, per_object=True)
+    spec.objects.add(name="part", slots=[0], mesh_sha256=sha256, diameter_m=diameter_m)
     spec.camera.MergeFrom(CanonicalCamera(width=WIDTH, height=HEIGHT, camera_matrix=np.ravel(K).tolist()))
     put_spec(model, spec)
     onnx.save(model, str(path))

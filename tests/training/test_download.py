@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import trimesh
-from curio_train.commands import cli
+from curio_train.commands import train as train_command
 from curio_train.data.bop import BopDataset
 from curio_train.data.download import ARCHIVES, download_linemod
 from curio_train.errors import DataError
@@ -207,7 +207,7 @@ def test_places_that_cannot_be_written_are_told(hub: Hub, tmp_path: Path) -> Non
 
 def train(*flags: str) -> int:
     with pytest.raises(SystemExit) as exit_:
-        cli.train(["linemod", "--class", "duck", *flags])
+        train_command.train(["linemod", "--class", "duck", *flags])
     assert isinstance(exit_.value.code, int)
     return exit_.value.code
 

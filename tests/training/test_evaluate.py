@@ -12,7 +12,7 @@ import torch
 import trimesh
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.view import CanonicalCamera, PinholeFrame, Region
-from curio_train.commands import cli
+from curio_train.commands import evaluate as evaluate_command
 from curio_train.config import RunConfig
 from curio_train.data.bop import ModelInfo
 from curio_train.errors import CurioError, DataError, ExportError, UsageError
@@ -224,7 +224,7 @@ def test_the_command_prints_one_object_and_keeps_it(
 ) -> None:
     run = write_run(tmp_path / "run")
     with pytest.raises(SystemExit) as exit_:
-        cli.evaluate([str(run), "--json", "--num-images", "40", "--cache", str(tmp_path / "cache")])
+        evaluate_command.evaluate([str(run), "--json", "--num-images", "40", "--cache", str(tmp_path / "cache")])
     assert exit_.value.code == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert json.loads((run / "evaluation.json").read_text()) == result

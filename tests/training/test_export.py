@@ -12,11 +12,10 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from curio_train.commands import cli
+from curio_train.commands import export as export_command
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, ExportError, UsageError
 from curio_train.export.card import EVALUATION_FILE, Provenance, card, portable
-from curio_train.export.folder import find_model
 from curio_train.export.graph import (
     Exported,
     Graph,
@@ -26,7 +25,7 @@ from curio_train.export.graph import (
     refuse_disparity,
     settled,
 )
-from curio_train.export.onnx import OnnxModel
+from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import this_session
 from curio_train.learning.state import TrainingProgress
@@ -74,7 +73,7 @@ def test_the_file_says_what_the_network_says(single: Exported, network: torch.nn
     images = np.random.default_rng(num_images).integers(0, 256, (num_images, 128, 128, 3), dtype=np.uint8)
     expected = network(torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255)[TRANSLATION]
     assert expected.std() > 1e-3, "the network answers the same to everything: nothing is compared"
-    found = OnnxModel.open(single.path / "model.onnx")(images)
+    found = ExportedModel.open(single.path / "model.onnx")(torch.from_numpy(images))
     assert found.keys() == {TRANSLATION}
     assert (found[TRANSLATION] - expected).abs().max() < 1e-4
     assert single.rounding_error == 0
@@ -88,7 +87,7 @@ def test_half_is_half_as_large_and_its_rounding_is_told(
     assert half.parity_error <= 1e-4
     images = check_images(Circles())
     expected = network(images.permute(0, 3, 1, 2).float() / 255)
-    found = OnnxModel.open(half.path / "model.onnx")(images.numpy())
+    found = ExportedModel.open(half.path / "model.onnx")(images)
     assert half.rounding_error > 0
     assert largest_difference(expected, found) == pytest.approx(half.rounding_error, abs=1e-5)
 
@@ -105,14 +104,14 @@ def test_a_file_stands_alone_and_tells_nothing_of_the_machine(single: Exported, 
 
 def test_the_golden_image_comes_with_the_models_own_answers(half: Exported) -> None:
     with np.load(half.path / "golden.npz") as golden:
-        found = OnnxModel.open(half.path / "model.onnx")(golden["image"][None])
+        found = ExportedModel.open(half.path / "model.onnx")(torch.from_numpy(golden["image"][None]))
         assert set(golden.files) == {"image", *found}
         assert all(np.abs(found[name][0].numpy() - golden[name]).max() < 1e-6 for name in found)
         assert golden["image"].max() > 100, "a black picture tells nothing"
 
 
 def test_the_spec_describes_world_and_making(single: Exported, run: Path) -> None:
-    spec = OnnxModel.open(single.path / "model.onnx").spec
+    spec = ExportedModel.open(single.path / "model.onnx").spec
     assert (spec.schema_version, spec.name, spec.world, spec.num_slots) == (1, "circles", "circles", 1)
     assert [(f.name, f.size, f.per_object, f.unit, f.frame) for f in spec.fields] == [
         (TRANSLATION, 3, True, "image_width", "image")
@@ -148,7 +147,7 @@ def test_versions_stand_beside_each_other(single: Exported, half: Exported, mode
 
 
 def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Exported, tmp_path: Path) -> None:
-    spec = OnnxModel.open(single.path / "model.onnx").spec
+    spec = ExportedModel.open(single.path / "model.onnx").spec
     config, course = RunConfig(CirclesOptions(), method="noncur"), TrainingProgress(step=2, images=64, seconds=1.5)
     made = Provenance(tmp_path, config, this_session(), course, "float32")
     result = {"split": "test", "num_images": 500, "metrics": {"position_px": 1.25}, "untrained": {"position_px": 40.0}}
@@ -286,7 +285,7 @@ def test_runs_that_cannot_be_read_are_refused(tmp_path: Path, write_run: WriteRu
 def test_a_place_that_cannot_be_written_is_told(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(SystemExit) as exit_:
-        cli.export([str(run), "--out", str(tmp_path / "file")])
+        export_command.export([str(run), "--out", str(tmp_path / "file")])
     assert exit_.value.code == 1
     said = capsys.readouterr().err
     assert said.startswith("error: cannot write ")
@@ -294,7 +293,9 @@ def test_a_place_that_cannot_be_written_is_told(run: Path, tmp_path: Path, capsy
 
 
 def test_a_full_disk_leaves_nothing_behind(run: Path, tmp_path: Path) -> None:
-    limited = f'ulimit -f 2000; exec "{sys.executable}" -c "from curio_train.commands.cli import export; export()" "$@"'
+    limited = (
+        f'ulimit -f 2000; exec "{sys.executable}" -c "from curio_train.commands.export import export; export()" "$@"'
+    )
     command = ["bash", "-c", limited, "curio-export", str(run), "--out", str(tmp_path / "models")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1

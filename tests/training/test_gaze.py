@@ -6,22 +6,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from curio_train.camera import Intrinsics, project
+from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
 from curio_train.geometry import (
+    Pose,
     matrix_from_rotation_6d,
     rotation_6d_from_matrix,
     rotation_angle_deg,
     rotation_between,
 )
 from curio_train.networks.base import StageNetwork
+from curio_train.networks.crop_camera import project
 from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import (
-    CANDIDATE_LOG_WEIGHTS,
-    CANDIDATES,
     HEAT_MAP,
-    NUM_CANDIDATES,
+    NUM_TOP,
     PROPOSALS,
+    TOP_LOG_WEIGHTS,
+    TOP_PROPOSALS,
 )
 from curio_train.networks.two_stage.network import SCALES
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
@@ -89,7 +91,7 @@ def test_a_crop_is_what_the_second_look_was_trained_on_and_its_pose_comes_back(b
         OBJECT_COORDINATES: torch.zeros(6, 4, 16, 16),
     }
     glance = Told(relative)
-    places = {CANDIDATES: code[TRANSLATION], CANDIDATE_LOG_WEIGHTS: torch.zeros(6, 1)}
+    places = {TOP_PROPOSALS: code[TRANSLATION], TOP_LOG_WEIGHTS: torch.zeros(6, 1)}
     network = brick_world.assemble([Told(places), glance])
     found = network(images)
     assert torch.allclose(found[TRANSLATION], code[TRANSLATION], atol=1e-5)
@@ -133,12 +135,12 @@ def test_surface_points_project_to_the_patches_that_see_them(brick_world: TwoSta
     for image in range(8):
         v, u = torch.nonzero(seen[image], as_tuple=True)  # those at the rim, too
         metres = points[image][:, v, u].T * surface_map.half_extent_m + torch.from_numpy(surface_map.center_m).float()
-        camera = metres @ rotation[image].T + place[image]
+        camera = Pose(rotation[image], place[image]).apply(metres)
         pixels = project(camera[None], torch.from_numpy(matrices[image]).float()[None])[0]
         assert (pixels - torch.stack([u, v], dim=1)).abs().mean() < 0.3
 
 
-def test_first_look_reads_the_likeliest_place(brick_world: TwoStageWorld) -> None:
+def test_localisation_gives_the_likeliest_position(brick_world: TwoStageWorld) -> None:
     """A network that scores brightness must answer with the bright spot's place, between the depth bounds."""
     first = brick_world.stages[0]
     network = first.network(NetworkConfig()).eval()
@@ -210,12 +212,12 @@ def test_of_several_candidates_the_likeliest_is_answered(brick_world: TwoStageWo
     for image, chosen in enumerate((2, 0)):
         u, v = pixels[image, chosen].tolist()
         frames[image, :, v - 30 : v + 31, u - 30 : u + 31] = 1.0
-    equal = {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: torch.full((2, 3), -1.1)}
+    equal = {TOP_PROPOSALS: candidates, TOP_LOG_WEIGHTS: torch.full((2, 3), -1.1)}
     found = brick_world.assemble([Told(equal), Bright()])(frames)
     assert torch.allclose(found[TRANSLATION][:, 0], candidates[0, [2, 0]], atol=1e-5)
     assert found[CONFIDENCE].min() > 0.1
     assert set(found) == {field.name for field in brick_world.layout.fields}
-    known = {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: torch.tensor([[-9.0, 0, -9]]).expand(2, 3)}
+    known = {TOP_PROPOSALS: candidates, TOP_LOG_WEIGHTS: torch.tensor([[-9.0, 0, -9]]).expand(2, 3)}
     found = brick_world.assemble([Told(known), Bright()])(frames)
     assert torch.allclose(found[TRANSLATION][:, 0], candidates[0, [1, 1]], atol=1e-5)
 
@@ -225,11 +227,11 @@ def test_confidence_weighs_what_all_glances_see(brick_world: TwoStageWorld) -> N
     candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8]]).expand(3, 2, 3)
     weights = torch.tensor([[-3.0, -0.5]]).expand(3, 2)
     frames = torch.tensor([0.2, 0.5, 0.9])[:, None, None, None].expand(3, 3, 480, 640)
-    network = brick_world.assemble([Told({CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: weights}), Bright()])
-    _, signs = network.read(frames)
+    network = brick_world.assemble([Told({TOP_PROPOSALS: candidates, TOP_LOG_WEIGHTS: weights}), Bright()])
+    _, features = network.uncalibrated(frames)
     brightness = frames[:, 0, 0, 0]
-    assert torch.allclose(signs.right[:, 0], brightness.logit(), atol=1e-4)
-    assert torch.allclose(signs.there, torch.stack([brightness, torch.full((3,), -0.5)], dim=1), atol=1e-4)
+    assert torch.allclose(features.pose_correct[:, 0], brightness.logit(), atol=1e-4)
+    assert torch.allclose(features.presence, torch.stack([brightness, torch.full((3,), -0.5)], dim=1), atol=1e-4)
     assert torch.allclose(network(frames)[CONFIDENCE].flatten(), brightness, atol=1e-4)
     network.rightness.copy_(torch.tensor([2.0, 0.5]))
     network.presence.copy_(torch.tensor([2.0, 1.0, 0.25]))
@@ -247,7 +249,7 @@ class Middle(StageNetwork):
     def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         count = len(features)
         place = torch.tensor([0.0, 0, 0.8]).expand(count, 1, 3)
-        return {}, {CANDIDATES: place, CANDIDATE_LOG_WEIGHTS: torch.zeros(count, 1)}
+        return {}, {TOP_PROPOSALS: place, TOP_LOG_WEIGHTS: torch.zeros(count, 1)}
 
 
 def test_calibration_knows_empty_frames(brick_world: TwoStageWorld, tmp_path: Path) -> None:
@@ -271,20 +273,20 @@ def test_calibration_knows_empty_frames(brick_world: TwoStageWorld, tmp_path: Pa
     assert empty < 0.6 * full
 
 
-def test_candidates_are_apart_and_the_likeliest_comes_first(brick_world: TwoStageWorld) -> None:
+def test_top_proposals_are_apart_and_the_likeliest_comes_first(brick_world: TwoStageWorld) -> None:
     first = brick_world.stages[0]
     network = first.network(NetworkConfig())
     weights = torch.full((1, 20 * 15), 1e-6)
     chosen = torch.tensor([5 * 20 + 5, 5 * 20 + 6, 10 * 20 + 12, 2 * 20 + 17])
     weights[0, chosen] = torch.tensor([0.5, 0.3, 0.15, 0.05])
     places = network.grid.locate(network.grid.pixels, torch.zeros(300, 1))[None]
-    found, of_found = network._candidates(places, weights)
-    assert found.shape == (1, NUM_CANDIDATES, 3)
+    found, of_found = network._top_proposals(places, weights)
+    assert found.shape == (1, NUM_TOP, 3)
     assert torch.equal(found[0, :3], places[0, chosen[[0, 2, 3]]])
     assert torch.equal(of_found[0, :3], weights[0, chosen[[0, 2, 3]]])
     # Cells far from each other that mean one place are one candidate.
     places[0, chosen[2]] = places[0, chosen[0]] + 0.01
-    found, _ = network._candidates(places, weights)
+    found, _ = network._top_proposals(places, weights)
     assert torch.equal(found[0, :2], places[0, chosen[[0, 3]]])
 
 

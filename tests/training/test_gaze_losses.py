@@ -3,7 +3,7 @@
 import torch
 from curio_train.config import NetworkConfig
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
-from curio_train.networks.grid import of_cells
+from curio_train.networks.grid import per_cell
 from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import HEAT_MAP, PROPOSALS
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
@@ -17,7 +17,7 @@ def test_first_look_loss_rewards_cells_that_know_their_object(brick_world: TwoSt
     true = first.sample(3, (1,))
     grid = first.network(NetworkConfig()).grid
     place = true[TRANSLATION]
-    here = grid.share(grid.project(place))
+    here = grid.splat_weights(grid.project(place))
     every, images = here.cell.flatten(1), torch.arange(3)[:, None]
     places = grid.locate(grid.pixels, torch.zeros(len(grid.pixels), 1)).repeat(3, 1, 1)
     places[images, every] = place.repeat_interleave(4, dim=1)  # where two share a cell, the last one's
@@ -37,7 +37,7 @@ def test_first_look_loss_rewards_cells_that_know_their_object(brick_world: TwoSt
 
 def told_by_cells(code: dict[str, Tensor]) -> dict[str, Tensor]:
     """The code as 64 cells say it that all agree with the whole."""
-    return code | {of_cells(name): code[name].expand(-1, 64, -1) for name in (TRANSLATION, ROTATION_6D)}
+    return code | {per_cell(name): code[name].expand(-1, 64, -1) for name in (TRANSLATION, ROTATION_6D)}
 
 
 def test_second_look_loss_is_least_at_the_truth_and_knows_what_looks_alike(brick_world: TwoStageWorld) -> None:
@@ -78,7 +78,7 @@ def test_each_cell_that_sees_the_object_is_to_say_its_pose(brick_world: TwoStage
     best = float(second.code_loss(right, true))
     for name, change in ((TRANSLATION, 0.05), (ROTATION_6D, 0.3)):
         for cells, counts in ((empty, False), (1 - empty, True)):
-            worse = float(second.code_loss(right | {of_cells(name): right[of_cells(name)] + change * cells}, true))
+            worse = float(second.code_loss(right | {per_cell(name): right[per_cell(name)] + change * cells}, true))
             assert (worse > best + 5e-3) == counts, name
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from curio_train import geometry
+from curio_train.geometry import Pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -29,7 +30,7 @@ def rotation(seed: int, angle: float = math.pi) -> torch.Tensor:
 
 
 rotations = st.builds(rotation, seeds, st.sampled_from([1e-12, 1e-7, 1e-3, 1.0, math.pi]))
-transforms = st.tuples(rotations, vectors)
+transforms = st.builds(Pose, rotations, vectors)
 
 
 def assert_rotation(matrix: torch.Tensor, atol: float = ATOL) -> None:
@@ -38,7 +39,7 @@ def assert_rotation(matrix: torch.Tensor, atol: float = ATOL) -> None:
     torch.testing.assert_close(torch.linalg.det(matrix), torch.ones_like(matrix[..., 0, 0]), atol=atol, rtol=0)
 
 
-def close(a: tuple[torch.Tensor, torch.Tensor], b: tuple[torch.Tensor, torch.Tensor]) -> None:
+def close(a: Pose, b: Pose) -> None:
     for x, y in zip(a, b, strict=True):
         torch.testing.assert_close(x, y, atol=ATOL, rtol=0)
 
@@ -139,19 +140,29 @@ def test_angle_is_exact_at_both_ends(matrix: torch.Tensor, angle_deg: float) -> 
 
 
 @given(transforms, transforms, transforms)
-def test_group_axioms(a: tuple, b: tuple, c: tuple) -> None:
-    identity = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    close(geometry.compose(a, geometry.compose(b, c)), geometry.compose(geometry.compose(a, b), c))
-    close(geometry.compose(a, identity), a)
-    close(geometry.compose(a, geometry.invert(*a)), identity)
-    close(geometry.compose(geometry.invert(*a), a), identity)
+def test_group_axioms(a: Pose, b: Pose, c: Pose) -> None:
+    identity = Pose.identity().to(a.rotation)
+    close(a @ (b @ c), (a @ b) @ c)
+    close(a @ identity, a)
+    close(a @ a.inverse(), identity)
+    close(a.inverse() @ a, identity)
 
 
 @given(transforms, transforms, vectors)
-def test_points_follow_the_composition(a: tuple, b: tuple, point: torch.Tensor) -> None:
-    one_by_one = geometry.transform_points(*a, geometry.transform_points(*b, point[None]))
-    at_once = geometry.transform_points(*geometry.compose(a, b), point[None])
-    torch.testing.assert_close(one_by_one, at_once, atol=ATOL, rtol=0)
+def test_points_follow_the_composition(a: Pose, b: Pose, point: torch.Tensor) -> None:
+    torch.testing.assert_close(a.apply(b.apply(point)), (a @ b).apply(point), atol=ATOL, rtol=0)
+
+
+def test_a_batch_of_poses_in_numpy_moves_each_its_own_points() -> None:
+    rng = np.random.default_rng(0)
+    matrices = np.tile(np.eye(4), (5, 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = geometry.random_rotations(5, rng).numpy(), rng.standard_normal((5, 3))
+    poses, points = Pose.from_matrix(matrices), rng.standard_normal((5, 7, 3))
+    moved = (poses @ poses).apply(points)
+    for number, matrix in enumerate(matrices):
+        homogeneous = np.concatenate([points[number], np.ones((7, 1))], axis=1)
+        np.testing.assert_allclose(moved[number], (homogeneous @ (matrix @ matrix).T)[:, :3], atol=1e-6)
+    np.testing.assert_allclose(poses.inverse().apply(poses.apply(points)), points, atol=1e-6)
 
 
 @given(rotations, vectors.filter(lambda v: v.norm() > 1e-2))
@@ -170,13 +181,13 @@ def test_rotation_between(matrix: torch.Tensor, source: torch.Tensor) -> None:
 def test_camera_looking_at() -> None:
     eye = torch.tensor([0.0, 2.0, -5.0])
     pose = geometry.camera_looking_at(eye, torch.zeros(3))
-    assert_rotation(pose[0], atol=1e-6)
+    assert_rotation(pose.rotation, atol=1e-6)
 
     def seen(point: list[float]) -> torch.Tensor:
-        return geometry.transform_points(*pose, torch.tensor([point], dtype=torch.float32))[0]
+        return pose.apply(torch.tensor(point, dtype=torch.float32))
 
     torch.testing.assert_close(seen([0, 0, 0]), torch.tensor([0.0, 0.0, eye.norm()]))
     assert seen([0, 1, 0])[1] < 0, "up in the world is up in the image: smaller y"
     # Looking along +z with y up, right-handed: the world's +x is to the left.
     assert seen([1, 0, 0])[0] < 0
-    assert_rotation(geometry.camera_looking_at(torch.tensor([0.0, 3.0, 0.0]), torch.zeros(3))[0], atol=1e-6)
+    assert_rotation(geometry.camera_looking_at(torch.tensor([0.0, 3.0, 0.0]), torch.zeros(3)).rotation, atol=1e-6)

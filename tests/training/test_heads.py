@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from curio_train.networks.paper.heads import Heads
+from curio_train.networks.paper.network import Heads
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, YAW, Field, Layout
 
 CIRCLES = Layout((Field(TRANSLATION, 3),))

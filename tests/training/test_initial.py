@@ -10,7 +10,7 @@ from curio_train.config import NetworkConfig, RunConfig
 from curio_train.errors import CheckpointError, CurioError, UsageError
 from curio_train.export.card import EVALUATION_FILE
 from curio_train.export.graph import export
-from curio_train.export.onnx import OnnxModel
+from curio_train.exported_model import ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.initial import begin_with, uses_synthetic_labels
 from curio_train.learning.runs.interruption import Interruption
@@ -58,7 +58,7 @@ def test_a_model_gives_the_network_that_it_was_exported_from(run: Path, model: P
         for name, value in expected.items():
             assert found[name].dtype == value.dtype
             assert torch.allclose(found[name], value, rtol=tolerance, atol=1e-6 * bool(tolerance)), name
-        assert (state.course.all_images, state.course.images, state.course.all_seconds) == (64, 0, 1.5)
+        assert (state.progress.all_images, state.progress.images, state.progress.all_seconds) == (64, 0, 1.5)
     assert not torch.equal(network(begun(model))["encoder.layers.0.weight"], expected["encoder.layers.0.weight"])
     assert (model / "2" / "weights.safetensors").stat().st_size < 0.51 * (
         model / "1" / "weights.safetensors"
@@ -76,14 +76,14 @@ def test_images_count_on_over_models_and_in_their_cards(model: Path, tmp_path: P
     learn(replace(config, images=12), path, Interruption(), resume=True, cache=tmp_path / "cache")
     (path / EVALUATION_FILE).write_text('{"images_seen": 76, "split": "test", "num_images": 5, "metrics": {"a": 2.0}}')
     version = export(path, tmp_path / "models").path
-    spec = OnnxModel.open(version / "model.onnx").spec
+    spec = ExportedModel.open(version / "model.onnx").spec
     assert spec.images_seen == 64 + 12
     assert spec.training_seconds > 1.5
     card = (version.parent / "CARD.md").read_text()
     assert "| images seen | 76, 12 of them since it was circles |" in card
     assert "| a | 2 |" in card
     assert "`curio-train circles --init models/circles/1`" in card
-    assert begun(version).course.images_before == 76
+    assert begun(version).progress.images_before == 76
 
 
 def test_a_run_killed_before_its_first_checkpoint_begins_with_the_same_network(run: Path, tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def of_nothing(version: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "error", "text"),
     [
-        (without_weights, CheckpointError, r"circles/1 was exported without weights to go on from"),
+        (without_weights, CheckpointError, r"circles/1 was exported without weights.safetensors"),
         (cut, CheckpointError, r"weights\.safetensors cannot be read .*export the model anew"),
         (of_nothing, UsageError, "neither a run folder .* nor a model"),
     ],

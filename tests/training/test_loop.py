@@ -8,12 +8,13 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
-from curio_train.config import PRESETS, ConvStack, Method, NetworkConfig, Recipe, RunConfig
+from curio_train.config import PRESETS, ConvStack, MethodName, NetworkConfig, Recipe, RunConfig
 from curio_train.errors import DataError, TrainingError, UsageError
-from curio_train.learning.loop import Outcome, Trainer, learning_rate_factor
+from curio_train.learning.loop import Outcome, learning_rate_factor
 from curio_train.learning.parallel import Ranks
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.session import learn
+from curio_train.learning.trainer import Trainer
 from curio_train.worlds.base import Batch, ImageSource
 from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions
@@ -42,7 +43,7 @@ class SameBatch(ImageSource):
         return Batch(self.images[rows], code=code if self.with_code else None)
 
 
-def configuration(method: Method = "our", recipe: Recipe = FAST, **others: object) -> RunConfig:
+def configuration(method: MethodName = "our", recipe: Recipe = FAST, **others: object) -> RunConfig:
     return RunConfig(CirclesOptions(), method=method, recipe=recipe, network=THIN, **others)
 
 
@@ -65,8 +66,8 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("cache")
 
 
-@pytest.mark.parametrize("method", get_args(Method))
-def test_every_method_learns_a_fixed_batch(method: Method) -> None:
+@pytest.mark.parametrize("method", get_args(MethodName))
+def test_every_method_learns_a_fixed_batch(method: MethodName) -> None:
     one = trainer(configuration(method))
     rows = [one.step(1.0) for _ in range(25)]
     assert all(math.isfinite(value) for row in rows for value in row.values())
@@ -85,7 +86,7 @@ def test_every_method_learns_a_fixed_batch(method: Method) -> None:
         ("wake_sleep_critic", {"image", "curiosity", "critic", "sleep"}),
     ],
 )
-def test_a_method_is_its_loss_terms(method: Method, terms: set[str]) -> None:
+def test_a_method_is_its_loss_terms(method: MethodName, terms: set[str]) -> None:
     one = trainer(configuration(method))
     assert set(one.step(1.0)) == terms
     assert (one.state.critic is None) == ("critic" not in terms)
@@ -98,7 +99,7 @@ def test_micro_batches_add_up_to_the_gradient_of_the_whole() -> None:
         one.step(1.0)
     for one, other in zip(*(gradients(t) for t in (whole, pieces)), strict=True):
         assert torch.allclose(one, other, atol=1e-5, rtol=1e-3)
-    assert pieces.state.course.images == 24
+    assert pieces.state.progress.images == 24
 
 
 def test_each_micro_batch_holds_its_own_images(cache: Path) -> None:
@@ -130,7 +131,7 @@ def test_gradient_penalty_acts_on_its_steps_alone() -> None:
     rare = trainer(configuration("our", replace(FAST, gradient_penalty=10.0, gradient_penalty_every=3)))
     plain.step(1.0), rare.step(1.0)
     assert not torch.equal(weights(plain), weights(rare))
-    rare.state.load({k: v.clone() for k, v in plain.state.tensors().items()}, replace(plain.state.course))
+    rare.state.load({k: v.clone() for k, v in plain.state.tensors().items()}, replace(plain.state.progress))
     plain.step(1.0), rare.step(1.0)
     assert torch.equal(weights(plain), weights(rare))
 
@@ -152,7 +153,7 @@ def test_a_step_that_is_not_finite_is_discarded_and_named() -> None:
     with pytest.raises(TrainingError, match=r"step 2: not finite: .*image.*the gradient of pose"):
         one.step(1.0)
     assert torch.equal(weights(one), before)
-    assert one.state.course.step == 1
+    assert one.state.progress.step == 1
 
 
 def test_learning_rate_warms_up_and_decays_along_a_cosine() -> None:
@@ -222,7 +223,7 @@ def test_supervision_sees_only_its_share_of_the_images(tmp_path: Path, cache: Pa
     ("change", "message"),
     [
         ({"labels": 0.5}, "expected --method super"),
-        ({"method": "super", "labels": 1.5}, "is no share"),
+        ({"method": "super", "labels": 1.5}, "is no fraction"),
         ({"minutes": 0.0}, "--minutes is 0.0, expected more than 0"),
         ({"method": "super", "stop_below": 1.0}, "--stop-below watches the image loss"),
         ({"images": -1}, "--images is -1, expected more than 0"),
@@ -253,7 +254,7 @@ def test_the_paper_preset_is_the_papers_table() -> None:
 
 
 def test_processes_share_micro_batches_evenly_or_not_at_all() -> None:
-    shares = [list(Ranks(rank, 2, torch.device("cpu")).share(4)) for rank in range(2)]
+    shares = [list(Ranks(rank, 2, torch.device("cpu")).micro_batches(4)) for rank in range(2)]
     assert np.array(shares).tolist() == [[0, 2], [1, 3]]
-    with pytest.raises(UsageError, match="3 micro-batches a step cannot be shared by 2 processes"):
-        Ranks(0, 2, torch.device("cpu")).share(3)
+    with pytest.raises(UsageError, match="3 micro-batches a step cannot be divided among 2 processes"):
+        Ranks(0, 2, torch.device("cpu")).micro_batches(3)

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from curio_train.config import NetworkConfig
-from curio_train.learning.curiosity import critic_loss, curiosity_loss, frozen, gradient_penalty
-from curio_train.learning.losses import image_loss
+from curio_train.learning.losses import critic_loss, curiosity_loss, frozen, gradient_penalty, image_loss
 from curio_train.learning.sleep import sleep_codes
 from curio_train.metrics.assignment import scene_error
 from curio_train.networks.paper.critic import Critic

@@ -5,8 +5,7 @@ import torch
 from curio_train.config import ConvStack, NetworkConfig
 from curio_train.errors import UsageError
 from curio_train.networks.paper.critic import Critic
-from curio_train.networks.paper.encoder import Encoder
-from curio_train.networks.paper.pose import PoseNetwork
+from curio_train.networks.paper.network import Encoder, PoseNetwork
 from curio_train.scene_code import TRANSLATION, Field, Layout
 from torch import nn
 

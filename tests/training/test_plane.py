@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from curio_train.capture.plane import CameraPoseFile, ever_changed, seen_points
 from curio_train.errors import CameraError, DataError
+from curio_train.geometry import Pose
 
 WIDTH, HEIGHT = 96, 72
 MATRIX = np.array([[110.0, 0, 47.5], [0, 110, 35.5], [0, 0, 1]])
@@ -29,7 +30,7 @@ def test_pixels_look_at_the_plane_and_nothing_above_the_horizon() -> None:
     seen = points[np.isfinite(points).all(axis=2)]
     assert len(seen) > 1000
     assert np.allclose(seen[:, 1], 0)
-    back = seen @ level[:3, :3].T + level[:3, 3]
+    back = Pose.from_matrix(level).apply(seen)
     pixels = (back @ MATRIX.T)[:, :2] / back[:, 2:]
     rows, columns = np.nonzero(np.isfinite(points).all(axis=2))
     assert np.allclose(pixels, np.stack([columns, rows], axis=1), atol=1e-6)

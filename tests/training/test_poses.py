@@ -30,7 +30,6 @@ def test_perfect_is_zero() -> None:
     assert poses.add_s_m(pose, pose, CLOUD) == 0
     assert poses.mssd_m(pose, pose, CLOUD, same) == 0
     assert poses.mspd_px(pose, pose, CLOUD, same, K) == 0
-    assert poses.projection_error_px(pose, pose, CLOUD, K) == 0
     assert poses.rotation_error_deg(pose, pose) == pytest.approx(0, abs=1e-6)
     assert poses.translation_error_m(pose, pose) == 0
 
@@ -95,7 +94,7 @@ def test_continuous_symmetry() -> None:
     np.testing.assert_allclose(same[0].translation_m, 0, atol=1e-12)
     on_axis = np.array([[0.05, 0, -0.2]])
     for pose in same:
-        np.testing.assert_allclose(poses.transform(pose, on_axis), on_axis, atol=1e-12)
+        np.testing.assert_allclose(pose.apply(on_axis), on_axis, atol=1e-12)
     turn = same[100]
     estimate = Pose(turn.rotation, turn.translation_m + ORIGIN.translation_m)
     assert poses.mssd_m(estimate, ORIGIN, CLOUD, same) == pytest.approx(0, abs=1e-12)
@@ -113,12 +112,12 @@ def test_continuous_symmetry() -> None:
 def test_projection() -> None:
     # 1 cm sideways at 1 m through a focal length of 500 px is 5 px for points of depth 1 m.
     estimate = moved(0.01, 0, 0)
-    assert poses.projection_error_px(estimate, ORIGIN, SQUARE, K) == pytest.approx(5)
     assert poses.mspd_px(estimate, ORIGIN, SQUARE, poses.symmetry_poses(PLAIN), K) == pytest.approx(5)
     # Twice as near: each corner, 50 * sqrt(2) px from the centre, goes out to twice that.
-    assert poses.projection_error_px(moved(0, 0, -0.5), ORIGIN, SQUARE, K) == pytest.approx(50 * 2**0.5)
+    identity = poses.symmetry_poses(PLAIN)
+    assert poses.mspd_px(moved(0, 0, -0.5), ORIGIN, SQUARE, identity, K) == pytest.approx(50 * 2**0.5)
     assert poses.project(np.array([[0.0, 0, 1]]), K).tolist() == [[320, 240]]
-    assert poses.projection_error_px(moved(0, 0, -2), ORIGIN, SQUARE, K) == np.inf
+    assert poses.mspd_px(moved(0, 0, -2), ORIGIN, SQUARE, identity, K) == np.inf
 
 
 def test_recall() -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from curio_train.commands import cli
+from curio_train.commands import evaluate as evaluate_command
+from curio_train.commands import train as train_command
 from curio_train.config import WorldOptions
 from curio_train.errors import ReportError
 from curio_train.evaluation.evaluate import evaluate
@@ -103,7 +104,10 @@ def test_neither_training_nor_evaluation_fails_for_want_of_a_report(
     run = tmp_path / "run"
     (run / (REPORT_FILE + ".tmp")).mkdir(parents=True)  # in the way of every report
     flags = ["--batch-size", "4", "--micro-batch-size", "4", "--images", "4", "--out", str(run)]
-    for command, arguments in ((cli.train, ["circles", "--method", "noncur", *flags]), (cli.evaluate, [str(run)])):
+    for command, arguments in (
+        (train_command.train, ["circles", "--method", "noncur", *flags]),
+        (evaluate_command.evaluate, [str(run)]),
+    ):
         with pytest.raises(SystemExit) as exit_:
             command([*arguments, "--cache", str(tmp_path)])
         assert exit_.value.code == 0

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from curio_train.commands.cli import _parse
+from curio_train.commands.train import _parse
 from curio_train.errors import DataError
 from curio_train.learning.runs.configuration import to_json
 from curio_train.worlds.options import CaptureOptions

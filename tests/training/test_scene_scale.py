@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from curio_train.camera import Intrinsics
 from curio_train.capture.structure import Structure
-from curio_train.commands import cli
+from curio_train.commands import train as train_command
 from curio_train.data.bop import BopDataset
 from curio_train.errors import DataError, UsageError
 from curio_train.evaluation.scene_scale import mean_scale, scale_by_objects
@@ -35,7 +35,7 @@ def test_two_networks_of_one_object_are_refused(tmp_path: Path) -> None:
 
 def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, str]:
     with pytest.raises(SystemExit) as exit_:
-        cli.train(["capture", "--calibrate", *map(str, flags)])
+        train_command.train(["capture", "--calibrate", *map(str, flags)])
     captured = capsys.readouterr()
     return int(exit_.value.code or 0), captured.out, captured.err
 

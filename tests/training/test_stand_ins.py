@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from curio_train.errors import DataError, UsageError
+from curio_train.geometry import Pose
 from curio_train.meshes.meshes import load_mesh
 from scipy.spatial.transform import Rotation
 from synthetic_captures import scenes
@@ -91,8 +92,7 @@ def test_scenes_are_drawn_by_seed_and_nothing_touches(name: str, fewest: int, mo
         assert all((a.world_from_obj == b.world_from_obj).all() for a, b in zip(things, again, strict=True))
         clouds = []
         for thing in things:
-            pose = thing.world_from_obj
-            clouds.append(kinds[thing.slot].mesh.vertices_m @ pose[:3, :3].T + pose[:3, 3])
+            clouds.append(Pose.from_matrix(thing.world_from_obj).apply(kinds[thing.slot].mesh.vertices_m))
             assert clouds[-1][:, 1].min() == pytest.approx(0, abs=1e-9), "it stands on the table"
         for number_a, a in enumerate(clouds):
             for b in clouds[:number_a]:

@@ -10,7 +10,7 @@ import torch
 from curio_train.camera import Intrinsics, load_intrinsics
 from curio_train.capture.ground import scale_by_distance, scale_by_height, to_world
 from curio_train.capture.structure import Structure, every_nth, recover
-from curio_train.commands import cli
+from curio_train.commands import train as train_command
 from curio_train.errors import CameraError, DataError
 from curio_train.geometry import camera_looking_at
 from scipy.spatial.transform import Rotation
@@ -139,7 +139,7 @@ def test_the_command(
     flags = ["--images", str(paths[0].parent), "--every", "3", "--distance-m", str(baseline)]
     flags += ["--camera-out", str(tmp_path / "camera.json"), "--views-out", str(tmp_path / "views.json")]
     with pytest.raises(SystemExit) as exit_:
-        cli.train(["capture", "--calibrate", *flags])
+        train_command.train(["capture", "--calibrate", *flags])
     assert not exit_.value.code
     assert "placed 14 photographs" in capsys.readouterr().out
     assert load_intrinsics(tmp_path / "camera.json").matrix[0, 0] == pytest.approx(FOCAL, rel=0.02)

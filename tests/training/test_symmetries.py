@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from curio_train.data.bop import BopDataset
+from curio_train.geometry import Pose
 from curio_train.meshes import shapes
 from curio_train.meshes.meshes import Mesh
 from curio_train.meshes.symmetries import find_symmetries
@@ -51,9 +52,9 @@ def test_motions_are_of_the_object_frame_wherever_its_origin_lies() -> None:
     offset = np.array([0.2, -0.1, 0.05])
     box = shapes.box((0.03, 0.05, 0.08))
     turned = Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix()
-    moved = Mesh(box.vertices_m @ turned.T + offset, box.faces)
+    moved = Mesh(Pose(turned, offset).apply(box.vertices_m), box.faces)
     for motion in find_symmetries(moved).discrete:
-        carried = moved.vertices_m @ motion[:3, :3].T + motion[:3, 3]
+        carried = Pose.from_matrix(motion).apply(moved.vertices_m)
         distances = np.linalg.norm(carried[:, None] - moved.vertices_m[None], axis=2).min(axis=1)
         assert distances.max() < 0.01 * box.diameter_m
 
@@ -77,6 +78,6 @@ def test_agrees_with_bop(name: str) -> None:
     assert not found.continuous
     assert len(found.discrete) == len(annotated)
     for ours, theirs in zip(found.discrete, annotated, strict=True):
-        ends = [mesh.vertices_m @ motion[:3, :3].T + motion[:3, 3] for motion in (ours, theirs)]
+        ends = [Pose.from_matrix(motion).apply(mesh.vertices_m) for motion in (ours, theirs)]
         apart = np.linalg.norm(ends[0] - ends[1], axis=1).max() / mesh.diameter_m
         assert apart < LARGEST_DISAGREEMENT, f"{name}: {apart:.3f} diameters apart"

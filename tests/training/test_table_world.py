@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train.commands import cli
+from curio_train.commands import train as train_command
 from curio_train.config import METHODS, NetworkConfig, Recipe, RunConfig
-from curio_train.doctor.before_training import refuse_unfit
+from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.photographed import judge
 from curio_train.export.graph import export
-from curio_train.geometry import camera_looking_at
-from curio_train.learning.loop import Trainer
+from curio_train.geometry import Pose, camera_looking_at
 from curio_train.learning.parallel import ranks
 from curio_train.learning.runs.configuration import load_config
+from curio_train.learning.trainer import Trainer
 from curio_train.meshes.meshes import load_mesh
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW
@@ -61,16 +61,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cv2.imwrite(str(root / f"plate-{side}.png"), grey)
         views[f"plate-{side}.png"] = {"cam_from_world": pose(azimuth).tolist()}
         plate = torch.from_numpy(cv2.cvtColor(grey, cv2.COLOR_BGR2RGB)).permute(2, 0, 1).float() / 255
-        turn, shift = torch.from_numpy(pose(azimuth)[:3, :3]).float(), torch.from_numpy(pose(azimuth)[:3, 3]).float()
+        cam_from_world = Pose.from_matrix(torch.from_numpy(pose(azimuth)).float())
         where = torch.zeros(NUM, 2, 3)
         where[..., [0, 2]] = torch.from_numpy(places).float()
         own = torch.from_numpy(z_up).float()
         images = renderer(
-            (turn @ own).expand(NUM, 2, 3, 3),
-            where @ turn.T + shift,
+            (cam_from_world.rotation @ own).expand(NUM, 2, 3, 3),
+            cam_from_world.apply(where),
             camera_matrix=MATRIX,
             backgrounds=plate.expand(NUM, -1, -1, -1),
-            light=(turn @ torch.tensor([0.0, 0.7, 0.0])).expand(NUM, 3),
+            light=(cam_from_world.rotation @ torch.tensor([0.0, 0.7, 0.0])).expand(NUM, 3),
             color=torch.tensor(RED).expand(NUM, 2, 3),
         )
         (root / side).mkdir()
@@ -176,7 +176,7 @@ def test_a_few_steps_bring_photographs_or_dreams_nearer(world: Table, folder: Pa
             with torch.no_grad():
                 return float(world.code_loss(trainer.state.stages[0](world.render(fixed)), fixed))
 
-        error = image_error if "image" in METHODS[method] else dream_error
+        error = image_error if METHODS[method].image else dream_error
         before = error()
         for _ in range(12):
             trainer.step(1.0)
@@ -229,11 +229,9 @@ def test_a_model_answers_in_the_camera_frame_and_the_files(folder: Path, lying: 
     file_corner = torch.tensor([0.0, 0.0, 0.05], dtype=torch.float64)  # of the upper edge
     seen = outputs[TRANSLATION].double() + outputs["rotation"].double() @ file_corner
     part = found.parts[0]
-    own_corner = torch.from_numpy(
-        part.file_from_own.rotation.T @ (file_corner.numpy() - part.file_from_own.translation_m)
-    )
-    turn, shift = (torch.from_numpy(value) for value in found.stage.cam_from_world)
-    expected = (found.own_rotation(code).double() @ own_corner + code[TRANSLATION]) @ turn.T + shift
+    own_corner = part.file_from_own.inverse().to(file_corner).apply(file_corner)
+    in_world = found.own_rotation(code).double() @ own_corner + code[TRANSLATION]
+    expected = found.stage.cam_from_world.to(in_world).apply(in_world)
     assert torch.allclose(seen, expected, atol=1e-5)
     again = found.from_exported(outputs)
     assert torch.allclose(found.own_rotation(again).double(), found.own_rotation(code).double(), atol=1e-4)
@@ -302,7 +300,7 @@ def test_photographs_have_no_labels(world: Table, tmp_path: Path) -> None:
 
 def call(*words: object) -> int:
     with pytest.raises(SystemExit) as exit_:
-        cli.train(["capture", *map(str, words)])
+        train_command.train(["capture", *map(str, words)])
     return int(exit_.value.code or 0)
 
 

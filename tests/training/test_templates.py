@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.templates.alignment import Aligned, align, with_gradient
 from curio_train.templates.build import template_network

@@ -90,7 +90,7 @@ def test_a_polite_signal_leaves_a_checkpoint_and_says_how_to_go_on(
 
 def test_help_names_worlds_flags_and_defaults_without_torch() -> None:
     script = (
-        "import sys; from curio_train.commands.cli import train\n"
+        "import sys; from curio_train.commands.train import train\n"
         "try: train(sys.argv[1:])\n"
         "finally: print(sorted({'torch', 'mitsuba', 'cv2', 'scipy'} & set(sys.modules)), file=sys.stderr)"
     )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train.commands import cli
+from curio_train.commands import render as render_command
 from curio_train.drawing.scenes import mesh_world
 
 WIDTH, HEIGHT = 64, 48
@@ -21,7 +21,7 @@ PLACE = [0.02, -0.01, 0.4]
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     """Exit status, stdout and stderr of the command."""
     with pytest.raises(SystemExit) as exit_:
-        cli.render([str(argument) for argument in arguments])
+        render_command.render([str(argument) for argument in arguments])
     out, err = capsys.readouterr()
     return int(exit_.value.code or 0), out, err
 

@@ -9,11 +9,11 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
-from curio_train.config import ConvStack, Method, NetworkConfig, Recipe, RunConfig
+from curio_train.config import ConvStack, MethodName, NetworkConfig, Recipe, RunConfig
 from curio_train.errors import DataError
 from curio_train.geometry import matrix_from_yaw
-from curio_train.learning.loop import Trainer
 from curio_train.learning.parallel import Ranks
+from curio_train.learning.trainer import Trainer
 from curio_train.metrics.assignment import scene_error
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW, index
 from curio_train.worlds import WORLDS, build
@@ -65,7 +65,7 @@ def pixels_of(world: MeshWorld, code: dict[str, Tensor], novel: bool) -> np.ndar
     )
     for slot, kind in enumerate(meshes):
         own = np.einsum("bij,nj->bni", turns[:, slot], kind.mesh.vertices_m) + code[TRANSLATION][:, slot, None].numpy()
-        projected = (own @ pose.rotation.T + pose.translation_m) @ world.camera.matrix.T
+        projected = (pose.apply(own)) @ world.camera.matrix.T
         found.append((projected[..., :2] / projected[..., 2:]).reshape(-1, 2))
     return np.concatenate(found)
 
@@ -251,9 +251,9 @@ def test_without_codes_the_label_file_is_not_opened(worlds: dict[str, MeshWorld]
         world.source("test", 0, with_code=True, cache=tmp_path)
 
 
-@pytest.mark.parametrize("method", get_args(Method))
+@pytest.mark.parametrize("method", get_args(MethodName))
 @pytest.mark.parametrize("name", NAMES)
-def test_every_method_learns_a_fixed_batch(worlds: dict[str, MeshWorld], name: str, method: Method) -> None:
+def test_every_method_learns_a_fixed_batch(worlds: dict[str, MeshWorld], name: str, method: MethodName) -> None:
     world = worlds[name]
     config = RunConfig(WORLDS[name](), method=method, recipe=FAST, network=THIN)
     with torch.no_grad():

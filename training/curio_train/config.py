@@ -1,6 +1,7 @@
-"""Every number a training run may be asked to change, as plain data without torch.
+"""Configuration of a training run as plain dataclasses, without torch.
 
-The command line, ``config.json`` of a run folder and the loop read these same classes.
+The command line, ``config.json`` of a run folder and the training loop share these classes. The string under each field
+is its help text.
 """
 
 from collections.abc import Mapping
@@ -12,26 +13,52 @@ from tyro.conf import OmitArgPrefixes, Suppress
 
 from curio_train.errors import UsageError
 
-Term = Literal["image", "curiosity", "sleep", "label"]
-Method = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic", "templates"]
+MethodName = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic", "templates"]
 Preset = Literal["laptop", "paper"]
 DecoderKind = Literal["whole", "cells"]
 
-METHODS: Mapping[Method, frozenset[Term]] = {
-    "our": frozenset({"image", "curiosity"}),
-    "noncur": frozenset({"image"}),
-    "super": frozenset({"label"}),
-    "sleep": frozenset({"sleep"}),
-    "wake_sleep": frozenset({"image", "sleep"}),
-    "wake_sleep_critic": frozenset({"image", "curiosity", "sleep"}),
-    "templates": frozenset(),
+
+@dataclass(frozen=True)
+class Method:
+    """A training method: the loss terms that it adds up."""
+
+    image: bool = False
+    """Squared error between the training images and the re-renderings of what the network predicts for them."""
+    curiosity: bool = False
+    """The critic's verdict on these re-renderings."""
+    sleep: bool = False
+    """Error of what the network predicts for renderings of known scene codes."""
+    label: bool = False
+    """Error of what the network predicts for training images whose scene codes are given."""
+    templates: bool = False
+    """Nothing is trained: renderings of the object are stored and compared with frames by pretrained features."""
+
+    @property
+    def reads_images(self) -> bool:
+        """Whether the network is run on training images at all; else it learns from renderings alone."""
+        return self.image or self.curiosity or self.label
+
+    @property
+    def perturbs_predictions(self) -> bool:
+        """Whether the scene codes of ``sleep`` are drawn around predictions for training images."""
+        return self.sleep and self.reads_images
+
+
+METHODS: Mapping[MethodName, Method] = {
+    "our": Method(image=True, curiosity=True),
+    "noncur": Method(image=True),
+    "super": Method(label=True),
+    "sleep": Method(sleep=True),
+    "wake_sleep": Method(image=True, sleep=True),
+    "wake_sleep_critic": Method(image=True, curiosity=True, sleep=True),
+    "templates": Method(templates=True),
 }
-"""The loss terms of each method; the paper's own are the first three."""
+"""All methods by name; the first three are the paper's."""
 
 
 @dataclass(frozen=True)
 class ConvStack:
-    """Widths and geometry of a stack of strided convolutions, first layer first."""
+    """Channels and geometry of a stack of strided convolutions, first layer first."""
 
     widths: tuple[int, ...]
     kernels: tuple[int, ...]
@@ -44,7 +71,7 @@ class ConvStack:
             raise UsageError(f"widths, kernels, strides and paddings must be equally long, found {self}")
 
     def output_side(self, side: int) -> int:
-        """Pixels a side that are left of an image of ``side`` pixels."""
+        """Side of the output, in pixels, for an input of ``side`` x ``side`` pixels."""
         for kernel, stride, padding in zip(self.kernels, self.strides, self.paddings, strict=True):
             side = (side + 2 * padding - kernel) // stride + 1
         return side
@@ -52,95 +79,86 @@ class ConvStack:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Sizes of the networks; the defaults are the paper's appendix as its parameter counts decide it.
-
-    Attributes:
-        encoder: 2,029,056 parameters, 128 → 30 → 14 → 7 → 4 → 1 pixels.
-        critic: 1,883,713 parameters, 128 → 30 → 7 → 4 → 2 → 1 pixels.
-        critic_normalisation: Both worked for the paper; its results use "batch".
-        reading: How images of generated worlds and of parts on a plane are read. whole: the paper's way, all of a scene
-            from one latent code. cells: every cell of the image says what is there, and slots are filled afterwards.
-            Unless given, parts on a plane are read by cells (but not with preset paper, nor by wake–sleep, which needs
-            the former), all else as a whole.
-        row: Values each object slot gets from the shared trunk.
-        hidden: Width of each branch's hidden layer.
-    """
+    """Sizes of the networks; the defaults are the paper's appendix as its parameter counts decide it."""
 
     encoder: Suppress[ConvStack] = ConvStack(
         (64, 192, 384, 256, 64), (11, 5, 3, 3, 3), (4, 2, 2, 2, 2), (0, 1, 1, 1, 0)
     )
+    """2,029,056 parameters, 128 → 30 → 14 → 7 → 4 → 1 pixels."""
     critic: Suppress[ConvStack] = ConvStack((64, 192, 384, 256, 1), (11, 5, 3, 3, 3), (4, 4, 2, 2, 2), (0, 0, 1, 1, 1))
+    """1,883,713 parameters, 128 → 30 → 7 → 4 → 2 → 1 pixels."""
     critic_normalisation: Literal["batch", "instance"] = "batch"
+    """Both worked for the paper; its results use "batch"."""
     reading: DecoderKind | None = None
+    """Decoder for images of generated worlds and of parts on a plane. whole: the paper's global decoder, which predicts
+    all slots of a scene from one latent code. cells: a dense decoder, which predicts an object at every grid cell and
+    fills the slots from the surest cells. Unless given, parts on a plane use cells (but not with preset paper, nor with
+    wake–sleep, which needs whole), all else uses whole."""
     row: int = 32
+    """Values each object slot gets from the shared trunk."""
     hidden: int = 64
+    """Width of each branch's hidden layer."""
 
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """What a user may choose about a world; each world has its own subclass in ``worlds/options.py``.
+    """What a user may choose about a world; each world has its own subclass in ``worlds/options.py``."""
 
-    Attributes:
-        default_method: What --method is unless given.
-        default_recipe: Where the preset laptop differs for this world, because that was measured to be better.
-    """
-
-    default_method: ClassVar[Method] = "our"
+    default_method: ClassVar[MethodName] = "our"
+    """The method unless --method is given."""
     default_recipe: ClassVar[Mapping[str, Any]] = {}
+    """Hyperparameters that were measured to be better for this world than those of the preset laptop."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Hyperparameters of learning; the defaults are the paper's.
-
-    Attributes:
-        batch_size: Images a step.
-        micro_batch_size: Images held in memory at once; gradients add up to those of a whole batch, batch norm sees one
-            micro-batch at a time.
-        learning_rate: Adam's, of encoder and heads.
-        matrix_learning_rate: Muon's, of the matrices and convolutions of encoder and heads, whose other parameters
-            stay with Adam; 0: all do.
-        critic_learning_rate: Adam's, of the critic.
-        warm_up_steps: Steps over which learning rates rise linearly from 0.
-        final_learning_rate: Share of the learning rates that is left at the end of the budget, approached along a
-            cosine; 1 keeps them constant.
-        image_weight: Of the squared image error, summed over pixels and channels.
-        critic_weight: Of the curiosity term.
-        gradient_penalty: R1: weight of the critic's squared gradient at data images; 0 is off.
-        gradient_penalty_every: Steps between penalties, each weighted up by as many.
-        sleep_weight: Of the distance between sleep codes and what the network reads from their renderings.
-        sleep_noise: Standard deviation of sleep codes around the network's own predictions, in half ranges.
-        swap_colors: Show each image with its colour channels in a random order, and its true colours likewise, in
-            worlds of which that makes nothing else.
-        sleep_drawn: Share of sleep codes drawn from the world's known range instead of around own predictions; all are
-            with --method sleep, which makes no predictions of the data.
-        self_training: Share of the second look's images that are photographs, with the poses that the network has read
-            in them and render-and-compare has refined, in the last two fifths of a run that sleeps, or in the last four
-            where it began as another (--init); 0: none. Only where a world has photographs.
-        gradient_clip: Largest L2 norm of a step's gradient, of the network and of the critic each.
-        precision: Of the convolutions, bfloat16 only where the machine is quick with it; all else is in float32.
-        budget_images: Images to show where neither --minutes nor --images is given.
-    """
+    """Hyperparameters of learning; the defaults are the paper's."""
 
     batch_size: int = 128
+    """Images a step."""
     micro_batch_size: int = 32
+    """Images held in memory at once; gradients add up to those of a whole batch, batch norm sees one micro-batch at a
+    time."""
     learning_rate: float = 1e-4
+    """Adam's learning rate for encoder and heads."""
     matrix_learning_rate: float = 0.0
+    """Muon's learning rate for the matrices and convolutions of encoder and heads, whose other parameters stay with
+    Adam; 0: Adam moves them all."""
     critic_learning_rate: float = 1e-6
+    """Adam's learning rate for the critic."""
     warm_up_steps: int = 0
+    """Steps over which learning rates rise linearly from 0."""
     final_learning_rate: float = 1.0
+    """Fraction of the learning rates that is left at the end of the budget, approached along a cosine; 1 keeps them
+    constant."""
     image_weight: float = 0.01
+    """Weight of the squared image error, summed over pixels and channels."""
     critic_weight: float = 10.0
+    """Weight of the curiosity term."""
     gradient_penalty: float = 0.0
+    """R1: weight of the critic's squared gradient at data images; 0 is off."""
     gradient_penalty_every: int = 1
+    """Steps between penalties, each weighted up by as many."""
     sleep_weight: float = 1.0
+    """Weight of the error between the scene codes of renderings and the network's predictions for them."""
     sleep_noise: float = 0.5
+    """Standard deviation of wake–sleep's scene codes around the network's own predictions, in half ranges."""
     swap_colors: bool = False
+    """Show each image with its colour channels in a random order, and permute its true colours alike, in worlds where
+    the result is a scene of the same world."""
     sleep_drawn: float = 0.5
+    """Fraction of wake–sleep's scene codes that is drawn from the world's known range instead of around predictions;
+    --method sleep draws all of them."""
     self_training: float = 0.0
+    """Fraction of the crop-pose stage's images that are crops of photographs. Their pseudo-labels are the network's own
+    poses, refined by render-and-compare. Mixed in during the last two fifths of a run with --method sleep, or the last
+    four where it began with trained weights (--init); 0: none. Only where a world has photographs."""
     gradient_clip: float = 0.5
+    """Largest L2 norm of a step's gradient, of the network and of the critic each."""
     precision: Literal["float32", "bfloat16"] = "float32"
+    """Precision of the convolutions, bfloat16 only where the machine is quick with it; all else is in float32."""
     budget_images: int = 6_400_000
+    """Images to show where neither --minutes nor --images is given."""
 
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
@@ -183,67 +201,63 @@ PRESETS: Mapping[Preset, Recipe] = {
 
 
 def preset_recipe(preset: Preset, world: type[WorldOptions]) -> Recipe:
-    """The hyperparameters that a preset means in a world."""
+    """The preset's hyperparameters for a world."""
     return replace(PRESETS[preset], **world.default_recipe) if preset == "laptop" else PRESETS[preset]
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """All that decides what a run learns; ``config.json`` of its folder.
-
-    Attributes:
-        world: The world's own options.
-        method: our: image loss and critic. noncur: image loss alone. super: true scene codes. Beyond the paper,
-            sleep: renderings of codes from the world's known range, to regress. wake_sleep: image loss, and sleep
-            with half of the codes around own predictions. wake_sleep_critic: that and the critic. templates: no training
-            at all; renderings of the object are compared with frames by pretrained features.
-        labels: Share of the training images that --method super sees, with their true codes (paper: 0.05, 0.1, 1).
-        preset: Hyperparameters to start from: laptop (measured on two cores) or paper (the paper's).
-        seed: Of the initial weights and every random draw.
-        minutes: Budget of training time, in minutes.
-        images: Budget of images shown. Where both budgets are given the first to be reached ends the run.
-        stop_below: Converged, and done, when the image loss (summed squared error an image, smoothed) is below this;
-            0 never is.
-        recipe: Hyperparameters; the preset's unless given.
-        network: Sizes of the networks; the paper's unless given.
-        init: Run folder, model folder (its latest version) or version's folder whose network to begin with instead of
-            random weights; of this world's kind, but the object may be another: features that read one object read the
-            next one sooner.
-    """
+    """All that decides what a run learns; ``config.json`` of its folder."""
 
     world: OmitArgPrefixes[WorldOptions]
-    method: Method = "our"
+    """The world's own options."""
+    method: MethodName = "our"
+    """our: image loss and critic. noncur: image loss alone. super: true scene codes. Beyond the paper, sleep: regress
+    the scene codes of renderings, drawn from the world's known range. wake_sleep: image loss, and sleep with half of
+    the codes around own predictions. wake_sleep_critic: that and the critic. templates: no
+    training; renderings of the object are compared with frames by pretrained features."""
     labels: float = 1.0
+    """Fraction of the training images that --method super sees, with their true codes (paper: 0.05, 0.1, 1)."""
     preset: Preset = "laptop"
+    """Hyperparameters to start from: laptop (measured on two cores) or paper (the paper's)."""
     seed: int = 0
+    """Seed of the initial weights and every random draw."""
     minutes: float | None = None
+    """Budget of training time, in minutes."""
     images: int | None = None
+    """Budget of images shown. Where both budgets are given the first to be reached ends the run."""
     stop_below: float = 0.0
+    """Converged, and done, when the image loss (summed squared error an image, smoothed) is below this; 0 never is."""
     recipe: OmitArgPrefixes[Recipe] = PRESETS["laptop"]
+    """Hyperparameters; the preset's unless given."""
     network: OmitArgPrefixes[NetworkConfig] = NetworkConfig()
+    """Sizes of the networks; the paper's unless given."""
     init: Path | None = None
+    """Run folder, model folder (its latest version) or version's folder whose network to begin with instead of random
+    weights. It must be of this world's kind, but its object may be another: features that were learned from one object
+    shorten the training of the next."""
 
     def __post_init__(self) -> None:
         """Refuse what contradicts itself."""
         if not 0 < self.labels <= 1:
-            raise UsageError(f"--labels {self.labels} is no share, expected more than 0 and at most 1")
+            raise UsageError(f"--labels {self.labels} is no fraction, expected more than 0 and at most 1")
         if self.labels != 1 and self.method != "super":
             raise UsageError(
                 f"--labels {self.labels} with --method {self.method}, which uses none; expected --method super"
             )
-        if self.stop_below and "image" not in self.terms:
+        if self.stop_below and not self.terms.image:
             raise UsageError(f"--stop-below watches the image loss, which --method {self.method} does not have")
         for name in ("minutes", "images"):
             if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected more than 0")
 
     @property
-    def terms(self) -> frozenset[Term]:
-        """The method's loss terms."""
+    def terms(self) -> Method:
+        """Loss terms of the method."""
         return METHODS[self.method]
 
     def progress(self, images: int, seconds: float) -> float:
-        """Share of the budget that is spent; 1 or more when it is used up."""
+        """Fraction of the budget that is spent; 1 or more when it is used up."""
         if self.images is None and self.minutes is None:
             return images / self.recipe.budget_images
         by_images = images / self.images if self.images is not None else 0.0

@@ -1,4 +1,4 @@
-"""Everything that training raises on purpose.
+"""All exceptions that training raises on purpose.
 
     CurioError
     ├── UsageError            the call is wrong: exit status 2
@@ -58,11 +58,11 @@ class CheckpointError(WorkError):
 
 
 class TrainingError(WorkError):
-    """The optimisation broke down."""
+    """A loss or a gradient is not finite."""
 
 
 class ExportError(WorkError):
-    """The model could not be exported as promised."""
+    """The model could not be exported, or an exported model cannot be used."""
 
 
 class ReportError(WorkError):

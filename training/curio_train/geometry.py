@@ -1,14 +1,16 @@
 """Rotations and rigid transforms in torch, batch first.
 
 Frames and handedness: everything is right-handed; the camera frame is OpenCV's (x right, y down, z forward), the world
-frame of the ground-plane scenes has y up. A transform is named target_from_source and is the pair
-``rotation [*batch, 3, 3], translation_m [*batch, 3]``; a point goes ``rotation @ point + translation_m``.
+frame of the ground-plane scenes has y up. A transform is a :class:`Pose`, named target_from_source; a point x of the
+source frame becomes ``rotation @ x + translation_m``.
 
 6D rotations are Zhou et al. 2019 ("On the Continuity of Rotation Representations in Neural Networks"), the first two
 **columns** of the matrix, column after column. (PyTorch3D stores rows.)
 """
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -16,21 +18,58 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-# Below this length a vector has no direction one could trust. Gradients of a direction grow as 1 / length, so it also
-# bounds them.
+# Shorter vectors count as without a direction. Gradients of a direction grow as 1 / length, so this also bounds them.
 _SHORTEST = 1e-6
 
+Array = TypeVar("Array", np.ndarray, Tensor)
 
-class Pose(NamedTuple):
-    """One target_from_source transform in numpy, as files and metrics hold it.
 
-    Attributes:
-        rotation: [3, 3].
-        translation_m: [3].
-    """
+@dataclass(frozen=True, eq=False)
+class Pose(Generic[Array]):
+    """A rigid transform target_from_source, or a batch of them: numpy arrays, as files and metrics have, or tensors."""
 
-    rotation: np.ndarray
-    translation_m: np.ndarray
+    rotation: Array
+    """[*batch, 3, 3]."""
+    translation_m: Array
+    """[*batch, 3]: the source frame's origin in the target frame."""
+
+    def __iter__(self) -> Iterator[Array]:
+        """Rotation and translation, to unpack."""
+        return iter((self.rotation, self.translation_m))
+
+    @staticmethod
+    def identity() -> "Pose[np.ndarray]":
+        """The pose that moves nothing, in numpy."""
+        return Pose(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: Array) -> "Pose[Array]":
+        """The pose of homogeneous matrices [*batch, 4, 4]."""
+        return Pose(matrix[..., :3, :3], matrix[..., :3, 3])
+
+    def apply(self, points: Array) -> Array:
+        """Points of the source frame in the target frame.
+
+        Args:
+            points: [*batch, n, 3]; leading dimensions broadcast. For a single pose any shape [..., 3].
+        """
+        single = self.rotation.ndim == 2
+        translation_m = self.translation_m if single else self.translation_m[..., None, :]
+        return points @ self.rotation.swapaxes(-1, -2) + translation_m
+
+    def inverse(self) -> "Pose[Array]":
+        """source_from_target."""
+        transposed = self.rotation.swapaxes(-1, -2)
+        return Pose(transposed, -(transposed @ self.translation_m[..., None])[..., 0])
+
+    def __matmul__(self, other: "Pose[Array]") -> "Pose[Array]":
+        """a_from_c of ``a_from_b @ b_from_c``."""
+        moved = (self.rotation @ other.translation_m[..., None])[..., 0]
+        return Pose(self.rotation @ other.rotation, moved + self.translation_m)
+
+    def to(self, like: Tensor) -> "Pose[Tensor]":
+        """The same pose as tensors with the type and device of ``like``."""
+        return Pose(torch.as_tensor(self.rotation).to(like), torch.as_tensor(self.translation_m).to(like))
 
 
 def _unit(vector: Tensor, fallback: Tensor) -> Tensor:
@@ -53,22 +92,22 @@ def _any_perpendicular(unit: Tensor) -> Tensor:
 
 
 def _without(vector: Tensor, unit: Tensor) -> Tensor:
-    """What is left of a vector without its part along a unit vector."""
+    """A vector minus its component along a unit vector."""
     return vector - (unit * vector).sum(dim=-1, keepdim=True) * unit
 
 
 def matrix_from_rotation_6d(rotation_6d: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a 6D rotation by Gram–Schmidt, Zhou et al. 2019, section B.
 
-    Any finite input gives a rotation with finite gradients: a first column without a direction becomes the x axis, a
-    second one without a direction of its own (zero, or along the first) becomes some perpendicular.
+    Any finite input gives a rotation with finite gradients: the x axis replaces a first column that is too short, any
+    perpendicular replaces a second one that is too short or parallel to the first.
     """
     first, second = rotation_6d[..., :3], rotation_6d[..., 3:]
     x = _unit(first, torch.eye(3, dtype=first.dtype, device=first.device)[0].expand_as(first))
-    # The second column is brought to length 1 first, so that "along the first" means the same at every scale.
+    # The second column is normalised first, so that "parallel" means the same at every scale.
     second = _unit(second, _any_perpendicular(x))
     y = _unit(_without(second, x), _any_perpendicular(x))
-    # Once more: of nearly parallel columns the first pass leaves little but rounding.
+    # Twice, because nearly parallel columns leave mostly rounding errors after the first pass.
     y = _unit(_without(y, x), _any_perpendicular(x))
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
 
@@ -79,9 +118,9 @@ def rotation_6d_from_matrix(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tens
 
 
 def matrix_from_yaw(yaw_ij: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation about the world's y axis (up, right-handed) by atan2(j, i); the length of (i, j) means nothing.
+    """Rotation about the world's y axis (up, right-handed) by atan2(j, i), whatever the length of (i, j).
 
-    (0, 0) is no rotation; gradients are finite there too.
+    (0, 0) gives the identity, with finite gradients.
     """
     forward = torch.eye(2, dtype=yaw_ij.dtype, device=yaw_ij.device)[0].expand_as(yaw_ij)
     cos, sin = _unit(yaw_ij, forward).unbind(-1)
@@ -91,9 +130,9 @@ def matrix_from_yaw(yaw_ij: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 
 
 
 def direction_from_hemisphere(light: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
-    """Unit vector above the ground (world frame, y up) of the two numbers (x / y, z / y).
+    """Unit vector above the ground (world frame, y up) from (x / y, z / y).
 
-    Every pair of real numbers is a direction above the horizon, and straight up is (0, 0).
+    Every pair of real numbers gives a direction above the horizon; (0, 0) is straight up.
     """
     x, z = light.unbind(-1)
     vector = torch.stack([x, torch.ones_like(x), z], dim=-1)
@@ -109,9 +148,9 @@ def random_rotations(count: int, generator: np.random.Generator) -> Float[Tensor
 def rotation_between(
     source: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "... 3 3"]:
-    """The smallest rotation that turns the direction ``source`` into ``target`` (Rodrigues).
+    """The smallest rotation from the direction ``source`` to ``target`` (Rodrigues), whatever their lengths.
 
-    Opposite directions leave the axis open; there the result is not a rotation. Lengths do not matter.
+    For opposite directions the axis is undefined and the result is not a rotation.
     """
     source = source / torch.linalg.vector_norm(source, dim=-1, keepdim=True)
     target = target / torch.linalg.vector_norm(target, dim=-1, keepdim=True)
@@ -123,7 +162,7 @@ def rotation_between(
 
 
 def rotation_angle_deg(a: Float[Tensor, "*#batch 3 3"], b: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "..."]:
-    """Angle of the rotation between two, in [0, 180] degrees.
+    """Angle of the relative rotation, in [0, 180] degrees.
 
     atan2 of sine and cosine is exact at both ends, where the usual arccos((trace - 1) / 2) loses half its digits.
     """
@@ -134,42 +173,14 @@ def rotation_angle_deg(a: Float[Tensor, "*#batch 3 3"], b: Float[Tensor, "*#batc
     return torch.rad2deg(torch.atan2(twice_sin, twice_cos))
 
 
-def transform_points(
-    rotation: Float[Tensor, "*#batch 3 3"],
-    translation_m: Float[Tensor, "*#batch 3"],
-    points: Float[Tensor, "*#batch n 3"],
-) -> Float[Tensor, "... n 3"]:
-    """Points of the source frame in the target frame; leading dimensions broadcast."""
-    return points @ rotation.transpose(-1, -2) + translation_m.unsqueeze(-2)
+def camera_looking_at(eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"]) -> Pose[Tensor]:
+    """cam_from_world of an OpenCV camera at ``eye`` (world frame, y up) that points at ``target`` without roll.
 
-
-def invert(
-    rotation: Float[Tensor, "*batch 3 3"], translation_m: Float[Tensor, "*batch 3"]
-) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
-    """source_from_target of a target_from_source."""
-    transposed = rotation.transpose(-1, -2)
-    return transposed, -(transposed @ translation_m.unsqueeze(-1)).squeeze(-1)
-
-
-def compose(
-    a_from_b: tuple[Float[Tensor, "*#batch 3 3"], Float[Tensor, "*#batch 3"]],
-    b_from_c: tuple[Float[Tensor, "*#batch 3 3"], Float[Tensor, "*#batch 3"]],
-) -> tuple[Float[Tensor, "... 3 3"], Float[Tensor, "... 3"]]:
-    """a_from_c."""
-    rotation, translation_m = a_from_b
-    return rotation @ b_from_c[0], (rotation @ b_from_c[1].unsqueeze(-1)).squeeze(-1) + translation_m
-
-
-def camera_looking_at(
-    eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"]
-) -> tuple[Float[Tensor, "... 3 3"], Float[Tensor, "... 3"]]:
-    """cam_from_world of an OpenCV camera at ``eye`` (world frame, y up) that stages at ``target`` without roll.
-
-    Looking straight up or down, where "without roll" means nothing, the image's x axis is the world's.
+    Straight up or down, where roll is not defined, the image's x axis is the world's.
     """
     forward = target - eye
     forward = forward / torch.linalg.vector_norm(forward, dim=-1, keepdim=True)
     down = forward.new_tensor([0.0, -1.0, 0.0]).expand_as(forward)
     right = _unit(torch.linalg.cross(down, forward), forward.new_tensor([1.0, 0.0, 0.0]).expand_as(forward))
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-2)
-    return rotation, -(rotation @ eye.unsqueeze(-1)).squeeze(-1)
+    return Pose(rotation, -(rotation @ eye.unsqueeze(-1)).squeeze(-1))

@@ -1,7 +1,7 @@
-"""The scene code: named physical quantities, one description for heads, renderer, metrics, export and tables.
+"""The scene code: named physical quantities, described once for heads, renderer, metrics, export and tables.
 
 A scene code is a mapping from field name to tensor: ``[batch, num_slots, size]`` for per-object fields and
-``[batch, size]`` for per-scene ones. Nobody slices a vector by number; everybody asks the layout.
+``[batch, size]`` for per-scene ones. No code slices a vector by number; the layout names the fields.
 """
 
 from collections.abc import Mapping
@@ -26,27 +26,24 @@ LIGHT = "light"
 
 @dataclass(frozen=True)
 class Field:
-    """One field of the scene code.
-
-    Attributes:
-        name: Also the output's name in the exported graph, where it is exported as it is.
-        size: Values an object, or a scene.
-        per_object: False for what a scene has once, such as light.
-        unit: "m", "image_width", "1".
-        frame: "camera", "world", "image", or "" where none applies.
-        activation: From the head's raw output to the physical value, see :meth:`activate`.
-        lower: Smallest value of each component, or empty where unbounded.
-        upper: Largest value of each component, or empty where unbounded.
-    """
+    """One field of the scene code."""
 
     name: str
+    """Also the output's name in the exported graph, if the field is exported unchanged."""
     size: int
+    """Values per object, or per scene."""
     per_object: bool = True
+    """False for fields that a scene has once, such as light."""
     unit: str = "1"
+    """"m", "image_width", "1"."""
     frame: str = ""
+    """"camera", "world", "image", or "" where none applies."""
     activation: Activation = "linear"
+    """From the head's raw output to the physical value, see :meth:`activate`."""
     lower: tuple[float, ...] = ()
+    """Smallest value of each component, or empty where unbounded."""
     upper: tuple[float, ...] = ()
+    """Largest value of each component, or empty where unbounded."""
 
     def __post_init__(self) -> None:
         """Refuse a range that does not fit the size."""
@@ -59,7 +56,7 @@ class Field:
 
     @property
     def span(self) -> tuple[float, ...]:
-        """Width of each component's range, by which metrics divide (Eq. 1 with w = 1).
+        """Width of each component's range, which metrics divide by (Eq. 1 with w = 1).
 
         It is 1 where unbounded, and where the range is a point (z of a 2D world), whose error is 0 anyway.
         """
@@ -127,10 +124,10 @@ class Layout:
         return {field.name: field.activate(raw[field.name]) for field in self.fields}
 
     def check(self, code: SceneCode) -> None:
-        """Refuse a code whose names or shapes differ from this layout.
+        """Check that the names and shapes of a code are this layout's.
 
         Raises:
-            ValueError: Says which.
+            ValueError: One differs.
         """
         if set(code) != {field.name for field in self.fields}:
             raise ValueError(f"scene code has {sorted(code)}, the layout {sorted(f.name for f in self.fields)}")
@@ -151,7 +148,7 @@ def index(code: SceneCode, rows: Tensor | slice) -> dict[str, Tensor]:
 
 
 def poses(code: SceneCode) -> list[Pose]:
-    """The poses cam_from_obj of the one object of each image."""
+    """cam_from_obj of each image's object, in codes with one object."""
     rotations = matrix_from_rotation_6d(code[ROTATION_6D][:, 0].double()).numpy()
     translations = code[TRANSLATION][:, 0].double().numpy()
     return [Pose(rotation, translation) for rotation, translation in zip(rotations, translations, strict=True)]

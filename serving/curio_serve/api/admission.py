@@ -95,6 +95,12 @@ class WorkQueue:
         finally:
             self._leave(time.monotonic() - granted)
 
+    def refusal(self) -> Overloaded | None:
+        """Why another call would be refused whatever its deadline; None if it may wait."""
+        with self._lock:
+            is_full = not self._num_free and len(self._waiting) >= self._max_waiting
+            return self._overloaded(_FULL) if is_full else None
+
     def _enter(self, remaining_s: float | None, *, always: bool) -> _Waiter | None:
         """Take a free slot (None) or a place in the queue."""
         with self._lock:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import tyro
 
-from curio_serve.arguments import parse
 from curio_serve.cores import num_cores
 from curio_serve.errors import CameraError, CurioError, UsageError
 
@@ -77,7 +76,7 @@ class DetectArguments:
 
 def main() -> NoReturn:
     """Entry point of the command."""
-    arguments: DetectArguments = parse(DetectArguments, prog="curio-detect")
+    arguments: DetectArguments = tyro.cli(DetectArguments, prog="curio-detect")
     # Both by name: a process started in the background inherits an ignored SIGINT, and Python then leaves it so.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _terminate)

@@ -152,11 +152,13 @@ def _check_matrix(matrix: Array) -> None:
     shown = matrix.tolist()
     if not np.isfinite(matrix).all():
         raise CameraError(f"K has values that are not finite: {shown}")
+    if (matrix[2] != (0, 0, 1)).any() and (matrix[:, 2] == (0, 0, 1)).all():
+        raise CameraError(f"K is {shown}; it is transposed: expected rows [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     if (matrix[2] != (0, 0, 1)).any() or matrix[1, 0] != 0:
         raise CameraError(f"K is {shown}; its last row has to be [0, 0, 1] and the entry below fx 0")
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise CameraError(
-            f"K is singular or mirrored: fx = {matrix[0, 0]:g}, fy = {matrix[1, 1]:g}; both must be above 0"
+            f"K is singular or mirrored: fx = {matrix[0, 0]:g}, fy = {matrix[1, 1]:g}; a focal length must be above 0"
         )
     if abs(matrix[0, 1]) > 1e-6 * matrix[0, 0]:
         raise CameraError(f"K has a skew of {matrix[0, 1]:g} px; expected 0: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")

@@ -75,7 +75,7 @@ def read_camera_file(path: str | Path) -> CameraFile:
 def _from_json(path: Path, content: Any) -> CameraFile:
     if isinstance(content, dict) and "camera_matrix" in content:
         size = _size(content.get("width"), content.get("height"))
-        distortion = tuple(float(v) for v in content.get("distortion") or ())
+        distortion = _distortion(content.get("distortion"))
         return CameraFile(path, PinholeCamera(_matrix(content["camera_matrix"]), distortion, size), {})
     if isinstance(content, dict) and {"fx", "fy", "cx", "cy"} <= content.keys():
         fx, fy, cx, cy = (float(content[name]) for name in ("fx", "fy", "cx", "cy"))
@@ -95,8 +95,19 @@ def _matrix(values: Any) -> np.ndarray:
     return array.reshape(3, 3) if array.shape == (9,) else array
 
 
+def _distortion(values: Any) -> tuple[float, ...]:
+    if values is not None and not isinstance(values, list):
+        raise CameraError(f"distortion is {values!r}; expected a list of numbers [k1, k2, p1, p2, k3]")
+    return tuple(float(v) for v in values or ())
+
+
 def _size(width: Any, height: Any) -> tuple[int, int] | None:
-    return None if width is None or height is None else (int(width), int(height))
+    if width is None or height is None:
+        return None
+    for name, value in (("width", width), ("height", height)):
+        if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value) or value < 1:
+            raise CameraError(f"{name} is {value!r}; expected a whole number of pixels")
+    return int(width), int(height)
 
 
 def _from_opencv(text: str) -> PinholeCamera:

@@ -149,17 +149,32 @@ def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAUL
         data = path.read_bytes()
     except OSError as exc:
         raise ModelError(f"model file {path} cannot be read: {exc.strerror}; expected an .onnx file") from exc
-    spec = read_spec(data, str(path))
-    session = _open(data, path, runtime.providers)
-    model = Model(
-        session, spec, name or spec.name or path.stem, version, hashlib.sha256(data).hexdigest(), runtime.max_batch
-    )
+    return from_bytes(data, str(path), name, version, runtime)
+
+
+def from_bytes(data: bytes, where: str, name: str = "", version: int = 0, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
+    """Check and open the content of an ONNX file.
+
+    Args:
+        data: The content.
+        where: The file, for messages.
+        name: What clients ask for; empty: the name in its spec.
+        version: Of the model folder.
+        runtime: How the network is run.
+
+    Raises:
+        ModelError: Says how the content differs from what its specification or curio requires.
+    """
+    spec = read_spec(data, where)
+    session = _open(data, where, runtime.providers)
+    name = name or spec.name or Path(where).stem
+    model = Model(session, spec, name, version, hashlib.sha256(data).hexdigest(), runtime.max_batch)
     _check_graph(session, model)
     _check_answer(model)
     return model
 
 
-def _open(data: bytes, path: Path, providers: Sequence[str]) -> "onnxruntime.InferenceSession":
+def _open(data: bytes, where: str, providers: Sequence[str]) -> "onnxruntime.InferenceSession":
     """One thread a call: parallel calls share the session, which holds the weights once."""
     # Before the import: unless told not to, onnxruntime from 1.29 on writes an identifier into the user's cache folder
     # and uploads events to its makers (its Privacy.md).
@@ -178,7 +193,7 @@ def _open(data: bytes, path: Path, providers: Sequence[str]) -> "onnxruntime.Inf
     try:
         return onnxruntime.InferenceSession(data, options, providers=list(providers))
     except _runtime_errors() as exc:
-        raise ModelError(f"{path}: onnxruntime refuses the graph: {exc}") from exc
+        raise ModelError(f"{where}: onnxruntime refuses the graph: {exc}") from exc
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:

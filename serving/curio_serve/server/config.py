@@ -1,7 +1,6 @@
 """The server's settings, and where they may come from: flags, environment, TOML file, defaults, in this order."""
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -9,10 +8,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from curio_serve.arguments import parse
 from curio_serve.errors import UsageError
+from curio_serve.settings import environment_settings, read_toml, to_arguments
 
 ENV_PREFIX = "CURIO_SERVE_"
+_NOT_STORED = {"config", "dump_config"}
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,8 @@ def read_config(arguments: list[str], environment: Mapping[str, str]) -> ServeCo
 
 
 def _parse(arguments: list[str], default: ServeConfig, source: str = "") -> ServeConfig:
-    config: ServeConfig = parse(ServeConfig, args=arguments, default=default, prog=f"curio-serve {source}".strip())
+    prog = f"curio-serve {source}".strip()
+    config: ServeConfig = tyro.cli(ServeConfig, args=arguments, default=default, prog=prog)
     return config
 
 
@@ -138,48 +139,38 @@ def _flag(name: str) -> str:
 
 
 def _file_arguments(path: Path) -> list[str]:
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as exc:
-        raise UsageError(f"--config {path} cannot be read: {exc}") from exc
-    except tomllib.TOMLDecodeError as exc:
-        raise UsageError(f"--config {path} is not TOML: {exc}") from exc
-    known = {field.name for field in fields(ServeConfig)} - {"config", "dump_config"}
+    content = read_toml(path, "--config")
+    known = {field.name for field in fields(ServeConfig)} - _NOT_STORED
     if unknown := content.keys() - known:
         raise UsageError(f"--config {path} has unknown keys {sorted(unknown)}; known are {sorted(known)}")
     return [argument for name, value in content.items() for argument in _arguments(name, value, str(path))]
 
 
 def _environment_arguments(environment: Mapping[str, str]) -> list[str]:
-    known = {field.name: str(field.type) for field in fields(ServeConfig)}
+    known = {field.name for field in fields(ServeConfig)}
     arguments = []
-    for variable, text in environment.items():
-        name = variable.removeprefix(ENV_PREFIX).lower()
-        if not variable.startswith(ENV_PREFIX) or name in ("config", "dump_config"):
+    for variable, name, text in environment_settings(environment, ENV_PREFIX):
+        if name in _NOT_STORED:
             continue
         if name not in known:
             names = ", ".join(sorted(ENV_PREFIX + name.upper() for name in known))
             raise UsageError(f"environment variable {variable} is no setting; known are {names}")
-        value: Any = text
-        if isinstance(getattr(ServeConfig, name), bool):
-            if text.lower() not in ("true", "false", "1", "0"):
-                raise UsageError(f"{variable} is {text!r}; expected true or false")
-            value = text.lower() in ("true", "1")
-        elif isinstance(getattr(ServeConfig, name), tuple):
-            value = text.split(",")
-        arguments += _arguments(name, value, variable)
+        arguments += _arguments(name, _typed(variable, text, getattr(ServeConfig, name)), variable)
     return arguments
 
 
+def _typed(variable: str, text: str, default: Any) -> Any:
+    """A variable's text as the kind of value that its setting has."""
+    if isinstance(default, bool):
+        if text.lower() not in ("true", "false", "1", "0"):
+            raise UsageError(f"{variable} is {text!r}; expected true or false")
+        return text.lower() in ("true", "1")
+    return text.split(",") if isinstance(default, tuple) else text
+
+
 def _arguments(name: str, value: Any, source: str) -> list[str]:
-    """One setting as command line arguments, so that one parser checks all sources."""
-    if isinstance(value, bool):
-        return [f"--{_flag(name)}" if value else f"--no-{_flag(name)}"]
-    if isinstance(value, dict):
-        raise UsageError(f"{source}: {name} is a table; expected a value")
-    if isinstance(value, list):
-        return [f"--{_flag(name)}", *map(str, value)]
-    return [str(value)] if name == "models" else [f"--{_flag(name)}={value}"]
+    """``models`` is the one setting without a flag."""
+    return [str(value)] if name == "models" else to_arguments(name, value, source)
 
 
 def to_toml(config: ServeConfig) -> str:
@@ -189,6 +180,6 @@ def to_toml(config: ServeConfig) -> str:
         # JSON's strings, numbers, booleans and lists are TOML's.
         f"{name} = {json.dumps(str(value) if isinstance(value, Path) else value, ensure_ascii=False)}"
         for name, value in values.items()
-        if value is not None and name not in ("config", "dump_config")
+        if value is not None and name not in _NOT_STORED
     )
     return "\n".join(lines) + "\n"

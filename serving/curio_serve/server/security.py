@@ -1,19 +1,13 @@
-"""Who may call: TLS, client certificates, bearer tokens."""
+"""Reads what decides who may call: TLS files, client certificates, bearer tokens."""
 
 import hmac
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
 
 import grpc
-from grpc_health.v1 import health
 
-from curio_serve.api.messages import status_from_error
 from curio_serve.errors import TokenError, UsageError
 from curio_serve.server.config import ServeConfig
-
-_HEALTH_PREFIX = f"/{health.SERVICE_NAME}/"
 
 
 class Tokens:
@@ -34,29 +28,6 @@ class Tokens:
         if token != text and any(matches):
             return None
         return TokenError("bearer token missing or unknown; send the metadata `authorization: Bearer <token>`")
-
-
-class TokenInterceptor(grpc.ServerInterceptor):
-    """Lets calls pass that show a known bearer token, and health checks."""
-
-    def __init__(self, tokens: Tokens) -> None:
-        self._tokens = tokens
-
-    def intercept_service(
-        self,
-        continuation: Callable[[grpc.HandlerCallDetails], "grpc.RpcMethodHandler[Any, Any] | None"],
-        handler_call_details: grpc.HandlerCallDetails,
-    ) -> "grpc.RpcMethodHandler[Any, Any] | None":
-        if handler_call_details.method.startswith(_HEALTH_PREFIX):
-            return continuation(handler_call_details)
-        error = self._tokens.refuse(handler_call_details.invocation_metadata)
-        if error is None:
-            return continuation(handler_call_details)
-        return grpc.stream_stream_rpc_method_handler(partial(_abort, status_from_error(error)))
-
-
-def _abort(status: grpc.Status, _requests: Iterator[bytes], context: grpc.ServicerContext) -> NoReturn:
-    context.abort_with_status(status)
 
 
 def server_credentials(config: ServeConfig) -> grpc.ServerCredentials | None:

@@ -24,13 +24,15 @@ from curio_serve.models.model import Runtime
 from curio_serve.models.model_check import ChildCheck
 from curio_serve.models.repository import Change, Repository
 from curio_serve.server.config import ServeConfig
-from curio_serve.server.security import TokenInterceptor, Tokens, read_tokens, server_credentials
+from curio_serve.server.interceptors import AdmissionInterceptor, TokenInterceptor
+from curio_serve.server.security import Tokens, read_tokens, server_credentials
 from curio_serve.telemetry import Metrics, log
 
 _POSE = detector_pb2.DESCRIPTOR.services_by_name["PoseDetector"]
 _INFERENCE = inference_pb2.DESCRIPTOR.services_by_name["GRPCInferenceService"]
 _HEALTH = health_pb2.DESCRIPTOR.services_by_name["Health"]
 _REFLECTION = reflection_pb2.DESCRIPTOR.services_by_name["ServerReflection"]
+_QUEUED = (f"/{_POSE.full_name}/Detect", f"/{_INFERENCE.full_name}/ModelInfer")
 _SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
 
 
@@ -92,7 +94,10 @@ class PoseServer:
         server = grpc.server(
             # Threads are made as calls need them, so their number follows the load; one that waits takes 16 kB.
             ThreadPoolExecutor(config.max_calls, thread_name_prefix="curio-call"),
-            interceptors=[TokenInterceptor(tokens)],
+            interceptors=[
+                TokenInterceptor(tokens, self._metrics),
+                AdmissionInterceptor(self._work, _QUEUED, self._metrics),
+            ],
             options=channel_options(config),
             maximum_concurrent_rpcs=config.max_calls,
         )

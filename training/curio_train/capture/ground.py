@@ -6,6 +6,7 @@ import numpy as np
 
 from curio_train.capture.structure import Structure
 from curio_train.errors import CameraError
+from curio_train.geometry import Pose
 
 _OFF_PLANE = 0.01  # of the distance from cameras to points: what still counts as ground
 _FEWEST_ON_GROUND = 0.2  # share of the points
@@ -63,7 +64,7 @@ def to_world(structure: Structure) -> Structure:
 
 
 def _moved(structure: Structure, new_from_old: np.ndarray) -> Structure:
-    points = structure.points @ new_from_old[:3, :3].T + new_from_old[:3, 3]
+    points = Pose.from_matrix(new_from_old).apply(structure.points)
     return replace(structure, points=points, cam_from_world=structure.cam_from_world @ np.linalg.inv(new_from_old))
 
 

@@ -5,9 +5,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from curio_train.camera import load_intrinsics
+from curio_train.camera import load_intrinsics, save_intrinsics
 from curio_train.capture.calibration import Board, calibrate
-from curio_train.capture.camera_json import save_intrinsics
 from curio_train.capture.ground import scale_by_distance, to_world
 from curio_train.capture.options import CalibrateCommand
 from curio_train.capture.structure import Structure, every_nth, recover

@@ -33,7 +33,7 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
     if isinstance(config.world, LinemodOptions):
         _refuse_unreadable(config.world)
     if isinstance(options, CaptureOptions):
-        from curio_train.doctor.before_training import refuse_unfit
+        from curio_train.doctor.examine import refuse_unfit
 
         for doubt in refuse_unfit(options):
             warn(doubt)
@@ -45,7 +45,7 @@ def _usual_network(config: RunConfig, options: CaptureOptions) -> NetworkConfig:
     """Parts on a plane are read by cells, unless the call, the paper, or wake–sleep wants it otherwise."""
     if options.plane is None or config.network.reading is not None:
         return config.network
-    whole = config.preset == "paper" or config.terms > {"sleep"}
+    whole = config.preset == "paper" or config.terms.perturbs_predictions
     return replace(config.network, reading="whole" if whole else "cells")
 
 

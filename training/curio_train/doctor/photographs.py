@@ -1,4 +1,4 @@
-"""A folder of photographs: read each once, and look for what would spoil training on them."""
+"""Examines a folder of photographs: reads each once and looks for what would spoil training on them."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -7,8 +7,7 @@ from pathlib import Path
 from curio_train.camera import Intrinsics
 from curio_train.data.photographs import Photographs
 from curio_train.doctor.finding import Finding, State
-from curio_train.doctor.photograph import Photograph, look_at
-from curio_train.doctor.picture_content import examine_content
+from curio_train.doctor.picture_content import Photograph, examine_content, look_at
 from curio_train.errors import CurioError
 
 _FEWEST, _FEW = 10, 60

@@ -9,7 +9,7 @@ from curio_train.errors import RendererError
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.learning.losses import image_loss
 from curio_train.meshes.shapes import box, sphere
-from curio_train.networks.paper.pose import PoseNetwork
+from curio_train.networks.paper.network import PoseNetwork
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, Field, Layout
 

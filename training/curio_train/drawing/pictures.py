@@ -51,14 +51,14 @@ class SceneContext:
     @classmethod
     def of_world(cls, world: MeshWorld) -> "SceneContext":
         """Those of a generated world."""
-        turn, shift = world.stage.cam_from_world
+        cam_from_world = world.stage.cam_from_world
         return cls(
             {kind.name: kind.mesh for kind in world.kinds},
             world.stage.ambient,
-            turn @ np.array(world.stage.sun),
-            turn @ np.array(world.stage.center_m) + shift,
-            tuple((turn @ np.array(world.stage.up)).tolist()),
-            world.ground(world.stage.cam_from_world),
+            cam_from_world.rotation @ np.array(world.stage.sun),
+            cam_from_world.apply(np.array(world.stage.center_m)),
+            tuple((cam_from_world.rotation @ np.array(world.stage.up)).tolist()),
+            world.ground(cam_from_world),
         )
 
     def mesh(self, kind: str) -> Mesh:
@@ -150,10 +150,8 @@ def _carried(scene: Scene, around: SceneContext, turn_deg: float) -> tuple[Scene
     if turn_deg == 0 or center is None:
         return scene, around
     turn = Rotation.from_rotvec(-np.radians(turn_deg) * np.array(around.up)).as_matrix()
-    objects = tuple(
-        replace(item, pose=Pose(turn @ item.pose.rotation, turn @ (item.pose.translation_m - center) + center))
-        for item in scene.objects
-    )
+    orbit = Pose(turn, center - turn @ center)
+    objects = tuple(replace(item, pose=orbit @ item.pose) for item in scene.objects)
     ground = around.ground
     if ground is not None:
         up = turn @ ground.up
@@ -223,4 +221,5 @@ def _path_traced(scene: Scene, around: SceneContext, behind: np.ndarray | None, 
 
 
 def _posed(item: Placed, around: SceneContext) -> PosedMesh:
-    return PosedMesh(around.mesh(item.kind), *item.pose, item.color_srgb, item.confidence)
+    rotation, translation_m = item.pose
+    return PosedMesh(around.mesh(item.kind), rotation, translation_m, item.color_srgb, item.confidence)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from curio_serve.models.model_folder import MODEL_FILE
+
 from curio_train.errors import DataError, UsageError
-from curio_train.export.folder import MODEL_FILE, find_model
-from curio_train.export.onnx import OnnxModel
+from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, to_portable
 from curio_train.worlds.options import LinemodOptions
@@ -74,7 +75,7 @@ def _found(folder: Path) -> Iterator[Candidate]:
                 )
         elif any(path.glob(f"[0-9]*/{MODEL_FILE}")):
             file = find_model(path)
-            spec = OnnxModel.open(file).spec
+            spec = ExportedModel.open(file).spec
             if spec.world == "linemod":
                 yield Candidate(path, spec.objects[0].name, _method(json.loads(spec.recipe)), files_sha256(file))
 

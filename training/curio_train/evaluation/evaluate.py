@@ -19,7 +19,7 @@ from curio_train.export.card import EVALUATION_FILE
 from curio_train.learning.runs.configuration import CONFIG_FILE, world_name
 from curio_train.learning.runs.initial import uses_synthetic_labels
 from curio_train.learning.runs.provenance import machine
-from curio_train.metrics.certainty import auroc, calibration_error
+from curio_train.metrics.calibration import auroc, calibration_error
 from curio_train.metrics.poses import ADD_THRESHOLD
 from curio_train.refinement.render_and_compare import refined
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
@@ -179,7 +179,7 @@ def _origin(path: Path, subject: Subject) -> dict[str, Any]:
         "objects": [kind.name for kind in subject.world.objects],
         "method": config.method,
         "reading": config.network.reading or "whole",
-        "labels": config.labels if "label" in config.terms else 0.0,
+        "labels": config.labels if config.terms.label else 0.0,
         "labels_real": False,  # images with true codes are renderings in every world
         "labels_synthetic": uses_synthetic_labels(config),
         "preset": config.preset,

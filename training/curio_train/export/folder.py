@@ -13,21 +13,19 @@
 
 import hashlib
 import os
-import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from curio_train.errors import ExportError, UsageError
+from curio_serve.models.model_folder import MODEL_FILE, is_model_name, versions
 
-MODEL_FILE = "model.onnx"
-GOLDEN_FILE = "golden.npz"
-WEIGHTS_FILE = "weights.safetensors"
+from curio_train.errors import ExportError, UsageError
+from curio_train.exported_model import WEIGHTS_FILE
+
 _CONFIG, _CARD, _SUMS = "config.pbtxt", "CARD.md", "SHA256SUMS"
 _LISTED = (MODEL_FILE, WEIGHTS_FILE)
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # what a server takes for a model's name
 _MAX_BATCH_SIZE = 64
 
 
@@ -48,7 +46,7 @@ class ModelFolder:
         Raises:
             UsageError: The name cannot be a model's, or something else has the folder's place.
         """
-        if not _NAME.fullmatch(name):
+        if not is_model_name(name):
             raise UsageError(f"--name {name!r}: expected letters, digits, _, - and ., at most 64, no leading dot")
         folder = ModelFolder(out / name)
         if folder.path.exists() and not folder.versions():
@@ -60,8 +58,7 @@ class ModelFolder:
 
     def versions(self) -> list[int]:
         """Versions that are there, ascending."""
-        found = (path.parent.name for path in self.path.glob(f"*/{MODEL_FILE}"))
-        return sorted(int(name) for name in found if name.isdecimal() and int(name) > 0)
+        return versions(self.path) if self.path.is_dir() else []
 
     def next_version(self) -> int:
         """The number after the largest."""
@@ -119,25 +116,6 @@ class ModelFolder:
         _replace(self.path / _SUMS, sums)
         draft.rename(target)
         _replace(self.path / _CARD, f"{title or _title(self.path.name)}\n\n{card}\n{earlier}")
-
-
-def find_model(path: Path) -> Path:
-    """The ONNX file of a model folder (latest version), of a version's folder, or the file itself.
-
-    Raises:
-        UsageError: There is none.
-    """
-    if path.is_file():
-        return path
-    if (path / MODEL_FILE).is_file():
-        return path / MODEL_FILE
-    versions = ModelFolder(path).versions()
-    if not versions:
-        raise UsageError(
-            f"{path}: neither a run folder (config.json) nor a model (<version>/{MODEL_FILE}); expected what "
-            "curio-train or curio-export wrote"
-        )
-    return path / str(versions[-1]) / MODEL_FILE
 
 
 def triton_config(name: str, image: Sequence[int], outputs: Mapping[str, Sequence[int]]) -> str:

@@ -13,14 +13,17 @@ import torch
 import torch.nn.functional as F
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec, ObjectModel, Symmetry
 from curio_proto.v1.model_spec_pb2 import Field as FieldSpec
+from curio_serve.models.model_folder import GOLDEN_FILE, MODEL_FILE
+from curio_serve.models.spec import SCHEMA_VERSION
 from jaxtyping import Bool
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from curio_train.errors import ExportError
 from curio_train.export.card import Provenance, card
-from curio_train.export.folder import GOLDEN_FILE, MODEL_FILE, WEIGHTS_FILE, ModelFolder, triton_config
-from curio_train.export.onnx import SCHEMA_VERSION, OnnxModel, put_spec, store_half, to_onnx
+from curio_train.export.folder import ModelFolder, triton_config
+from curio_train.export.onnx import put_spec, store_half, to_onnx
+from curio_train.exported_model import WEIGHTS_FILE, ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
 from curio_train.learning.runs.initial import weights_file
@@ -115,18 +118,18 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     first = run_sessions(run)[0]
     spec.commit, spec.images_seen, spec.training_seconds = (
         first.commit,
-        state.course.all_images,
-        state.course.all_seconds,
+        state.progress.all_images,
+        state.progress.all_seconds,
     )
     put_spec(model, spec)
 
-    found = OnnxModel(model.SerializeToString(), "the exported graph")(images.numpy())
+    found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
     known = settled(deployed if half else trained, images)
     answers, found = ({name: v[known] for name, v in of.items()} for of in (expected if half else learned, found))
     spec.parity_max_abs_error = refuse_disparity(answers, found)
     put_spec(model, spec)
     version = target.next_version()
-    made = Provenance(run, folder.config, first, state.course, _weights(half, rounding_error))
+    made = Provenance(run, folder.config, first, state.progress, _weights(half, rounding_error))
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),

@@ -1,26 +1,21 @@
-"""ONNX files: a torch module written as one, and one run by onnxruntime."""
+"""Writes a torch module as an ONNX file."""
 
 import logging
-import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
 import torch
 from curio_proto.v1.model_spec_pb2 import ModelSpec
+from curio_serve.models.model import INPUT
+from curio_serve.models.spec import SPEC_KEY
 from google.protobuf import json_format
 from onnx import TensorProto, helper, numpy_helper
-from torch import Tensor, nn
+from torch import nn
 
-from curio_train.errors import ExportError
-
-INPUT = "image"
-SPEC_KEY = "curio.model_spec"
-SCHEMA_VERSION = 1
 OPSET = 18
 _SMALLEST_HALF = 256  # values; below, a Cast costs more than it saves
 
@@ -104,87 +99,3 @@ def put_spec(model: onnx.ModelProto, spec: ModelSpec) -> None:
     del model.metadata_props[:]
     text = json_format.MessageToJson(spec, preserving_proto_field_name=True, indent=None)
     model.metadata_props.add(key=SPEC_KEY, value=text)
-
-
-class OnnxModel:
-    """An exported model, run by onnxruntime as serving runs it.
-
-    Attributes:
-        spec: What it says about itself.
-    """
-
-    def __init__(self, content: bytes, where: str) -> None:
-        """Open a model.
-
-        Args:
-            content: Of the file.
-            where: The file, for messages.
-
-        Raises:
-            ExportError: Not an exported model, or one that onnxruntime refuses.
-        """
-        # Before the import: unless told not to, onnxruntime from 1.29 on writes an identifier into the user's cache
-        # folder and uploads events to its makers (its Privacy.md).
-        os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = 3
-        try:
-            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        except _runtime_errors() as exc:
-            raise ExportError(f"{where}: onnxruntime refuses the graph ({exc}); export it again") from exc
-        self.spec = _read_spec(self._session.get_modelmeta().custom_metadata_map, where)
-        self._where = where
-
-    @staticmethod
-    def open(path: Path) -> "OnnxModel":
-        """The model in a file.
-
-        Raises:
-            ExportError: It cannot be read or used.
-        """
-        try:
-            return OnnxModel(path.read_bytes(), str(path))
-        except OSError as exc:
-            raise ExportError(f"{path} cannot be read: {exc.strerror}; expected an exported .onnx file") from exc
-
-    def __call__(self, images: np.ndarray) -> dict[str, Tensor]:
-        """Outputs by name.
-
-        Args:
-            images: uint8 RGB [batch, height, width, 3] of the canonical camera's size.
-
-        Raises:
-            ExportError: onnxruntime failed on them.
-        """
-        names = [output.name for output in self._session.get_outputs()]
-        try:
-            values = self._session.run(names, {INPUT: images})
-        except _runtime_errors() as exc:
-            raise ExportError(f"{self._where}: onnxruntime failed on {images.shape} images ({exc})") from exc
-        return {name: torch.from_numpy(value) for name, value in zip(names, values, strict=True)}
-
-
-def _runtime_errors() -> tuple[type[Exception], ...]:
-    """Onnxruntime's exceptions, which share no base."""
-    from onnxruntime.capi import onnxruntime_pybind11_state as runtime
-
-    return (runtime.Fail, runtime.InvalidArgument, runtime.InvalidGraph, runtime.InvalidProtobuf)
-
-
-def _read_spec(metadata: Mapping[str, str], where: str) -> ModelSpec:
-    if SPEC_KEY not in metadata:
-        raise ExportError(
-            f"{where} has no {SPEC_KEY} in its metadata, only {sorted(metadata)}; expected a model of ours"
-        )
-    try:
-        spec = json_format.Parse(metadata[SPEC_KEY], ModelSpec(), ignore_unknown_fields=True)
-    except json_format.ParseError as exc:
-        raise ExportError(f"{where}: its {SPEC_KEY} is no ModelSpec ({exc}); export it again") from exc
-    if spec.schema_version != SCHEMA_VERSION:
-        raise ExportError(
-            f"{where}: ModelSpec has schema version {spec.schema_version}, supported is {SCHEMA_VERSION}; "
-            "export it again"
-        )
-    return spec

@@ -2,7 +2,7 @@
 
 A weight matrix, or a convolution seen as one, moves equally far in every direction that its gradients span, instead of
 mostly along the few that are steep. torch's own Muon takes matrices alone; here convolutions count as matrices
-[out, in · height · width], and everything else, biases and normalisation, moves by Adam.
+[out, in · height · width], and Adam moves everything else: biases and normalisation.
 """
 
 from collections.abc import Callable, Iterable
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from curio_train.learning.precision import quick_bfloat16
+from curio_train.learning.hardware import quick_bfloat16
 
 _MOMENTUM = 0.95
 _COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of the quintic iteration, Jordan et al. 2024
@@ -22,10 +22,7 @@ _BETAS, _EPSILON = (0.9, 0.999), 1e-8  # of Adam, as for every other network her
 
 
 class Muon(Optimizer):
-    """Muon for matrices, Adam for the rest.
-
-    Its two parameter groups have learning rates of their own.
-    """
+    """Muon for matrices, Adam for the rest; the two parameter groups have their own learning rates."""
 
     def __init__(self, parameters: Iterable[nn.Parameter], matrix_learning_rate: float, learning_rate: float) -> None:
         """Sort the parameters.
@@ -44,7 +41,7 @@ class Muon(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # type: ignore[override]
-        """Move all parameters that have a gradient; there is no closure to call."""
+        """Move all parameters that have a gradient; ``closure`` is not called."""
         for group in self.param_groups:
             move = self._move_matrix if group["matrices"] else self._move_by_adam
             for parameter in group["params"]:
@@ -76,14 +73,14 @@ class Muon(Optimizer):
 
 
 def _is_matrix(parameter: Tensor) -> bool:
-    """Maps between few values, such as a branch's last layer, have too few directions to balance."""
+    """Whether Muon moves it; a map between few values has too few directions to balance."""
     return parameter.dim() > 1 and min(parameter.shape[0], parameter[0].numel()) >= _SMALLEST
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
     """Roughly U Vᵀ of a matrix U S Vᵀ, by Newton–Schulz iterations: singular values from 0.7 to 1.2."""
     tall = matrix.shape[0] > matrix.shape[1]
-    # Half the digits are enough for it, where they are quicker.
+    # bfloat16 is precise enough for it.
     found = (matrix.T if tall else matrix).to(torch.bfloat16 if quick_bfloat16(matrix.device.type) else torch.float32)
     found = found / (found.norm() + 1e-7)
     a, b, c = _COEFFICIENTS

@@ -1,7 +1,7 @@
-"""Data parallel training under torchrun: every process takes its share of a step's micro-batches.
+"""Data parallel training under torchrun: the processes divide each step's micro-batches among them.
 
-Which images a micro-batch holds, and over which batch norm takes its statistics, does not depend on the number of
-processes, so two of them compute what one would, up to the order of sums.
+The images of a micro-batch, over which batch norm takes its statistics, do not depend on the number of processes, so
+two of them compute what one would, up to the order of sums.
 """
 
 import os
@@ -18,32 +18,29 @@ from curio_train.errors import UsageError
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process among all that train together.
-
-    Attributes:
-        rank: Its number; 0 writes checkpoints and reports.
-        size: Number of processes.
-        device: Its torch device.
-    """
+    """This process among all that train together."""
 
     rank: int
+    """Its number; 0 writes checkpoints and reports."""
     size: int
+    """Number of processes."""
     device: torch.device
+    """Its torch device."""
 
     @property
     def leads(self) -> bool:
         """Whether this process writes and reports."""
         return self.rank == 0
 
-    def share(self, count: int) -> range:
-        """The numbers below ``count`` that are this process's to do.
+    def micro_batches(self, count: int) -> range:
+        """The numbers below ``count`` of the micro-batches that this process computes.
 
         Raises:
-            UsageError: The processes cannot share them evenly.
+            UsageError: ``count`` cannot be divided evenly among the processes.
         """
         if count % self.size:
             raise UsageError(
-                f"{count} micro-batches a step cannot be shared by {self.size} processes; expected --batch-size / "
+                f"{count} micro-batches a step cannot be divided among {self.size} processes; expected --batch-size / "
                 "--micro-batch-size to be a multiple of torchrun's --nproc-per-node times --nnodes"
             )
         return range(self.rank, count, self.size)
@@ -59,7 +56,7 @@ class Ranks:
             part.copy_(summed.view_as(part))
 
     def largest(self, *values: float) -> list[float]:
-        """The largest of each value over all processes, so that all of them decide alike."""
+        """The largest of each value over all processes, so that all of them make the same decisions."""
         if self.size == 1:
             return list(values)
         tensor = torch.tensor(values, dtype=torch.float64, device=self.device)
@@ -83,13 +80,13 @@ def ranks(device: Literal["auto", "cpu", "cuda"]) -> Iterator[Ranks]:
     if size == 1:
         yield Ranks(0, 1, torch.device("cuda" if cuda else "cpu"))
         return
-    place = torch.device("cuda", int(os.environ["LOCAL_RANK"])) if cuda else torch.device("cpu")
+    local = torch.device("cuda", int(os.environ["LOCAL_RANK"])) if cuda else torch.device("cpu")
     if cuda:
-        torch.cuda.set_device(place)
+        torch.cuda.set_device(local)
     distributed.init_process_group("nccl" if cuda else "gloo")
     try:
-        yield Ranks(distributed.get_rank(), size, place)
-        # Leave together: a thread that still lets go of the last sum's tensor while the interpreter ends aborts it.
+        yield Ranks(distributed.get_rank(), size, local)
+        # Without a barrier a thread that still frees the last sum's tensor aborts the interpreter while it ends.
         distributed.barrier()
     finally:
         distributed.destroy_process_group()

@@ -1,9 +1,9 @@
-"""What the next step needs is made in a thread of its own, while the networks learn from what this step needs."""
+"""A thread that makes the next item while the caller works with this one."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from types import TracebackType
-from typing import Generic, Self, TypeVar
+from contextlib import contextmanager
+from typing import Generic, TypeVar
 
 import torch
 
@@ -11,58 +11,52 @@ Item = TypeVar("Item")
 
 
 class Prefetcher(Generic[Item]):
-    """A row of items, made one at a time and at most one ahead of what was taken; the thread ends with the block.
+    """Makes numbered items in one thread, at most one ahead of what was taken; see :func:`prefetching`."""
 
-    Items must depend on their number alone: then those taken are the same as without a thread.
-    """
-
-    def __init__(self, make: Callable[[int], Item], stride: int) -> None:
-        """Begin with nothing.
-
-        Args:
-            make: The item of a number. Always called in the one thread.
-            stride: From a number to that asked for next.
-        """
-        self._make, self._stride = make, stride
-        self._coming: tuple[int, Future[Item]] | None = None
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="ahead")
-        allowed = torch.get_num_threads()
-        self._thread.submit(_compute_alone).result()
-        torch.set_num_threads(allowed)  # what the other thread set is that of the process, too
-
-    def __enter__(self) -> Self:
-        """Itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """End the thread, at the latest when the item at hand is made."""
-        self._thread.shutdown(cancel_futures=True)
+    def __init__(self, make: Callable[[int], Item], stride: int, thread: ThreadPoolExecutor) -> None:
+        self._make, self._stride, self._thread = make, stride, thread
+        self._next: tuple[int, Future[Item]] | None = None
 
     def take(self, number: int) -> Item:
-        """The item of that number; the next one is begun.
+        """The item of that number; the thread begins with the next one.
 
         Raises:
-            Exception: Whatever making it raised.
+            Exception: Whatever ``make`` raised.
         """
-        if self._coming is None or self._coming[0] != number:
-            self._begin(number)
-        assert self._coming is not None  # it has begun
-        item = self._coming[1].result()
-        self._begin(number + self._stride)
+        if self._next is None or self._next[0] != number:
+            self._next = self._begin(number)
+        item = self._next[1].result()
+        self._next = self._begin(number + self._stride)
         return item
 
     def wait_idle(self) -> None:
-        """Wait until the thread rests, so that the caller is alone with what items are made with."""
-        if self._coming is not None:
-            wait([self._coming[1]])
+        """Wait until the thread is idle, so that the caller may use what ``make`` uses."""
+        if self._next is not None:
+            wait([self._next[1]])
 
-    def _begin(self, number: int) -> None:
-        self._coming = number, self._thread.submit(self._make, number)
+    def _begin(self, number: int) -> tuple[int, Future[Item]]:
+        return number, self._thread.submit(self._make, number)
 
 
-def _compute_alone() -> None:
-    """Use no more than this thread to compute with: the other cores are the learning's."""
+@contextmanager
+def prefetching(make: Callable[[int], Item], stride: int) -> Iterator[Prefetcher[Item]]:
+    """Within it a thread makes items ahead; it ends with the block, at the latest when the item at hand is made.
+
+    Args:
+        make: Returns the item of a number; it depends on the number alone, so that the thread changes no item.
+        stride: From one number to the next that will be asked for.
+    """
+    allowed = torch.get_num_threads()
+    thread = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
+    thread.submit(_compute_with_one_thread).result()
+    torch.set_num_threads(allowed)  # the other thread's call changed the whole process
+    try:
+        yield Prefetcher(make, stride, thread)
+    finally:
+        thread.shutdown(cancel_futures=True)
+
+
+def _compute_with_one_thread() -> None:
+    """Keep torch from starting more threads here: the other cores belong to the training step."""
     torch.set_num_threads(1)
     torch.get_num_threads()  # a thread takes up the process's number when it first asks, and keeps it

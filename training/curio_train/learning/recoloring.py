@@ -1,7 +1,7 @@
-"""More colours from the same images: exchanging channels, where a world stays what it was.
+"""Colour augmentation by permuting channels, exact in worlds with white light and a grey background.
 
-Under white light and before grey, a scene whose colours have red and green exchanged looks like its image with these
-channels exchanged, exactly. A network that is shown 2,000 images over and over otherwise learns places by colours.
+There, exchanging red and green in the image equals exchanging them in the objects' colours. Without it a network that
+sees 2,000 images over and over memorises positions by colour.
 """
 
 from dataclasses import replace
@@ -12,18 +12,18 @@ import torch
 from curio_train.scene_code import COLOR
 from curio_train.worlds.base import Batch
 
-_MARK = 2  # of these draws among all that a step makes
+_RECOLOR = 2  # keeps these draws apart from a step's other ones
 
 
 def recolored(batch: Batch, seed: tuple[int, ...]) -> Batch:
-    """The batch with the channels of each image in one of their six orders, and true colours likewise.
+    """The batch with the channels of each image, and of its true colours, in one of their six orders.
 
     Args:
         batch: Images without backgrounds of their own.
         seed: Decides every draw.
     """
     num = len(batch.images)
-    draws = np.random.default_rng((*seed, _MARK)).permuted(np.tile(np.arange(3), (num, 1)), axis=1)
+    draws = np.random.default_rng((*seed, _RECOLOR)).permuted(np.tile(np.arange(3), (num, 1)), axis=1)
     order = torch.from_numpy(draws).to(batch.images.device)
     images = batch.images.gather(1, order[:, :, None, None].expand_as(batch.images))
     if batch.code is None:

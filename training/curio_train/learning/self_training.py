@@ -1,4 +1,7 @@
-"""When photographs are read for self-training, and how they come among the renderings: see ``pseudo_labels``."""
+"""Self-training: when photographs get pseudo-labels, and how they are mixed into the synthetic batches.
+
+``refinement.pseudo_labels`` says how the labels are made.
+"""
 
 import torch
 from torch import Tensor, nn
@@ -8,54 +11,63 @@ from curio_train.scene_code import SceneCode
 from curio_train.worlds.base import World
 
 ROUNDS, ROUNDS_OF_PRETRAINED = (0.6, 0.8), (0.2, 0.5, 0.8)
-"""Shares of the budget after which photographs are read: late, when what is read is worth it, and once more; sooner by
-networks that began as trained ones (``--init``)."""
+"""Fractions of the budget after which a pseudo-labelling round is due: late, when the network's poses are good enough;
+sooner for networks that began with trained weights (``--init``)."""
 
 
 class SelfTraining:
-    """The photographs of a world as its network reads them, for the last look."""
+    """Pseudo-labels of a world's photographs, for the last stage of its network."""
 
     def __init__(
-        self, network: nn.Module, world: World, share: float, device: torch.device, *, trained: bool = False
+        self, network: nn.Module, world: World, fraction: float, device: torch.device, *, pretrained: bool = False
     ) -> None:
         """Begin without any.
 
         Args:
-            network: All looks in one.
-            world: What it learns.
-            share: Of the last look's images that are to be photographs.
+            network: All stages in one.
+            world: Has the photographs.
+            fraction: Of the last stage's images that are to be photographs; 0 never labels any.
             device: Of the network.
-            trained: The network began as one that reads already.
+            pretrained: The network began with trained weights.
         """
-        self._world, self._network, self._share, self._device = world, network, share, device
-        self._studies = ROUNDS_OF_PRETRAINED if trained else ROUNDS
-        self._lessons: PseudoLabels | None = None
-        self._num_studies = 0
+        self._world, self._network, self._fraction, self._device = world, network, fraction, device
+        self._rounds = ROUNDS_OF_PRETRAINED if pretrained else ROUNDS
+        self._labels: PseudoLabels | None = None
+        self._num_rounds = 0
 
-    def is_due(self, progress: float) -> bool:
-        """Whether to read photographs, after this share of the budget; a run that was interrupted reads them anew."""
-        return self._share > 0 and sum(progress >= share for share in self._studies) > self._num_studies
+    def is_due(self, spent: float) -> bool:
+        """Whether a round is due after this fraction of the budget; a resumed run repeats the last one."""
+        return self._fraction > 0 and self._rounds_until(spent) > self._num_rounds
 
-    def study(self, progress: float) -> None:
-        """Read them; where nothing is found, what was found before stays.
+    def run_round(self, spent: float) -> None:
+        """Pseudo-labelling round; if it accepts no pose, the labels of the round before stay.
 
         Raises:
             DataError: A photograph cannot be read, or is not of the camera's size.
         """
-        self._num_studies = sum(progress >= share for share in self._studies)
+        self._num_rounds = self._rounds_until(spent)
         self._network.eval()
-        self._lessons = PseudoLabels.from_photographs(self._world, self._read) or self._lessons
+        self._labels = PseudoLabels.from_photographs(self._world, self._predict) or self._labels
         self._network.train()
 
-    def among(self, code: SceneCode, images: Tensor, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:
-        """Codes and images of the last look, the first of which have made room for photographs."""
-        if self._lessons is None:
+    def mix_in(self, code: SceneCode, images: Tensor, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:
+        """The last stage's codes and images with the first ones replaced by pseudo-labelled crops of photographs.
+
+        Args:
+            code: Of the renderings.
+            images: The renderings [batch, 3, height, width].
+            seed: Decides which photographs are drawn.
+        """
+        if self._labels is None:
             return dict(code), images
-        read, crops = self._lessons.draw(round(self._share * len(images)), seed)
+        labels, crops = self._labels.draw(round(self._fraction * len(images)), seed)
         num = len(crops)
-        mixed = {name: torch.cat([code[name][num:], value.to(images.device)]) for name, value in read.items()}
+        mixed = {name: torch.cat([code[name][num:], value.to(images.device)]) for name, value in labels.items()}
         return mixed, torch.cat([images[num:], crops.to(images)])
 
+    def _rounds_until(self, spent: float) -> int:
+        return sum(spent >= fraction for fraction in self._rounds)
+
     @torch.no_grad()
-    def _read(self, images: Tensor) -> dict[str, Tensor]:
+    def _predict(self, images: Tensor) -> dict[str, Tensor]:
         return {name: value.cpu() for name, value in self._network(images.to(self._device)).items()}

@@ -1,4 +1,4 @@
-"""Everything that changes while a run learns, and that a checkpoint therefore holds."""
+"""All that changes while a run learns: what a checkpoint holds."""
 
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -10,6 +10,7 @@ from torch.optim import Adam, Optimizer
 from curio_train.config import RunConfig
 from curio_train.errors import UsageError
 from curio_train.learning.muon import Muon
+from curio_train.networks.base import StageNetwork
 from curio_train.networks.paper.critic import Critic
 from curio_train.templates.build import template_network
 from curio_train.worlds.base import World
@@ -19,30 +20,30 @@ _BETAS = (0.9, 0.999)  # paper, appendix, table of hyperparameters
 
 
 class Learner(Generic[N]):
-    """A network with its optimiser.
+    """A network with its optimiser."""
 
-    Attributes:
-        network: What learns.
-        optimizer: Adam, as in the paper, or Muon.
-    """
+    network: N
+    """What learns."""
+    optimizer: Optimizer
+    """Adam, as in the paper, or Muon."""
 
     def __init__(self, network: N, learning_rate: float, matrix_learning_rate: float = 0.0) -> None:
-        """Start.
+        """Set up the optimiser.
 
         Args:
             network: What is to learn.
-            learning_rate: Before warm-up and decay.
-            matrix_learning_rate: Of matrices and convolutions by Muon; 0: they move by Adam like the rest.
+            learning_rate: Adam's, before warm-up and decay.
+            matrix_learning_rate: Muon's, for matrices and convolutions; 0: Adam moves them, too.
         """
         self.network = network
         if matrix_learning_rate:
-            self.optimizer: Optimizer = Muon(network.parameters(), matrix_learning_rate, learning_rate)
+            self.optimizer = Muon(network.parameters(), matrix_learning_rate, learning_rate)
         else:
             self.optimizer = Adam(network.parameters(), learning_rate, betas=_BETAS)
         self._learning_rates = [group["lr"] for group in self.optimizer.param_groups]
 
     def clip_gradient(self, largest: float) -> bool:
-        """Cut the accumulated gradient to this L2 norm; whether it was finite."""
+        """Clip the accumulated gradient to this L2 norm; returns whether it was finite."""
         return bool(nn.utils.clip_grad_norm_(self.network.parameters(), largest).isfinite())
 
     def step(self, rate: float) -> None:
@@ -52,7 +53,7 @@ class Learner(Generic[N]):
         self.optimizer.step()
 
     def tensors(self) -> dict[str, Tensor]:
-        """Weights, buffers and Adam's moments by name."""
+        """Weights, buffers and the optimiser's moments by name."""
         weights = {f"network.{name}": value for name, value in self.network.state_dict().items()}
         moments = {
             f"optimizer.{number}.{name}": value
@@ -77,68 +78,67 @@ class Learner(Generic[N]):
 
 @dataclass
 class TrainingProgress:
-    """How far a run has come.
-
-    Attributes:
-        step: Steps done. Every random draw is a function of the seed and this number: there is no other random state.
-        images: Images shown.
-        seconds: Time spent training, over all sessions.
-        image_loss: Unweighted and smoothed; None before the first step and for methods without it.
-        images_before: Shown to the network that it began as, and to those that one began as.
-        seconds_before: Spent on them.
-    """
+    """How far a run has come; ``course.json`` of a checkpoint."""
 
     step: int = 0
+    """Steps done. Every random draw is a function of the seed and this number: there is no other random state."""
     images: int = 0
+    """Images shown."""
     seconds: float = 0.0
+    """Time spent training, over all sessions."""
     image_loss: float | None = None
+    """Unweighted and smoothed; None before the first step and for methods without it."""
     images_before: int = 0
+    """Images shown before this run, where it began with trained weights (``--init``)."""
     seconds_before: float = 0.0
+    """Time spent training before this run."""
 
     @property
     def all_images(self) -> int:
-        """That the network has seen, from random weights on."""
+        """Images shown to the network since it had random weights."""
         return self.images_before + self.images
 
     @property
     def all_seconds(self) -> float:
-        """Spent on the network, from random weights on."""
+        """Time spent training the network since it had random weights."""
         return self.seconds_before + self.seconds
 
 
 class TrainState:
-    """The networks, their optimisers, and the course of the run.
+    """The networks, their optimisers, and the progress of the run."""
 
-    Attributes:
-        course: How far it is.
-        looks: The network of each of the world's looks.
-        pose: All looks as one network.
-        critic: Of methods with curiosity.
-    """
+    progress: TrainingProgress
+    """How far the run is."""
+    stages: list[StageNetwork]
+    """The network of each of the world's stages."""
+    pose: Learner[nn.Module]
+    """All stages as one network."""
+    critic: Learner[Critic] | None
+    """Only with the loss term curiosity."""
 
     def __init__(self, config: RunConfig, world: World, device: torch.device) -> None:
         """Everything before the first step.
 
         Raises:
-            UsageError: The world's images cannot be read so, or what is read so cannot be learned by the method.
+            UsageError: The world has no such decoder, or the method cannot train it.
         """
-        reading = config.network.reading
-        if reading is not None and reading not in world.readings:
-            raise UsageError(f"--reading {reading}: images of {world.name} cannot be read so; leave it out")
+        decoder = config.network.reading
+        if decoder is not None and decoder not in world.readings:
+            raise UsageError(f"--reading {decoder}: {world.name} has no such decoder; leave the flag out")
         torch.manual_seed(config.seed)
-        self.course = TrainingProgress()
-        templates = config.method == "templates"
-        self.stages = [] if templates else [look.network(config.network) for look in world.stages]
-        if config.terms > {"sleep"} and not self.stages[0].has_raw_values:
+        self.progress = TrainingProgress()
+        templates = config.terms.templates
+        self.stages = [] if templates else [stage.network(config.network) for stage in world.stages]
+        if config.terms.perturbs_predictions and not self.stages[0].has_raw_values:
             raise UsageError(
-                f"--method {config.method} dreams around what it reads, which cells do not allow: expected --method "
-                "sleep, or --reading whole"
+                f"--method {config.method} perturbs the network's raw outputs, and the dense decoder has none: "
+                "use --method sleep, or --reading whole"
             )
         recipe = config.recipe
         network = template_network(world) if templates else world.assemble(self.stages)
         self.pose = Learner(network.to(device), recipe.learning_rate, recipe.matrix_learning_rate)
-        self.critic: Learner[Critic] | None = None
-        if "curiosity" in config.terms:
+        self.critic = None
+        if config.terms.curiosity:
             critic = Critic(config.network.critic, config.network.critic_normalisation).to(device)
             self.critic = Learner(critic, config.recipe.critic_learning_rate)
 
@@ -151,15 +151,15 @@ class TrainState:
         """All tensors by name, see :meth:`Learner.tensors`."""
         return {f"{who}.{name}": value for who, one in self.learners.items() for name, value in one.tensors().items()}
 
-    def load(self, tensors: dict[str, Tensor], course: TrainingProgress) -> None:
-        """Go back to where :meth:`tensors` and ``course`` were taken.
+    def load(self, tensors: dict[str, Tensor], progress: TrainingProgress) -> None:
+        """Go back to where :meth:`tensors` and ``progress`` were taken.
 
         Raises:
             RuntimeError: The tensors are not those of these networks.
         """
         for who, learner in self.learners.items():
             learner.load(under(f"{who}.", tensors))
-        self.course = course
+        self.progress = progress
 
 
 def under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -27,23 +27,21 @@ Groups = Sequence[Sequence[int]]
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """Which prediction stands for which object.
+    """Pairs of predictions and objects.
 
-    The pairs of all images in one list, so that ``code[field][image, slot]`` are the paired values.
-
-    Attributes:
-        image: Position in the batch of each pair.
-        predicted: Slot of the prediction of each pair.
-        true: Slot of the object of each pair.
-        surplus: Predictions without an object.
-        missing: Objects without a prediction.
+    The pairs of all images are in one list, so that ``code[field][image, slot]`` are the paired values.
     """
 
     image: Int[Tensor, " pairs"]
+    """Position in the batch of each pair."""
     predicted: Int[Tensor, " pairs"]
+    """Slot of the prediction of each pair."""
     true: Int[Tensor, " pairs"]
+    """Slot of the object of each pair."""
     surplus: Bool[Tensor, "batch num_predicted"]
+    """Predictions without an object."""
     missing: Bool[Tensor, "batch num_true"]
+    """Objects without a prediction."""
 
 
 def assign(layout: Layout, predicted: SceneCode, true: SceneCode, groups: Groups | None = None) -> Assignment:

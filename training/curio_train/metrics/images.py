@@ -33,7 +33,7 @@ def blurred(
 
 
 def _filter(size: int, side: int) -> Tensor:
-    """The filter along one axis as a matrix [size, size], borders repeated: on a CPU ten times quicker so."""
+    """The filter along one axis as a matrix [size, size], borders repeated; ten times quicker on a CPU."""
     reach = side // 2
     steps = torch.arange(-reach, reach + 1)
     weights = torch.exp(-0.5 * (steps / (0.3 * (reach - 1) + 0.8)).square())

@@ -5,8 +5,7 @@ object frame. Every error is 0 for a perfect estimate. Rotation and translation 
 diameter or unit makes ADD look good when nothing is.
 
 Hinterstoisser et al. 2012, "Model based training, detection and pose estimation of texture-less 3D objects …" (ADD,
-ADD-S); Brachmann et al. 2016, "Uncertainty-driven 6D pose estimation" (projection error); Hodan et al. 2020, "BOP
-Challenge 2020 on 6D Object Localization" (MSSD, MSPD, discretised symmetries).
+ADD-S); Hodan et al. 2020, "BOP Challenge 2020 on 6D Object Localization" (MSSD, MSPD, discretised symmetries).
 """
 
 from collections.abc import Sequence
@@ -20,12 +19,7 @@ from curio_train.data.bop import ModelInfo
 from curio_train.geometry import Pose, rotation_angle_deg
 
 ADD_THRESHOLD = 0.1
-"""A pose counts as found where ADD is below this share of the diameter."""
-
-
-def transform(pose: Pose, points: np.ndarray) -> np.ndarray:
-    """The points in the camera frame."""
-    return points @ pose.rotation.T + pose.translation_m
+"""A pose counts as correct where ADD is below this fraction of the diameter."""
 
 
 def rotation_error_deg(estimate: Pose, truth: Pose) -> float:
@@ -40,12 +34,12 @@ def translation_error_m(estimate: Pose, truth: Pose) -> float:
 
 def add_m(estimate: Pose, truth: Pose, points: np.ndarray) -> float:
     """ADD: mean distance of each model point under the two poses (Hinterstoisser et al. 2012)."""
-    return float(np.linalg.norm(transform(estimate, points) - transform(truth, points), axis=1).mean())
+    return float(np.linalg.norm(estimate.apply(points) - truth.apply(points), axis=1).mean())
 
 
 def add_s_m(estimate: Pose, truth: Pose, points: np.ndarray) -> float:
     """ADD-S: mean distance from each true point to the closest estimated one (Hinterstoisser et al. 2012)."""
-    distances, _ = KDTree(transform(estimate, points)).query(transform(truth, points))
+    distances, _ = KDTree(estimate.apply(points)).query(truth.apply(points))
     return float(np.mean(distances))
 
 
@@ -55,26 +49,23 @@ def add_or_add_s_m(estimate: Pose, truth: Pose, points: np.ndarray, info: ModelI
 
 
 def symmetry_poses(info: ModelInfo, max_step: float = 0.01) -> list[Pose]:
-    """All poses of the object that look like the first, the identity; continuous symmetries in steps.
+    """All motions of the object that leave its appearance unchanged, the identity first; continuous ones in steps.
 
     Args:
         info: Discrete and continuous symmetries of the object.
-        max_step: The point farthest from a continuous axis moves at most by this share of the diameter a step, which
-            is BOP's choice: 315 steps for the default.
+        max_step: Largest displacement of the point farthest from a continuous axis per step, as a fraction of the
+            diameter. The default is BOP's choice: 315 steps.
     """
-    discrete = [Pose(np.eye(3), np.zeros(3))] + [Pose(s[:3, :3], s[:3, 3]) for s in info.symmetries]
+    discrete = [Pose.identity(), *map(Pose.from_matrix, info.symmetries)]
     continuous = [
-        turn for axis, point in info.symmetry_axes for turn in _turns(axis, point, int(np.ceil(np.pi / max_step)))
+        rotation
+        for axis, point in info.symmetry_axes
+        for rotation in _rotations_about(axis, point, int(np.ceil(np.pi / max_step)))
     ]
-    turns = continuous or [Pose(np.eye(3), np.zeros(3))]
-    return [
-        Pose(turn.rotation @ pose.rotation, turn.rotation @ pose.translation_m + turn.translation_m)
-        for pose in discrete
-        for turn in turns
-    ]
+    return [rotation @ pose for pose in discrete for rotation in continuous or [Pose.identity()]]
 
 
-def _turns(axis: np.ndarray, point: np.ndarray, num_steps: int) -> list[Pose]:
+def _rotations_about(axis: np.ndarray, point: np.ndarray, num_steps: int) -> list[Pose]:
     """Rotations about a line, the identity first."""
     angles = np.arange(num_steps) * 2 * np.pi / num_steps
     rotations = Rotation.from_rotvec(angles[:, None] * (axis / np.linalg.norm(axis))).as_matrix()
@@ -90,36 +81,30 @@ def mssd_m(estimate: Pose, truth: Pose, points: np.ndarray, symmetries: Sequence
         points: Of the evaluation model.
         symmetries: From :func:`symmetry_poses`.
     """
-    estimated = transform(estimate, points)
-    same = (transform(truth, transform(symmetry, points)) for symmetry in symmetries)
+    estimated = estimate.apply(points)
+    same = (truth.apply(symmetry.apply(points)) for symmetry in symmetries)
     return float(min(np.linalg.norm(estimated - points_of, axis=1).max() for points_of in same))
 
 
 def mspd_px(estimate: Pose, truth: Pose, points: np.ndarray, symmetries: Sequence[Pose], matrix: np.ndarray) -> float:
     """Maximum symmetry-aware projection distance (BOP Challenge 2020), pixels of the image of K."""
-    estimated = project(transform(estimate, points), matrix)
-    same = (project(transform(truth, transform(symmetry, points)), matrix) for symmetry in symmetries)
+    estimated = project(estimate.apply(points), matrix)
+    same = (project(truth.apply(symmetry.apply(points)), matrix) for symmetry in symmetries)
     return float(min(np.linalg.norm(estimated - pixels, axis=1).max() for pixels in same))
 
 
-def projection_error_px(estimate: Pose, truth: Pose, points: np.ndarray, matrix: np.ndarray) -> float:
-    """Mean distance of the projected model points (Brachmann et al. 2016), pixels."""
-    offsets = project(transform(estimate, points), matrix) - project(transform(truth, points), matrix)
-    return float(np.linalg.norm(offsets, axis=1).mean())
-
-
 def project(points_in_camera: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Pixels [n, 2] of points [n, 3]. The estimate may be anywhere: behind the camera the result is infinite."""
+    """Pixels [n, 2] of points [n, 3] in the camera frame; infinite for points behind the camera."""
     homogeneous = points_in_camera @ matrix.T
-    ahead = homogeneous[:, 2:] > 0
-    return np.where(ahead, homogeneous[:, :2] / np.where(ahead, homogeneous[:, 2:], 1), np.inf)
+    in_front = homogeneous[:, 2:] > 0
+    return np.where(in_front, homogeneous[:, :2] / np.where(in_front, homogeneous[:, 2:], 1), np.inf)
 
 
 def recall(errors: Sequence[float], threshold: float) -> float:
-    """Share of the errors below the threshold, in [0, 1]. A missing estimate enters as infinity.
+    """Fraction of the errors below the threshold, in [0, 1]. A missing estimate counts as infinity.
 
     Raises:
-        ValueError: There is nothing to judge.
+        ValueError: There are no errors.
     """
     if len(errors) == 0:
         raise ValueError("recall of no estimates: there must be at least one target")

@@ -1,4 +1,4 @@
-"""What every network that reads an image at one look is made of."""
+"""Base class of the networks; each reads the images of one stage."""
 
 from abc import ABC, abstractmethod
 
@@ -7,19 +7,16 @@ from torch import Tensor, nn
 
 
 class StageNetwork(nn.Module, ABC):
-    """Image to scene code in two parts, of which the first may be computed with fewer digits.
-
-    Attributes:
-        encoder: Image to features: convolutions, where the time goes.
-    """
+    """Image to scene code in two parts, of which only the encoder may run in bfloat16."""
 
     encoder: nn.Module
+    """Image to features: convolutions, which take most of the time."""
     has_raw_values = True
-    """Whether :meth:`decode` gives what wake–sleep perturbs."""
+    """Whether :meth:`decode` returns raw values, which wake–sleep perturbs."""
 
     @abstractmethod
     def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Features (float32) to raw values (see ``Layout.activate``; none where there are none) and the code."""
+        """Raw values (see ``Layout.activate``; empty without ``has_raw_values``) and scene code of float32 features."""
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Scene codes, in physical units, of sRGB images in [0, 1]."""

@@ -17,10 +17,10 @@ import torch.nn.functional as F
 from jaxtyping import Bool, UInt8
 from torch import Tensor
 
-from curio_train.camera import crop_camera_at, sampling_grid
 from curio_train.data.photographs import CameraPoses, read_frames
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.metrics.poses import symmetry_poses
+from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
 from curio_train.networks.two_stage.network import OVERSAMPLING
 from curio_train.refinement.multi_view import agreed
 from curio_train.refinement.render_and_compare import RenderAndCompare

@@ -22,9 +22,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from curio_train.camera import crop_camera_at, sampling_grid
 from curio_train.errors import UsageError
 from curio_train.geometry import rotation_angle_deg
+from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
 from curio_train.refinement.crops import Moves, Scene, View
 from curio_train.refinement.inpainting import blurred, filled_in, grown
 from curio_train.rendering.renderer import Renderer

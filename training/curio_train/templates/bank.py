@@ -49,9 +49,7 @@ class Bank(nn.Module):
         self.register_buffer("described", torch.zeros(num, NUM_POINTS, FINE_WIDTH, dtype=torch.int8))
         self.register_buffer("rotations", viewpoints(NUM_VIEWS, NUM_ROLLS), persistent=False)
 
-    def match(
-        self, descriptors: Float[Tensor, "batch size rows columns"]
-    ) -> Float[Tensor, "batch templates shifts"]:
+    def match(self, descriptors: Float[Tensor, "batch size rows columns"]) -> Float[Tensor, "batch templates shifts"]:
         """Mean cosine over each template's silhouette, at every shift of whole cells."""
         filtered = F.conv2d(descriptors, self.filters.float()).flatten(2)
         return self.weights.float() @ filtered

@@ -77,9 +77,7 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> Non
     frames = backgrounds.draw(_NUM_FRAMES, geometry.width, geometry.height, (_SEED, 0))
     _fill_localiser(network.localiser, network.trunk, geometry, world, frames)
     width_m = geometry.width / geometry.focal_px  # of a frame at a distance of 1 m
-    least, largest = (
-        geometry.diameter_m / FILL / (width_m * depth) for depth in (geometry.far_m, geometry.near_m)
-    )
+    least, largest = (geometry.diameter_m / FILL / (width_m * depth) for depth in (geometry.far_m, geometry.near_m))
     crops = backgrounds.of_crops(least, largest).draw(_NUM_CROPS, CROP_PX, CROP_PX, (_SEED, 1))
     _fill_bank(network.bank, network.trunk, geometry, world, crops)
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from curio_train.geometry import Pose
-from curio_train.metrics.certainty import calibration
+from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.scene_code import poses
 from curio_train.templates.network import Evidence, TemplateNetwork
@@ -65,4 +65,4 @@ def _depth_factor(found: list[Pose], true: list[Pose], nearly: np.ndarray) -> fl
 
 
 def _fit(evidence: list[Tensor], is_so: list[bool]) -> Tensor:
-    return torch.tensor(calibration(torch.cat(evidence).numpy(), is_so))
+    return torch.tensor(fit_calibration(torch.cat(evidence).numpy(), is_so))

@@ -7,8 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from curio_train.camera import crop_camera_at, sampling_grid
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_between
+from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.templates.alignment import Aligned, align, with_gradient
 from curio_train.templates.bank import Bank
@@ -153,7 +153,9 @@ class TemplateNetwork(nn.Module):
 
     def _aligned(self, images: Tensor, poses: Poses) -> Poses:
         """Each hypothesis moved to where the template nearest to it fits best."""
-        crops, back, depth, focal_px = self._crops(images, poses.position_m.unflatten(0, (images.shape[0], -1)), CROP_PX)
+        crops, back, depth, focal_px = self._crops(
+            images, poses.position_m.unflatten(0, (images.shape[0], -1)), CROP_PX
+        )
         maps = with_gradient(self.bank.fine(self.trunk(crops)[0]))
         start = self._in_crop(poses.rotation, back, depth)
         nearest = (start.rotation.flatten(1) @ self.bank.rotations.flatten(1).T).argmax(dim=1)

@@ -20,7 +20,7 @@ from curio_train.errors import UsageError
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.metrics.assignment import scene_error
 from curio_train.networks.base import StageNetwork
-from curio_train.networks.paper.pose import PoseNetwork
+from curio_train.networks.paper.network import PoseNetwork
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from curio_train.config import Method, WorldOptions
+from curio_train.config import MethodName, WorldOptions
 from curio_train.errors import UsageError
 
 _TWO_STAGE_RECIPE: Mapping[str, Any] = {
@@ -77,7 +77,7 @@ class LinemodOptions(WorldOptions):
             one encoder sees the frame squeezed to 128x128.
     """
 
-    default_method: ClassVar[Method] = "sleep"
+    default_method: ClassVar[MethodName] = "sleep"
     default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     class_name: Annotated[str, tyro.conf.arg(name="class")]
@@ -128,7 +128,7 @@ class CaptureOptions(WorldOptions):
             1 compares them as they are.
     """
 
-    default_method: ClassVar[Method] = "sleep"
+    default_method: ClassVar[MethodName] = "sleep"
     default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     mesh: tuple[Path, ...]

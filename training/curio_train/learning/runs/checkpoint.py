@@ -1,10 +1,10 @@
-"""The run folder: configuration and checkpoints, written so that no crash can leave half of one.
+"""The run folder: configuration and checkpoints, written so that a crash cannot leave half of one.
 
 ::
 
     RUN/config.json
-        checkpoints/00001200/tensors.safetensors     weights, buffers, Adam's moments
-                             course.json             see Course
+        checkpoints/00001200/tensors.safetensors     weights, buffers, the optimisers' moments
+                             course.json             see TrainingProgress
         checkpoints/00001400/…                       the last two are kept
         history.jsonl  samples.png  tensorboard/     written by ``progress``
 """
@@ -30,12 +30,12 @@ _NUM_KEPT = 2
 
 
 class RunFolder:
-    """Where a run lives.
+    """The folder of one run."""
 
-    Attributes:
-        path: The folder.
-        config: What the run was started with.
-    """
+    path: Path
+    """The folder."""
+    config: RunConfig
+    """What the run was started with."""
 
     def __init__(self, path: Path, config: RunConfig) -> None:
         self.path = path
@@ -60,7 +60,7 @@ class RunFolder:
         file = self.path / CONFIG_FILE
         if new and file.exists():
             raise UsageError(
-                f"{self.path} holds a run already; go on with it by --resume {self.path}, or name another folder: --out"
+                f"{self.path} holds a run already; continue it with --resume {self.path}, or name another folder: --out"
             )
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -83,14 +83,14 @@ class RunFolder:
         Raises:
             CheckpointError: It could not be written (disk full, …). The earlier ones are untouched.
         """
-        target = self.path / "checkpoints" / f"{state.course.step:08d}"
+        target = self.path / "checkpoints" / f"{state.progress.step:08d}"
         draft = target.with_name("draft.tmp")
         try:
             shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed while writing
             draft.mkdir(parents=True)
             tensors = {name: value.detach().cpu().contiguous() for name, value in state.tensors().items()}
             _write_synced(draft / "tensors.safetensors", save(tensors))
-            _write_synced(draft / "course.json", json.dumps(asdict(state.course)).encode())
+            _write_synced(draft / "course.json", json.dumps(asdict(state.progress)).encode())
             _sync_folder(draft)
             if not target.exists():  # the same step is the same checkpoint
                 draft.rename(target)
@@ -107,16 +107,11 @@ class RunFolder:
         Raises:
             CheckpointError: The last checkpoint is damaged, or of other networks.
         """
-        if not self.checkpoints():
-            return
-        tensors, course = self.last()
-        try:
-            state.load(tensors, course)
-        except RuntimeError as exc:
-            raise CheckpointError(_unreadable(self.checkpoints()[-1], exc)) from exc
+        if self.checkpoints():
+            self._load_last(state)
 
     def last(self) -> tuple[dict[str, Tensor], TrainingProgress]:
-        """The last checkpoint: all tensors of the :class:`TrainState` by name, and how far the run was.
+        """All tensors of the last checkpoint's :class:`TrainState` by name, and the run's progress.
 
         Raises:
             CheckpointError: There is no checkpoint, or it is damaged.
@@ -126,25 +121,28 @@ class RunFolder:
             raise CheckpointError(f"{self.path} has no checkpoint yet; train it first: --resume {self.path}")
         last = checkpoints[-1]
         try:
-            course = TrainingProgress(**json.loads((last / "course.json").read_bytes()))
-            return load((last / "tensors.safetensors").read_bytes()), course
+            progress = TrainingProgress(**json.loads((last / "course.json").read_bytes()))
+            return load((last / "tensors.safetensors").read_bytes()), progress
         except (OSError, ValueError, TypeError, SafetensorError) as exc:
             raise CheckpointError(_unreadable(last, exc)) from exc
 
     def trained(self, world: World) -> TrainState:
-        """The last checkpoint on the CPU with the network in evaluation mode: what is exported and scored.
+        """The last checkpoint on the CPU, with the network in evaluation mode, for export and evaluation.
 
         Raises:
             CheckpointError: There is no checkpoint yet, or it cannot be read.
         """
-        tensors, course = self.last()
         state = TrainState(self.config, world, torch.device("cpu"))
-        try:
-            state.load(tensors, course)
-        except RuntimeError as exc:
-            raise CheckpointError(_unreadable(self.checkpoints()[-1], exc)) from exc
+        self._load_last(state)
         state.pose.network.eval()
         return state
+
+    def _load_last(self, state: TrainState) -> None:
+        tensors, progress = self.last()
+        try:
+            state.load(tensors, progress)
+        except RuntimeError as exc:
+            raise CheckpointError(_unreadable(self.checkpoints()[-1], exc)) from exc
 
     def _not_written(self, target: Path, exc: OSError) -> str:
         kept = self.checkpoints()

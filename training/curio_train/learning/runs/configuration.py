@@ -2,14 +2,17 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields
+from functools import cache
 from pathlib import Path
-from types import NoneType
-from typing import Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any
 
-from curio_train.config import RunConfig
+from curio_train.config import RunConfig, WorldOptions
 from curio_train.errors import CheckpointError, ResumeMismatch, UsageError
 from curio_train.worlds import WORLDS
+
+if TYPE_CHECKING:
+    from cattrs import Converter
 
 CONFIG_FILE = "config.json"
 _MAY_CHANGE = ("minutes", "images", "stop_below")  # when to stop is not what to learn
@@ -17,18 +20,54 @@ _MAY_CHANGE = ("minutes", "images", "stop_below")  # when to stop is not what to
 
 def world_name(config: RunConfig) -> str:
     """The registered name of a configuration's world."""
-    return next(name for name, kind in WORLDS.items() if isinstance(config.world, kind))
+    return _registered_name(config.world)
+
+
+def _registered_name(world: WorldOptions) -> str:
+    return next(name for name, kind in WORLDS.items() if isinstance(world, kind))
+
+
+@cache
+def _converter() -> "Converter":
+    """Between dataclasses and JSON values; unknown keys are errors, and a world is stored with its name."""
+    from cattrs import Converter  # not at --help
+    from cattrs.gen import make_dict_structure_fn, make_dict_unstructure_fn
+
+    converter = Converter(forbid_extra_keys=True, unstruct_collection_overrides={tuple: list})
+
+    def from_world(world: WorldOptions) -> dict[str, Any]:
+        return {"name": _registered_name(world), **make_dict_unstructure_fn(type(world), converter)(world)}
+
+    def to_world(data: Mapping[str, Any], _: type) -> WorldOptions:
+        if data.get("name") not in WORLDS:
+            raise ValueError(f"found the world {data.get('name')!r}, expected one of {', '.join(WORLDS)}")
+        kind = WORLDS[data["name"]]
+        options = {name: value for name, value in data.items() if name != "name"}
+        world: WorldOptions = make_dict_structure_fn(kind, converter)(options, kind)
+        return world
+
+    for kind in (bool, int, float, str):
+        converter.register_structure_hook(kind, _unchanged)
+    converter.register_unstructure_hook(WorldOptions, from_world)
+    converter.register_structure_hook(WorldOptions, to_world)
+    return converter
+
+
+def _unchanged(value: Any, kind: type) -> Any:
+    """A JSON value of the declared type as it is: ``"1"`` is no number, ``true`` is no 1."""
+    if type(value) is not kind and not (kind is float and type(value) is int):
+        raise ValueError(f"found {value!r}, expected {kind.__name__}")
+    return value
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:
-    """Plain values; the world's name stands among its options."""
-    plain: dict[str, Any] = _plain(asdict(config))
-    plain["world"] = {"name": world_name(config), **plain["world"]}
+    """The configuration as JSON values; the world's name stands among its options."""
+    plain: dict[str, Any] = _converter().unstructure(config)
     return plain
 
 
 def to_portable(config: RunConfig) -> dict[str, Any]:
-    """The same without the folders that the world was given: what a model tells other machines of its making."""
+    """The same without paths of this machine: the recipe that is stored in an exported model."""
     folders = [field.name for field in fields(config.world) if _has_paths(getattr(config.world, field.name))]
     plain = to_json(config)
     if config.init is not None:
@@ -41,12 +80,23 @@ def from_json(data: Mapping[str, Any]) -> RunConfig:
     """The configuration that :func:`to_json` made these values of.
 
     Raises:
-        KeyError, TypeError, ValueError, UsageError: A field is missing, unknown or impossible.
+        ValueError: A field is missing, unknown or impossible; the text names it.
     """
-    options = dict(data["world"])
-    world = _typed(WORLDS[options.pop("name")], options)
-    hints = get_type_hints(RunConfig)
-    return RunConfig(world, **{name: _typed(hints[name], data[name]) for name in data if name != "world"})
+    from cattrs import BaseValidationError, transform_error
+
+    if not isinstance(data, Mapping):
+        raise ValueError(f"found {data!r}, expected an object")
+    try:
+        return _converter().structure(data, RunConfig)
+    except BaseValidationError as exc:
+        raise ValueError("; ".join(transform_error(exc, path="config", format_exception=_reason))) from exc
+
+
+def _reason(exc: BaseException, kind: type | None) -> str:
+    """Cattrs's words for missing and unknown fields, else the error's own."""
+    from cattrs.v import format_exception
+
+    return str(exc) if isinstance(exc, UsageError | ValueError) else format_exception(exc, kind)
 
 
 def load_config(run: Path) -> RunConfig:
@@ -62,9 +112,9 @@ def load_config(run: Path) -> RunConfig:
         raise CheckpointError(
             f"{run} is no run folder: cannot read {file} ({exc.strerror}); expected a folder named by --out"
         ) from exc
-    except (KeyError, TypeError, ValueError, UsageError) as exc:
+    except ValueError as exc:
         raise CheckpointError(
-            f"{file} is no configuration of this version ({type(exc).__name__}: {exc}); restore it, or start a new run"
+            f"{file} is no configuration of this version ({exc}); restore it, or start a new run"
         ) from exc
 
 
@@ -89,27 +139,6 @@ def refuse_other(stored: RunConfig, wanted: RunConfig, run: Path) -> None:
 
 def _has_paths(value: Any) -> bool:
     return isinstance(value, Path) or (isinstance(value, tuple) and any(isinstance(one, Path) for one in value))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(entry) for name, entry in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [_plain(entry) for entry in value]
-    return str(value) if isinstance(value, Path) else value
-
-
-def _typed(kind: Any, value: Any) -> Any:
-    """A JSON value as the type that a dataclass field declares."""
-    choices = get_args(kind)
-    if value is None or (choices and NoneType in choices):
-        return None if value is None else _typed(next(c for c in choices if c is not NoneType), value)
-    if isinstance(kind, type) and is_dataclass(kind):
-        hints = get_type_hints(kind)
-        return kind(**{name: _typed(hints[name], entry) for name, entry in value.items()})
-    if kind is Path:
-        return Path(value)
-    return tuple(_typed(choices[0] if choices else None, one) for one in value) if isinstance(value, list) else value
 
 
 def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:

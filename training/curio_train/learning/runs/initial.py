@@ -1,10 +1,9 @@
-"""What a run may begin with: the network of another run, or of an exported model.
+"""Starting a run from the network of another run, or of an exported model (``--init``).
 
-A model's ONNX file is for running: batch norm is folded into the convolutions, and the exporter names and shares
-constants as it likes. So a version keeps the network as it was trained beside it, in ``weights.safetensors``.
+A model's ONNX file cannot be trained further: batch norm is folded into the convolutions, and the exporter renames and
+shares constants. So each version also stores the network as it was trained, in ``weights.safetensors``.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -13,71 +12,48 @@ from torch import Tensor
 
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, CurioError, ExportError, UsageError
-from curio_train.export.folder import WEIGHTS_FILE, find_model
+from curio_train.exported_model import WEIGHTS_FILE, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, load_config
 from curio_train.learning.state import TrainState, under
 
-_IMAGES, _SECONDS, _TAUGHT = "images_seen", "training_seconds", "synthetic_labels"
-
-
-@dataclass(frozen=True)
-class Initial:
-    """A trained network.
-
-    Attributes:
-        tensors: Its weights and buffers, by name.
-        images_seen: By it, and by the networks that it began as.
-        training_seconds: Likewise.
-    """
-
-    tensors: dict[str, Tensor]
-    images_seen: int
-    training_seconds: float
-
-    @staticmethod
-    def open(path: Path) -> "Initial":
-        """The network behind a path.
-
-        Args:
-            path: A run folder, a model folder (its latest version) or a version's folder.
-
-        Raises:
-            UsageError: It is none of them.
-            CheckpointError: The run is damaged or has no checkpoint, or the model has no readable weights.
-        """
-        if _is_run(path):
-            tensors, course = RunFolder.open(path).last()
-            return Initial(under("pose.network.", tensors), course.all_images, course.all_seconds)
-        tensors, notes = _read(path)
-        return Initial(tensors, int(notes[_IMAGES]), float(notes[_SECONDS]))
+_IMAGES, _SECONDS, _SYNTHETIC_LABELS = "images_seen", "training_seconds", "synthetic_labels"
 
 
 def begin_with(state: TrainState, path: Path) -> None:
-    """Give ``state`` the network behind a path (see :meth:`Initial.open`), and nothing else of it.
+    """Load a trained network into ``state``; optimisers and budget start anew.
+
+    Args:
+        state: Of the new run.
+        path: A run folder, a model folder (its latest version) or a version's folder.
 
     Raises:
-        UsageError: The networks are not of one kind, or there is none.
-        CheckpointError: It cannot be read.
+        UsageError: There is no network there, or it is of another architecture.
+        CheckpointError: The run is damaged or has no checkpoint, or the model has no readable weights.
     """
-    initial = Initial.open(path)
+    if _is_run(path):
+        tensors, before = RunFolder.open(path).last()
+        tensors, images, seconds = under("pose.network.", tensors), before.all_images, before.all_seconds
+    else:
+        tensors, notes = _weights_and_notes(path)
+        images, seconds = int(notes[_IMAGES]), float(notes[_SECONDS])
     try:
-        state.pose.network.load_state_dict(initial.tensors)
+        state.pose.network.load_state_dict(tensors)
     except RuntimeError as exc:
         raise UsageError(
             f"--init {path}: its network does not fit this world ({str(exc).splitlines()[-1].strip()}); "
             "expected a run or a model of the same world and the same network flags"
         ) from exc
-    state.course.images_before, state.course.seconds_before = initial.images_seen, initial.training_seconds
+    state.progress.images_before, state.progress.seconds_before = images, seconds
 
 
 def weights_file(state: TrainState, config: RunConfig, *, half: bool) -> bytes:
-    """The content of ``weights.safetensors``: what :func:`begin_with` needs, and what figures tell of its making.
+    """The content of ``weights.safetensors``: the network for :func:`begin_with`, and notes on its training.
 
     Args:
         state: Whose network it is.
         config: What it was trained with.
-        half: Store matrices and convolutions as float16; vectors, which batch norm divides by, stay float32.
+        half: Store matrices and convolutions as float16; vectors stay float32, because batch norm divides by some.
 
     Raises:
         ExportError: A weight is too large for float16.
@@ -91,26 +67,26 @@ def weights_file(state: TrainState, config: RunConfig, *, half: bool) -> bytes:
         if not all(value.isfinite().all() for value in tensors.values()):
             raise ExportError("a weight is too large for float16; export without --half")
     notes = {
-        _IMAGES: str(state.course.all_images),
-        _SECONDS: str(state.course.all_seconds),
-        _TAUGHT: str(uses_synthetic_labels(config)),
+        _IMAGES: str(state.progress.all_images),
+        _SECONDS: str(state.progress.all_seconds),
+        _SYNTHETIC_LABELS: str(uses_synthetic_labels(config)),
     }
     return save(tensors, notes)
 
 
 def uses_synthetic_labels(config: RunConfig) -> bool:
-    """Whether poses of renderings taught a network, in the sense of the paper's LineMOD table, or the one it began as.
+    """Whether true poses of renderings were used to train a network, as in the paper's LineMOD table.
 
-    A network that began as another, of which nothing is known any more, counts as so taught.
+    The runs and models that it was initialised from count, too; one that cannot be read any more counts as yes.
     """
-    if config.terms & {"label", "sleep"} or config.method == "templates":
+    if config.terms.label or config.terms.sleep or config.terms.templates:
         return True
     if config.init is None:
         return False
     try:
         if _is_run(config.init):
             return uses_synthetic_labels(load_config(config.init))
-        return _read(config.init)[1][_TAUGHT] != str(False)
+        return _weights_and_notes(config.init)[1][_SYNTHETIC_LABELS] != str(False)
     except CurioError:
         return True
 
@@ -119,13 +95,13 @@ def _is_run(path: Path) -> bool:
     return (path / CONFIG_FILE).exists()
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and the notes of a model's weights."""
+def _weights_and_notes(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The content of a model's ``weights.safetensors``."""
     file = find_model(path).with_name(WEIGHTS_FILE)
     if not file.exists():
         raise CheckpointError(
-            f"{file.parent} was exported without weights to go on from ({WEIGHTS_FILE}); name a newer version, or the "
-            "run folder that it was exported from"
+            f"{file.parent} was exported without {WEIGHTS_FILE} and cannot be trained further; name a newer version, "
+            "or the run folder that it was exported from"
         )
     try:
         with safe_open(file, framework="pt") as content:
@@ -133,6 +109,6 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             notes = content.metadata() or {}
     except (OSError, SafetensorError) as exc:
         raise CheckpointError(f"{file} cannot be read ({exc}); copy it again, or export the model anew") from exc
-    if missing := {_IMAGES, _SECONDS, _TAUGHT} - notes.keys():
+    if missing := {_IMAGES, _SECONDS, _SYNTHETIC_LABELS} - notes.keys():
         raise CheckpointError(f"{file} does not say its {', '.join(sorted(missing))}; export the model anew")
     return tensors, notes

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: while training, the step at hand is finished and saved first; elsewhere they stop at once."""
+"""Ctrl-C and SIGTERM: training finishes and saves the current step first; all else stops at once."""
 
 import signal
 from collections.abc import Iterator
@@ -7,11 +7,10 @@ from types import FrameType
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal asked the process to end. Not an error: nothing in between may swallow it.
+    """A signal asked the process to end; a KeyboardInterrupt, so that no handler of errors swallows it."""
 
-    Attributes:
-        signum: Which signal.
-    """
+    signum: int
+    """Which signal."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(signal.Signals(signum).name)
@@ -24,35 +23,34 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interruption:
-    """Whether, and by which signal, this process was asked to end; see :func:`interruptible`.
+    """Whether, and by which signal, this process was asked to end; see :func:`interruptible`."""
 
-    Attributes:
-        signum: The signal that came, or None.
-    """
+    signum: int | None
+    """The signal that came, or None."""
 
     def __init__(self) -> None:
-        self.signum: int | None = None
-        self._waits = False
+        self.signum = None
+        self._deferred = False
 
     def receive(self, signum: int, frame: FrameType | None) -> None:
         """The signal handler.
 
         Raises:
-            Interrupted: Nobody asked for a delay, or this is the second signal.
+            Interrupted: Signals are not deferred, or this is the second one.
         """
         again = self.signum is not None
         self.signum = signum
-        if again or not self._waits:
+        if again or not self._deferred:
             raise Interrupted(signum)
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Within it the first signal only sets :attr:`signum`; a second one still stops at once."""
-        self._waits = True
+        """Within it the first signal only sets :attr:`signum`; a second one raises."""
+        self._deferred = True
         try:
             yield
         finally:
-            self._waits = False
+            self._deferred = False
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What a user sees of a run: progress on stderr, curves and pictures in its folder.
+"""Progress of a run: a bar on stderr, curves and pictures in the run folder.
 
 ::
 
@@ -18,6 +18,7 @@ import cv2
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.table import Column
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
@@ -27,50 +28,57 @@ from curio_train.learning.state import TrainingProgress
 _HISTORY = "history.jsonl"
 _STEPS_A_LINE = 20  # of history and curves
 _SECONDS_A_LINE = 10  # of the log where stderr is no terminal
+_BAR_WIDTH = 16
 
 
 class Reporter:
-    """Follows one run; see :func:`reporting`."""
+    """Reports the progress of one run; see :func:`reporting`."""
 
-    def __init__(self, run: Path, course: TrainingProgress, console: Console) -> None:
+    def __init__(self, run: Path, progress: TrainingProgress, console: Console) -> None:
         self._run = run
-        self._course = course
+        self._progress = progress
         self._console = console
-        self._curves = SummaryWriter(str(run / "tensorboard"), purge_step=course.step)
+        self._curves = SummaryWriter(str(run / "tensorboard"), purge_step=progress.step)
         self._history = (run / _HISTORY).open("a", encoding="utf-8")
         self._sums: Counter[str] = Counter()
         self._counts: Counter[str] = Counter()
-        self._since = (course.step, course.images, course.seconds)
-        self._logged_at = course.seconds
+        self._since = (progress.step, progress.images, progress.seconds)
+        self._logged_at = progress.seconds
         self._bar: Progress | None = None
         self._task = TaskID(0)
         if console.is_terminal:
-            self._bar = Progress(
-                BarColumn(), TextColumn("{task.percentage:3.0f} %  {task.description}"), console=console
-            )
+            # The bar keeps its place in narrow terminals: the text beside it is cut off at its end, the losses.
+            bar_column, text_column = Column(width=_BAR_WIDTH), Column(ratio=1, no_wrap=True)
+            text = TextColumn("{task.percentage:3.0f} %  {task.description}", table_column=text_column)
+            self._bar = Progress(BarColumn(table_column=bar_column), text, console=console, expand=True)
             self._task = self._bar.add_task("starting", total=1.0)
             self._bar.start()
 
-    def step(self, losses: dict[str, float], progress: float) -> None:
-        """Take note of one step, after which ``progress`` of the budget is spent."""
+    def step(self, losses: dict[str, float], spent: float) -> None:
+        """Report one step.
+
+        Args:
+            losses: By name.
+            spent: Fraction of the budget after the step.
+        """
         self._sums.update(losses)
         self._counts.update(losses.keys())
-        if self._course.step - self._since[0] >= _STEPS_A_LINE:
+        if self._progress.step - self._since[0] >= _STEPS_A_LINE:
             with _writing_into(self._run):
                 text = self._note()
-            self._show(text, progress)
+            self._show(text, spent)
 
     def pictures(self, pairs: tuple[Tensor, Tensor]) -> None:
-        """Show inputs and re-renderings, [num, 3, height, width] each."""
+        """Save pairs of inputs and re-renderings, [num, 3, height, width] each, as a picture."""
         sheet = torch.cat([torch.cat(list(images.cpu()), dim=2) for images in pairs], dim=1).clamp(0, 1)
         pixels = (sheet * 255).round().byte().permute(1, 2, 0).numpy()
         _, png = cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
         with _writing_into(self._run):
-            self._curves.add_image("input above, re-rendering below", sheet, self._course.step)
+            self._curves.add_image("input above, re-rendering below", sheet, self._progress.step)
             (self._run / "samples.png").write_bytes(png.tobytes())
 
     def close(self) -> None:
-        """Put everything on disk and leave the terminal in order."""
+        """Write what is not yet on disk, and end the bar."""
         if self._bar is not None:
             self._bar.stop()
         with _writing_into(self._run), self._history, self._curves:
@@ -78,8 +86,8 @@ class Reporter:
                 self._note()
 
     def _note(self) -> str:
-        """Write down what was gathered since the last line; returns it in words."""
-        now = self._course
+        """Write the means since the last line to history and curves; returns them as text."""
+        now = self._progress
         images, seconds = now.images - self._since[1], now.seconds - self._since[2]
         means = {name: value / self._counts[name] for name, value in self._sums.items()}
         rate = images / max(seconds, 1e-9)
@@ -93,24 +101,24 @@ class Reporter:
         self._counts.clear()
         self._since = (now.step, now.images, now.seconds)
         losses = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
-        return f"{now.images:,} images  {losses}  {rate:.0f} images/s"
+        return f"{now.images:,} images  {rate:.0f} images/s  {losses}"
 
-    def _show(self, text: str, progress: float) -> None:
-        seconds = self._course.seconds
-        text += f"  {_clock(seconds * max(0.0, 1 / progress - 1))} left"
+    def _show(self, text: str, spent: float) -> None:
+        seconds = self._progress.seconds
+        text = f"{_clock(seconds * max(0.0, 1 / spent - 1))} left  {text}"
         if self._bar is not None:
-            self._bar.update(self._task, completed=min(progress, 1.0), description=text)
+            self._bar.update(self._task, completed=min(spent, 1.0), description=text)
         elif seconds - self._logged_at >= _SECONDS_A_LINE:
             self._console.print(f"{_clock(seconds)}  {text}", soft_wrap=True)
             self._logged_at = seconds
 
 
 @contextmanager
-def reporting(run: Path, course: TrainingProgress) -> Iterator[Reporter]:
-    """Follow a run from ``course`` on; what was noted after that point, by a session since killed, is dropped."""
+def reporting(run: Path, progress: TrainingProgress) -> Iterator[Reporter]:
+    """Report a run from ``progress`` on; drops lines of a killed session that are later than that."""
     with _writing_into(run):
-        _drop_after(run, course.step)
-        reporter = Reporter(run, course, Console(stderr=True, highlight=False))
+        _drop_after(run, progress.step)
+        reporter = Reporter(run, progress, Console(stderr=True, highlight=False))
     try:
         yield reporter
     finally:
@@ -123,7 +131,7 @@ def _writing_into(run: Path) -> Iterator[None]:
         yield
     except OSError as exc:
         raise CheckpointError(
-            f"cannot write into {run}: {exc.strerror}; make room, then go on with --resume {run}"
+            f"cannot write into {run}: {exc.strerror}; make room, then continue with --resume {run}"
         ) from exc
 
 

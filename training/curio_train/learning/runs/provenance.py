@@ -1,9 +1,4 @@
-"""Where a run comes from: each sitting of training leaves a line in the run folder, for cards and result files.
-
-::
-
-    RUN/sittings.jsonl    command, commit, machine, start
-"""
+"""Provenance of a run: each session of training adds a line to ``RUN/sittings.jsonl``, for cards and result files."""
 
 import datetime
 import json
@@ -24,30 +19,27 @@ _FILE = "sittings.jsonl"
 
 @dataclass(frozen=True)
 class RunSession:
-    """One call of a command.
-
-    Attributes:
-        command: As typed.
-        commit: Of the code, with "-dirty" where it had changes; empty where it does not run from a git checkout.
-        machine: Processor, number of cores this process may use, GPU.
-        started: UTC, ISO 8601.
-    """
+    """One call of a command."""
 
     command: str
+    """As typed."""
     commit: str
+    """Of the code, with "-dirty" where it had changes; empty where it does not run from a git checkout."""
     machine: str
+    """Processor, number of cores this process may use, GPU."""
     started: str
+    """UTC, ISO 8601."""
 
 
 def this_session() -> RunSession:
-    """What this process is."""
+    """The call that this process carries out."""
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     return RunSession(command, commit(), machine(), now)
 
 
 def record_session(run: Path) -> None:
-    """Add this process to a run's sittings.
+    """Add this process to a run's sessions.
 
     Raises:
         CheckpointError: The folder cannot be written.
@@ -60,25 +52,24 @@ def record_session(run: Path) -> None:
 
 
 def run_sessions(run: Path) -> list[RunSession]:
-    """A run's sittings, oldest first.
+    """A run's sessions, oldest first.
 
     Raises:
         CheckpointError: They cannot be read.
     """
     try:
         lines = (run / _FILE).read_text(encoding="utf-8").splitlines()
-        found = [
-            RunSession(**json.loads(line)) for line in lines if line.endswith("}")
-        ]  # the rest was cut off by a kill
+        whole = [line for line in lines if line.endswith("}")]  # a kill may cut off the last one
+        found = [RunSession(**json.loads(line)) for line in whole]
     except (OSError, ValueError, TypeError) as exc:
         raise CheckpointError(f"{run / _FILE} cannot be read ({exc}); is {run} a whole run folder?") from exc
     if not found:
-        raise CheckpointError(f"{run / _FILE} has no whole line, expected one a sitting; is {run} a whole run folder?")
+        raise CheckpointError(f"{run / _FILE} has no whole line, expected one a session; is {run} a whole run folder?")
     return found
 
 
 def commit() -> str:
-    """Of this package's source, see :class:`RunSession`."""
+    """Commit of this package's source, see :class:`RunSession`."""
     here = Path(__file__).resolve()
     if _git(here.parent, "ls-files", here.name) == "":
         return ""  # not in a checkout, or in one that does not track it (a venv inside another project)

@@ -13,9 +13,9 @@ LEAK = 0.2  # the paper says "leaky ReLU" and no slope; DCGAN's, the usual one o
 class Critic(nn.Module):
     """Image to one logit, large for images that look like the data's.
 
-    The paper's sigmoid is in the loss. Its table ends in 64 channels; its count of 1,883,713 parameters, in one.
-    Statistics are always the batch's own: data and renderings are normalised apart, and the critic is never used after
-    training.
+    The paper's sigmoid is in the loss. Its table ends in 64 channels, but its count of 1,883,713 parameters has one.
+    Batch norm always uses the batch's own statistics: data and renderings are normalised apart, and the critic is not
+    used after training.
     """
 
     def __init__(self, stack: ConvStack, normalisation: Literal["batch", "instance"] = "batch") -> None:

@@ -1,7 +1,7 @@
-"""The first look's network: where one object is in a whole frame, as weighted hypotheses on a grid.
+"""Network of the localisation stage: centre proposals for one object in a whole frame, one from each grid cell.
 
-Every cell says where the object would be if it were near that cell, and how likely that is. What is learned at one
-place so holds at all, and two things that look like the object are two hypotheses instead of a mean between them.
+Every cell predicts how likely the object's centre is near it, and the object's position if so. What is learned at one
+position thus holds at all, and two regions that look like the object are two proposals instead of a mean between them.
 """
 
 import torch
@@ -14,19 +14,20 @@ from curio_train.networks.grid import STRIDE, CellGrid
 from curio_train.networks.layers import convolution
 from curio_train.scene_code import TRANSLATION
 
-PROPOSALS, HEAT_MAP = "places_m", "place_amounts"
-CANDIDATES, CANDIDATE_LOG_WEIGHTS = "candidates_m", "candidate_log_weights"
-"""What ``LocalisationNetwork.decode`` gives beside the place: all hypotheses [batch, cells, 3] with the logits of how
-much of an object is there [batch, cells], and the likeliest places that are not beside each other
-[batch, NUM_CANDIDATES, 3] with the logarithm of the weight around each."""
+PROPOSALS, HEAT_MAP = "proposals_m", "heat_map_logits"
+"""Keys beside the position that ``LocalisationNetwork.decode`` returns: the proposal of each cell [batch, cells, 3],
+and the logits of the centre heat map [batch, cells]."""
+TOP_PROPOSALS, TOP_LOG_WEIGHTS = "top_proposals_m", "top_log_weights"
+"""Keys of the likeliest proposals that are not neighbours [batch, NUM_TOP, 3], and of the logarithm of the heat around
+each [batch, NUM_TOP]."""
 
-NUM_CANDIDATES = 6
+NUM_TOP = 6
 
 _WIDTHS = (24, 48, 96)
 _CONTEXT_DILATIONS = (1, 2, 1)
 _LEAST_WEIGHT = 1e-6
-_SCARCE = -4.0  # logit of an amount at the start: most cells hold nothing
-_APART = 2  # cells that candidates are at least apart, across or down
+_EMPTY_LOGIT = -4.0  # of the heat map at the start: most cells have no object
+_LEAST_DISTANCE = 2  # cells between top proposals, across or down
 
 
 class LocalisationNetwork(StageNetwork):
@@ -48,34 +49,34 @@ class LocalisationNetwork(StageNetwork):
         assert self.place.bias is not None
         nn.init.zeros_(self.place.bias)
         assert self.score.bias is not None
-        nn.init.constant_(self.score.bias, _SCARCE)
+        nn.init.constant_(self.score.bias, _EMPTY_LOGIT)
 
     def decode(
         self, features: Float[Tensor, "batch channels rows columns"]
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """No raw values, and the code: the place with the most weight around it, and what else is known of places."""
-        amounts = self.score(features).flatten(1)
+        """No raw values, and the code: the likeliest position, with all proposals beside it."""
+        logits = self.score(features).flatten(1)
         values = self.place(features).flatten(2).transpose(1, 2)
-        places = self.grid.locate(self.grid.pixels + STRIDE * values[..., :2], values[..., 2:].tanh())
-        # Neighbours that mean the same place share its weight: together they count as one, led by the strongest.
-        weights = amounts.sigmoid()
-        around = F.avg_pool2d(weights.unflatten(1, (self.grid.rows, self.grid.columns))[:, None], 3, 1, 1).flatten(1)
-        candidates, of_candidates = self._candidates(places, around + weights)
-        known = {PROPOSALS: places, HEAT_MAP: amounts}
-        known |= {CANDIDATES: candidates, CANDIDATE_LOG_WEIGHTS: of_candidates.clamp(min=_LEAST_WEIGHT).log()}
-        return {}, {TRANSLATION: candidates[:, :1], **known}
+        proposals = self.grid.locate(self.grid.pixels + STRIDE * values[..., :2], values[..., 2:].tanh())
+        # Neighbours that propose the same position each have a part of its heat: they are counted together.
+        heat = logits.sigmoid()
+        around = F.avg_pool2d(heat.unflatten(1, (self.grid.rows, self.grid.columns))[:, None], 3, 1, 1).flatten(1)
+        top, weights = self._top_proposals(proposals, around + heat)
+        beside = {PROPOSALS: proposals, HEAT_MAP: logits}
+        beside |= {TOP_PROPOSALS: top, TOP_LOG_WEIGHTS: weights.clamp(min=_LEAST_WEIGHT).log()}
+        return {}, {TRANSLATION: top[:, :1], **beside}
 
-    def _candidates(
-        self, places: Float[Tensor, "batch cells 3"], weights: Float[Tensor, "batch cells"]
-    ) -> tuple[Float[Tensor, "batch candidates 3"], Float[Tensor, "batch candidates"]]:
-        """The likeliest place, the likeliest of those not beside it, and so on, each with its weight."""
-        pixels = self.grid.project(places)
+    def _top_proposals(
+        self, proposals: Float[Tensor, "batch cells 3"], weights: Float[Tensor, "batch cells"]
+    ) -> tuple[Float[Tensor, "batch top 3"], Float[Tensor, "batch top"]]:
+        """Non-maximum suppression: the likeliest proposal, the likeliest of those not near it, and so on."""
+        pixels = self.grid.project(proposals)
         found, found_weights = [], []
-        for _ in range(NUM_CANDIDATES):
+        for _ in range(NUM_TOP):
             best = weights.argmax(dim=1, keepdim=True)
             found_weights.append(weights.gather(1, best))
             best = best[..., None].expand(-1, 1, 3)
-            found.append(places.gather(1, best))
+            found.append(proposals.gather(1, best))
             distance = (pixels - pixels.gather(1, best[..., :2])).abs().amax(dim=-1)
-            weights = weights * (distance > _APART * STRIDE)
+            weights = weights * (distance > _LEAST_DISTANCE * STRIDE)
         return torch.cat(found, dim=1), torch.cat(found_weights, dim=1)

@@ -1,4 +1,4 @@
-"""Two looks as one network: a place from the whole frame, then pose and light from a crop around it."""
+"""The two-stage detector as one network: positions from the whole frame, then pose and light from crops around them."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -9,157 +9,156 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from curio_train.camera import crop_camera_at, sampling_grid
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.networks.base import StageNetwork
+from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
 from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
-from curio_train.networks.two_stage.localise import CANDIDATE_LOG_WEIGHTS, CANDIDATES
+from curio_train.networks.two_stage.localise import TOP_LOG_WEIGHTS, TOP_PROPOSALS
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
-_EVIDENCE = "evidence"
+_VISIBILITY = "visibility"
 _NUM_CLEAREST = 16  # of 256 patches
 SCALES, _MIDDLE = (1 / 1.18, 1.0, 1.18), 1
-"""Of the distance that the last crops are placed by."""
+"""The crops of the refinement pass assume the object at these multiples of its estimated distance."""
 
-_SURELY = 20.0  # logit: as long as nothing is calibrated, the confidence is the second look's
+_UNCALIBRATED = 20.0  # presence logit: the confidence is the crop-pose stage's own until it is calibrated
 
 OVERSAMPLING = 2  # a crop is sampled at so many points a pixel and side, then averaged: no aliasing of near objects
 
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """How a frame becomes a crop.
-
-    Attributes:
-        matrix: K of the frames, [3, 3].
-        diameter_m: Of the object.
-        near_m: Nearest distance that a place is taken for.
-        first_look_share: Frame pixels a pixel of the first look, each way.
-        crop_px: Side of the crop.
-        fill: Share of it that the diameter spans at the assumed depth.
-    """
+    """How a frame is cropped."""
 
     matrix: np.ndarray
+    """K of the frames, [3, 3]."""
     diameter_m: float
+    """Of the object."""
     near_m: float
+    """Proposals nearer than this are taken to be at this distance."""
     localisation_stride: int
+    """Frame pixels per pixel of the localisation stage, each way."""
     crop_px: int
+    """Side of the crop."""
     fill: float
+    """Fraction of the crop's side that the diameter spans at the assumed depth."""
 
 
 class CalibrationFeatures(NamedTuple):
-    """What the confidence is made of: the probability that the object is there, times that of reading it rightly then.
+    """Inputs of the calibrated confidence: P(object present) · P(pose correct | object present)."""
 
-    Attributes:
-        right: [batch, 1], logit of the second look's confidence.
-        there: [batch, 2], how clearly the last glances show the object, and the logarithm of the first look's weight.
-    """
-
-    right: Float[Tensor, "batch 1"]
-    there: Float[Tensor, "batch 2"]
+    pose_correct: Float[Tensor, "batch 1"]
+    """Logit of the crop-pose stage's own confidence."""
+    presence: Float[Tensor, "batch 2"]
+    """Mean visibility logit in the refinement pass, and log weight of the proposal."""
 
 
 class TwoStageNetwork(nn.Module):
     """Whole frame to scene code, all in one graph.
 
-    A glance at each of the likeliest places. Where the first look's weight and what the second look sees of the object
-    together say that it is, the second looks once more, at crops placed by its own answer as if that were a little
-    nearer or farther, too: each errs in its own way, so the position is their mean.
-
-    Attributes:
-        first: Reads places from frames at low resolution.
-        second: Reads poses and light from crops.
-        rightness: Weight and offset that make the sign of a right pose a logit; set when training is done.
-        presence: Weights and offset that do so with the signs that the object is there.
+    The crop-pose stage runs on a crop around each top proposal. The proposal with the highest sum of log weight and
+    visibility then goes through a refinement pass: crops at three assumed distances around the estimated position.
+    Their errors are nearly independent, so the final position is their mean.
     """
+
+    first: StageNetwork
+    """The localisation stage, on frames at low resolution."""
+    second: StageNetwork
+    """The crop-pose stage."""
+    rightness: Tensor
+    """[2], weight and offset from the feature ``pose_correct`` to a calibrated logit; set after training."""
+    presence: Tensor
+    """[3], weights and offset from the features ``presence`` to a calibrated logit; set after training."""
 
     def __init__(self, first: StageNetwork, second: StageNetwork, optics: Optics) -> None:
         super().__init__()
         self.first, self.second = first, second
         self._optics = optics
         self._matrix: Tensor
-        self.rightness: Tensor
-        self.presence: Tensor
         self.register_buffer("rightness", torch.tensor([1.0, 0.0]))
-        self.register_buffer("presence", torch.tensor([0.0, 0.0, _SURELY]))
+        self.register_buffer("presence", torch.tensor([0.0, 0.0, _UNCALIBRATED]))
         self.register_buffer("_matrix", torch.from_numpy(optics.matrix).float()[None], persistent=False)
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
-        code, signs = self.read(images)
-        sure = _probability(signs.right, self.rightness) * _probability(signs.there, self.presence)
-        return code | {CONFIDENCE: sure[:, None, None]}
+        code, features = self.uncalibrated(images)
+        pose_correct = _probability(features.pose_correct, self.rightness)
+        confidence = pose_correct * _probability(features.presence, self.presence)
+        return code | {CONFIDENCE: confidence[:, None, None]}
 
-    def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], CalibrationFeatures]:
-        """The code without its confidence's calibration, and what that is made of."""
-        seen = self.first(F.avg_pool2d(images, self._optics.localisation_stride))
-        glances = self._glance(images, seen[CANDIDATES])
-        likeliest, log_weight = _likeliest(glances[TRANSLATION], glances[_EVIDENCE], seen[CANDIDATE_LOG_WEIGHTS])
-        last = self._glance(images, likeliest * likeliest.new_tensor(SCALES)[:, None])
-        logit, evidence = torch.logit(last[CONFIDENCE].flatten(), 1e-6), last.pop(_EVIDENCE)
-        logit, evidence = (of_all.view(-1, len(SCALES)).mean(dim=1, keepdim=True) for of_all in (logit, evidence))
-        return _position_of_all(last), CalibrationFeatures(logit, torch.cat([evidence, log_weight], dim=1))
+    def uncalibrated(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> tuple[dict[str, Tensor], CalibrationFeatures]:
+        """The code with the crop-pose stage's own confidence, and the features to calibrate it with."""
+        located = self.first(F.avg_pool2d(images, self._optics.localisation_stride))
+        crops = self._crop_poses(images, located[TOP_PROPOSALS])
+        position, log_weight = _likeliest(crops[TRANSLATION], crops[_VISIBILITY], located[TOP_LOG_WEIGHTS])
+        refined = self._crop_poses(images, position * position.new_tensor(SCALES)[:, None])
+        logit, visibility = torch.logit(refined[CONFIDENCE].flatten(), 1e-6), refined.pop(_VISIBILITY)
+        logit, visibility = (values.view(-1, len(SCALES)).mean(dim=1, keepdim=True) for values in (logit, visibility))
+        return _mean_position(refined), CalibrationFeatures(logit, torch.cat([visibility, log_weight], dim=1))
 
-    def _glance(self, images: Tensor, places: Float[Tensor, "batch num 3"]) -> dict[str, Tensor]:
-        """Look at crops around places, and turn what is read there back into the frame's camera.
+    def _crop_poses(self, images: Tensor, centres: Float[Tensor, "batch num 3"]) -> dict[str, Tensor]:
+        """Crop around positions, predict poses there, and rotate them back into the frame's camera.
 
         Returns:
-            Codes of all crops, those of one image after the other, and the evidence that each shows the object.
+            Codes of all crops [batch · num, …], those of one image after the other, and the visibility in each.
         """
-        optics, place = self._optics, places.flatten(0, 1)
-        depth = place.norm(dim=1, keepdim=True).clamp(min=optics.near_m)  # along the crop camera's axis
-        matrix = self._matrix.expand(place.shape[0], 3, 3)
+        optics, centre = self._optics, centres.flatten(0, 1)
+        depth = centre.norm(dim=1, keepdim=True).clamp(min=optics.near_m)  # along the crop camera's axis
+        matrix = self._matrix.expand(centre.shape[0], 3, 3)
         side = OVERSAMPLING * optics.crop_px
-        gaze = crop_camera_at(place, optics.fill * side * depth[:, 0] / optics.diameter_m, side, matrix)
-        grid = sampling_grid(gaze, matrix, side, images.shape[3], images.shape[2])
+        crop_camera = crop_camera_at(centre, optics.fill * side * depth[:, 0] / optics.diameter_m, side, matrix)
+        grid = sampling_grid(crop_camera, matrix, side, images.shape[3], images.shape[2])
         # The crops of an image in one tall grid: no frame is copied.
-        tall = grid.view(-1, places.shape[1] * side, side, 2)
+        tall = grid.view(-1, centres.shape[1] * side, side, 2)
         fine = F.grid_sample(images, tall, padding_mode="border", align_corners=False)
-        crops = fine.unflatten(2, (places.shape[1], side)).transpose(1, 2).flatten(0, 1)
+        crops = fine.unflatten(2, (centres.shape[1], side)).transpose(1, 2).flatten(0, 1)
         code = self.second(F.avg_pool2d(crops, OVERSAMPLING))
         relative = code[TRANSLATION][:, 0]
-        seen = torch.cat([relative[:, :2] * optics.diameter_m, relative[:, 2:] * depth], dim=-1)
-        back = gaze.rotation.transpose(1, 2)
-        rotation = back @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
+        position = torch.cat([relative[:, :2] * optics.diameter_m, relative[:, 2:] * depth], dim=-1)
+        cam_from_crop = crop_camera.rotation.transpose(1, 2)
+        rotation = cam_from_crop @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
         return {name: code[name] for name in (COLOR,) if name in code} | {
-            _EVIDENCE: _evidence(code[OBJECT_COORDINATES]),
-            TRANSLATION: (back @ seen[..., None])[:, None, :, 0],
+            _VISIBILITY: _visibility(code[OBJECT_COORDINATES]),
+            TRANSLATION: (cam_from_crop @ position[..., None])[:, None, :, 0],
             ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None],
             CONFIDENCE: code[CONFIDENCE],
-            LIGHT: (back @ code[LIGHT][..., None])[..., 0],
+            LIGHT: (cam_from_crop @ code[LIGHT][..., None])[..., 0],
         }
 
 
-def _position_of_all(glances: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Of the last glances at each image the middle one, at the mean of all positions.
+def _mean_position(crops: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The code of each image's middle crop in the refinement pass, with the mean position of all of them.
 
-    The rotation stays as one of them reads it: an object's symmetric poses have no mean.
+    The rotation is not averaged: an object's symmetric poses have no mean.
     """
-    by_image = {name: value.unflatten(0, (-1, len(SCALES))) for name, value in glances.items()}
+    by_image = {name: value.unflatten(0, (-1, len(SCALES))) for name, value in crops.items()}
     code = {name: value[:, _MIDDLE] for name, value in by_image.items()}
-    position = by_image[TRANSLATION]  # [batch, glances, 1, 3]
+    position = by_image[TRANSLATION]  # [batch, crops, 1, 3]
     depth = position[..., 2:].log().mean(dim=1).exp()
     slope = (position[..., :2] / position[..., 2:]).mean(dim=1)
     return code | {TRANSLATION: torch.cat([slope * depth, depth], dim=-1)}
 
 
 def _likeliest(
-    places: Float[Tensor, "rows 1 3"], evidence: Float[Tensor, " rows"], log_weights: Float[Tensor, "batch num"]
+    positions: Float[Tensor, "rows 1 3"], visibility: Float[Tensor, " rows"], log_weights: Float[Tensor, "batch num"]
 ) -> tuple[Float[Tensor, "batch 1 3"], Float[Tensor, "batch 1"]]:
-    """Of the places of each image the one with the highest sum of evidence and log weight, and that weight."""
-    best = (evidence.view_as(log_weights) + log_weights).argmax(dim=1)
+    """Each image's position with the highest sum of visibility and log weight, and that weight."""
+    best = (visibility.view_as(log_weights) + log_weights).argmax(dim=1)
     first = torch.arange(best.shape[0], device=best.device) * log_weights.shape[1]
-    return places[first + best], log_weights.gather(1, best[:, None])
+    return positions[first + best], log_weights.gather(1, best[:, None])
 
 
-def _probability(signs: Float[Tensor, "batch signs"], weights: Float[Tensor, " values"]) -> Float[Tensor, " batch"]:
-    """Of the weighed sum as a logit; the offset is last."""
-    return torch.sigmoid(signs @ weights[:-1] + weights[-1])
+def _probability(features: Float[Tensor, "batch num"], weights: Float[Tensor, " values"]) -> Float[Tensor, " batch"]:
+    """Logistic regression; the offset is the last weight."""
+    return torch.sigmoid(features @ weights[:-1] + weights[-1])
 
 
-def _evidence(surface: Float[Tensor, "rows 4 side side"]) -> Float[Tensor, " rows"]:
-    """How surely the object is seen in a crop: mean logit of the patches that show it most clearly.
+def _visibility(coordinates: Float[Tensor, "rows 4 side side"]) -> Float[Tensor, " rows"]:
+    """How clearly a crop shows the object: mean visibility logit of the patches where it is highest.
 
-    Not the confidence that the pose is right, which is as low where a pose is hard to read as where there is nothing.
+    The confidence that the pose is correct cannot say this: it is as low for poses that are hard to estimate as for
+    crops without the object.
     """
-    return surface[:, 3].flatten(1).topk(_NUM_CLEAREST, dim=1).values.mean(dim=1)
+    return coordinates[:, 3].flatten(1).topk(_NUM_CLEAREST, dim=1).values.mean(dim=1)

@@ -21,7 +21,7 @@ from curio_train.geometry import Pose, direction_from_hemisphere, matrix_from_ya
 from curio_train.meshes.meshes import Mesh
 from curio_train.networks.base import StageNetwork
 from curio_train.networks.grid import CellGrid
-from curio_train.networks.set_detector import HEAT_MAP, CellNetwork, cell_error
+from curio_train.networks.set_detector import HEAT_MAP, SetDetector, dense_loss
 from curio_train.rendering.ground import Ground
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, YAW, Layout, SceneCode
@@ -156,7 +156,7 @@ class MeshWorld(World):
     def network(self, config: NetworkConfig) -> StageNetwork:
         """The paper's, or one that reads cell by cell."""
         if config.reading == "cells":
-            return CellNetwork(self.layout, self._slots_of_kinds, self._new_grid())
+            return SetDetector(self.layout, self._slots_of_kinds, self._new_grid())
         return super().network(config)
 
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
@@ -164,7 +164,7 @@ class MeshWorld(World):
         if HEAT_MAP not in predicted:
             return super().code_loss(predicted, true)
         grid = self._grid.to(true[TRANSLATION].device)
-        return cell_error(self.layout, self._slots_of_kinds, grid, predicted, true).mean()
+        return dense_loss(self.layout, self._slots_of_kinds, grid, predicted, true).mean()
 
     @property
     def _slots_of_kinds(self) -> tuple[tuple[int, ...], ...]:

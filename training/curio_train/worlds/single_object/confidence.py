@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from curio_train.metrics.certainty import calibration
+from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.networks.two_stage.network import CalibrationFeatures, TwoStageNetwork
 from curio_train.scene_code import poses
@@ -33,17 +33,17 @@ def calibrate(network: nn.Module, world: SingleObjectWorld, cache: Path) -> None
     for step in range(steps):
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
-        code, signs = network.read(batch.images.clamp(0, 1))
+        code, features = network.uncalibrated(batch.images.clamp(0, 1))
         errors = map(add_or_add_s_m, poses(code), poses(batch.code), repeat(points), repeat(kind.info))
         right += [error < ADD_THRESHOLD * kind.diameter_m for error in errors]
-        full.append(signs)
+        full.append(features)
         behind = source.backgrounds(steps + step, _BATCH_SIZE)
         assert behind is not None  # of a gaze's world there always are
-        empty.append(network.read(behind.clamp(0, 1))[1])
-    network.rightness.copy_(_fit([signs.right for signs in full], right))
+        empty.append(network.uncalibrated(behind.clamp(0, 1))[1])
+    network.rightness.copy_(_fit([features.pose_correct for features in full], right))
     there = [True] * _NUM_FRAMES + [False] * _NUM_FRAMES
-    network.presence.copy_(_fit([signs.there for signs in (*full, *empty)], there))
+    network.presence.copy_(_fit([features.presence for features in (*full, *empty)], there))
 
 
-def _fit(signs: list[Tensor], is_so: list[bool]) -> Tensor:
-    return torch.tensor(calibration(torch.cat(signs).cpu().numpy(), is_so))
+def _fit(features: list[Tensor], correct: list[bool]) -> Tensor:
+    return torch.tensor(fit_calibration(torch.cat(features).cpu().numpy(), correct))

@@ -33,7 +33,7 @@ from curio_train.data.photographs import UnlabelledPhotographs
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.metrics.poses import ADD_THRESHOLD, symmetry_poses
 from curio_train.networks.base import StageNetwork
-from curio_train.networks.grid import STRIDE, CellGrid, gather_cells, heat_map_loss, of_cells
+from curio_train.networks.grid import STRIDE, CellGrid, gather_cells, heat_map_loss, per_cell
 from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES, OBJECT_COORDINATES_STRIDE, CropPoseNetwork
 from curio_train.networks.two_stage.localise import HEAT_MAP, PROPOSALS, LocalisationNetwork
 from curio_train.networks.two_stage.network import Optics, TwoStageNetwork
@@ -165,7 +165,7 @@ class LocalisationStage(SingleObjectWorld):
         things in the picture are two hypotheses, and never a mean between them.
         """
         place, grid = true[TRANSLATION], _grid(self).to(true[TRANSLATION].device)
-        here = grid.share(grid.project(place))
+        here = grid.splat_weights(grid.project(place))
         said, wanted = gather_cells(predicted[PROPOSALS], here), place[:, :, None]  # [batch, objects, 4, 3]
         slope = said[..., :2] / said[..., 2:] - wanted[..., :2] / wanted[..., 2:]
         depth = said[..., 2].log() - wanted[..., 2].log()
@@ -303,8 +303,8 @@ class CropPoseStage(SingleObjectWorld):
         """
         seen = F.avg_pool2d(true[OBJECT_COORDINATES][:, 3:], STRIDE // OBJECT_COORDINATES_STRIDE).flatten(1)
         share = seen / seen.sum(dim=1, keepdim=True).clamp(min=1)
-        numbers = (predicted[of_cells(ROTATION_6D)] - rotation_6d[:, None]).square().sum(dim=-1)
-        offset, depth = self._place_error(predicted[of_cells(TRANSLATION)], true[TRANSLATION], true[ASSUMED_M])
+        numbers = (predicted[per_cell(ROTATION_6D)] - rotation_6d[:, None]).square().sum(dim=-1)
+        offset, depth = self._place_error(predicted[per_cell(TRANSLATION)], true[TRANSLATION], true[ASSUMED_M])
         return (share * (_NUMBERS_WEIGHT * numbers + offset + depth)).sum(dim=1)
 
     def _place_error(self, place: Tensor, true_place: Tensor, assumed: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,59 @@
+"""The command ``curio-doctor``. Heavy packages are imported only once its arguments are understood."""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from rich.console import Console
+
+from curio_train.commands.running import CACHE, answer
+from curio_train.errors import UsageError
+
+
+@dataclass(frozen=True)
+class DoctorCommand:
+    """Check this machine, and a mesh, a camera file, photographs and a model where they are given."""
+
+    mesh: Path | None = None
+    """Mesh file: PLY, OBJ, STL, glTF or OFF."""
+    mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
+    """Unit of its coordinates; the file's own, or metres, unless given."""
+    camera: Path | None = None
+    """Camera JSON, or BOP's camera.json."""
+    photos: Path | None = None
+    """Folder of photographs, taken with that camera where one is given."""
+    background: Path | None = None
+    """Photograph of the empty scene, taken as the others were."""
+    model: Path | None = None
+    """Model folder, version folder or .onnx file, made for that mesh and camera where they are given."""
+    symmetries: Path | None = None
+    """File for the symmetries of the mesh's shape, as an entry of BOP's models_info.json."""
+    cache: Path = CACHE
+    """Where image sets that a world draws once will be kept."""
+
+
+def doctor(arguments: Sequence[str] | None = None) -> None:
+    """``curio-doctor …``: exit status 1 where something will not work."""
+    command = tyro.cli(DoctorCommand, args=arguments, prog="curio-doctor")
+    sys.exit(answer(lambda _: _examine(command)))
+
+
+def _examine(command: DoctorCommand) -> int:
+    from curio_train.doctor.examine import Subjects, examine, save_symmetries
+
+    if command.symmetries is not None and command.mesh is None:
+        raise UsageError(f"--symmetries {command.symmetries}: found no --mesh to find them from")
+    colours = {"good": "green", "warning": "yellow", "bad": "bold red"}
+    console, status = Console(highlight=False, soft_wrap=True), 0
+    names = [field.name for field in dataclasses.fields(Subjects)]
+    for finding in examine(Subjects(**{name: getattr(command, name) for name in names}), command.cache):
+        console.print(f"[{colours[finding.state]}]{finding.state:>7}[/]  [bold]{finding.subject}[/]: ", end="")
+        console.print(str(finding), markup=False)
+        status = max(status, finding.state == "bad")
+    if command.symmetries is not None and command.mesh is not None:
+        save_symmetries(command.mesh, command.mesh_unit, command.symmetries)
+    return status

@@ -1,0 +1,55 @@
+"""The command ``curio-eval``. Heavy packages are imported only once its arguments are understood."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from curio_train.commands.running import CACHE, answer, warn
+
+
+@dataclass(frozen=True)
+class EvaluateCommand:
+    """Score a run or a model on held-out images of its world, beside the same network untrained."""
+
+    path: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
+    """A run folder, a model folder (its latest version), a version's folder, or an .onnx file."""
+    split: Literal["train", "validation", "test"] = "test"
+    """Which images of the world."""
+    num_images: int = 500
+    """How many images."""
+    data: Path | None = None
+    """BOP data set whose real frames are scored as well; needed for an exported LineMOD model."""
+    bop_results: Path | None = None
+    """Folder for a results file of the real frames in BOP's format."""
+    refine: FlagCreatePairsOff[bool] = False
+    """Score the poses once more after rendering and comparing; needs the renderer, as serving never does."""
+    json: FlagCreatePairsOff[bool] = False
+    """Print the result as one JSON object on the last line."""
+    cache: Path = CACHE
+    """Where image sets that a world draws once are kept."""
+
+
+def evaluate(arguments: Sequence[str] | None = None) -> None:
+    """``curio-eval RUN_OR_MODEL …``; exit status as of :func:`~curio_train.commands.train.train`."""
+    command = tyro.cli(EvaluateCommand, args=arguments, prog="curio-eval")
+    sys.exit(answer(lambda _: _evaluate(command)))
+
+
+def _evaluate(command: EvaluateCommand) -> int:
+    from curio_train.evaluation.evaluate import evaluate
+    from curio_train.evaluation.tables import print_evaluation
+
+    given = {name: getattr(command, name) for name in ("split", "num_images", "data", "bop_results", "refine", "cache")}
+    with Console(stderr=True).status("") as status:
+        result = evaluate(command.path, **given, progress=status.update, warn=warn)
+    print_evaluation(result, Console())
+    if command.json:
+        print(json.dumps(result))
+    return 0

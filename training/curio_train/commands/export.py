@@ -1,0 +1,45 @@
+"""The command ``curio-export``. Heavy packages are imported only once its arguments are understood."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from curio_train.commands.running import answer
+
+
+@dataclass(frozen=True)
+class ExportCommand:
+    """Write a run's network as the next version of a model that any ONNX runtime can serve."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The run folder. Its training images are not needed."""
+    out: Path = Path("models")
+    """Folder of models; the model goes to OUT/NAME/VERSION/model.onnx."""
+    name: str | None = None
+    """Of the model; the world's name, or LineMOD's class, unless given."""
+    half: FlagCreatePairsOff[bool] = False
+    """Store weights as float16: half the size, computed with in float32."""
+
+
+def export(arguments: Sequence[str] | None = None) -> None:
+    """``curio-export RUN …``; exit status as of :func:`~curio_train.commands.train.train`."""
+    command = tyro.cli(ExportCommand, args=arguments, prog="curio-export")
+    sys.exit(answer(lambda _: _export(command)))
+
+
+def _export(command: ExportCommand) -> int:
+    from curio_train.export.graph import export
+
+    with Console(stderr=True).status("tracing, and comparing torch with onnxruntime"):
+        done = export(command.run, command.out, command.name, half=command.half)
+    print(
+        f"{done.path}: {done.num_bytes / 1e6:.1f} MB, differs from torch by at most {done.parity_error:.2g}"
+        + (f", from the float32 weights by {done.rounding_error:.2g}" if command.half else "")
+    )
+    return 0

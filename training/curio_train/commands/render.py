@@ -1,0 +1,56 @@
+"""The command ``curio-render``. Heavy packages are imported only once its arguments are understood."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from curio_train.commands.running import answer
+
+
+@dataclass(frozen=True)
+class RenderCommand:
+    """Draw scenes for people: what curio-detect found, or scene codes of generated worlds."""
+
+    scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
+    """Lines of curio-detect, or of {"world": NAME, "code": {FIELD: numbers}}; or one such JSON object."""
+    out: Path
+    """Folder for the pictures, one PNG a scene."""
+    mesh: tuple[str, ...] = ()
+    """Mesh file of the objects, or NAME=FILE for each kind of them; a code's world brings its own."""
+    mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
+    """Unit of their coordinates; the file's own, or metres, unless given."""
+    world: str | None = None
+    """Generated world that detections are of: its meshes, light and ground."""
+    height: int | None = None
+    """Of the pictures in pixels; the scene's own unless given."""
+    turn_deg: float = 0.0
+    """Carries the camera round the objects, degrees; 90 is the novel view that worlds are scored from."""
+    over_photograph: FlagCreatePairsOff[bool] = False
+    """Draw over the photograph that the objects were found in."""
+    path_traced: FlagCreatePairsOff[bool] = False
+    """Draw with stock Mitsuba's path tracer, shadows and light between surfaces included."""
+    samples: int = 64
+    """Rays or paths a pixel."""
+
+
+def render(arguments: Sequence[str] | None = None) -> None:
+    """``curio-render SCENES --out DIR …``; exit status as of :func:`~curio_train.commands.train.train`."""
+    command = tyro.cli(RenderCommand, args=arguments, prog="curio-render")
+    sys.exit(answer(lambda _: _render(command)))
+
+
+def _render(command: RenderCommand) -> int:
+    from curio_train.drawing.album import draw
+    from curio_train.drawing.pictures import RenderOptions
+
+    wish = RenderOptions(
+        command.height, command.turn_deg, command.over_photograph, command.path_traced, command.samples
+    )
+    for path in draw(command.scenes, command.out, command.mesh, command.mesh_unit, command.world, wish):
+        print(path)
+    return 0

@@ -1,0 +1,152 @@
+"""The command ``curio-train``. Heavy packages are imported only once its arguments are understood."""
+
+import argparse
+import dataclasses
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, get_type_hints
+
+import tyro
+from tyro.conf import OmitArgPrefixes
+
+from curio_train.capture.options import CalibrateCommand
+from curio_train.commands.field_help import join_help_lines
+from curio_train.commands.project_file import with_project
+from curio_train.commands.running import CACHE, answer, tell, warn
+from curio_train.config import NetworkConfig, Preset, Recipe, RunConfig, WorldOptions, preset_recipe
+from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
+from curio_train.learning.runs.interruption import Interruption
+from curio_train.worlds import WORLDS
+
+if TYPE_CHECKING:
+    from curio_train.capture.structure import Structure
+
+
+@dataclass(frozen=True)
+class Session:
+    """Where and how this process trains; may differ between the sessions of one run."""
+
+    out: Path | None = None
+    """Folder of the new run; runs/WORLD-METHOD-SEED unless given."""
+    project: Path | None = None
+    """TOML file of flags by their names; those typed beside it win."""
+    resume: Path | None = None
+    """Folder of a run to go on with, with its own configuration; budgets may be given anew."""
+    cache: Path = CACHE
+    """Where image sets that a world draws once are kept."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """auto takes CUDA where there is one."""
+    checkpoint_minutes: float = 1.0
+    """Minutes of training between checkpoints."""
+
+
+@dataclass(frozen=True)
+class TrainCommand:
+    """Learn a world's poses from its images."""
+
+    config: OmitArgPrefixes[RunConfig]
+    session: OmitArgPrefixes[Session] = Session()
+
+
+def train(arguments: Sequence[str] | None = None) -> None:
+    """``curio-train WORLD …``: exit status 0 done, 1 failed, 2 wrong call, 128 + signal when interrupted."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if given[:1] == ["capture"] and "--calibrate" in given:
+        calibration = tyro.cli(CalibrateCommand, args=given[1:], prog="curio-train capture")
+        sys.exit(answer(lambda _: _calibrate(calibration)))
+    sys.exit(answer(lambda interruption: _train(_parse(given), interruption)))
+
+
+def _calibrate(command: CalibrateCommand) -> int:
+    from curio_train.commands.calibrate import run
+
+    def by_objects(structure: "Structure", models: Path, data: Path | None) -> "tuple[Structure, str]":
+        from curio_train.evaluation.scene_scale import scale_by_objects
+
+        return scale_by_objects(structure, models, data, tell)
+
+    print(run(command, by_objects))
+    return 0
+
+
+def _parse(arguments: list[str]) -> TrainCommand:
+    """The call as typed; what it leaves out comes from the preset, or from the run it resumes."""
+    arguments = with_project(arguments, _path_flags())
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", nargs="?", default="laptop")
+    first.add_argument("--resume", nargs="?", type=Path)
+    seen, _ = first.parse_known_args(arguments)
+
+    preset: Preset = "paper" if seen.preset == "paper" else "laptop"  # an unknown preset is tyro's to refuse
+    defaults = {
+        name: RunConfig(_unset(kind), method=kind.default_method, recipe=preset_recipe(preset, kind))
+        for name, kind in WORLDS.items()
+    }
+    stored = load_config(seen.resume) if seen.resume else None
+    if stored is not None:
+        defaults[world_name(stored)] = stored
+    commands = tyro.extras.subcommand_type_from_defaults(
+        {name: TrainCommand(config) for name, config in defaults.items()},
+        {name: (kind.__doc__ or "").partition("\n\n")[0] for name, kind in WORLDS.items()},
+    )
+    join_help_lines([RunConfig, Recipe, NetworkConfig])
+    command: TrainCommand = tyro.cli(
+        commands,
+        args=arguments,
+        prog="curio-train",
+        description=f"Learn to read poses from images without labels. Worlds: {', '.join(WORLDS)}.",
+    )
+    if stored is not None:
+        refuse_other(stored, command.config, seen.resume)
+    return command
+
+
+def _path_flags() -> set[str]:
+    """Names of all flags that are files or folders."""
+    hints = [hint for kind in (*WORLDS.values(), RunConfig, Session) for hint in get_type_hints(kind).items()]
+    return {name for name, kind in hints if kind in (Path, Path | None, tuple[Path, ...])}
+
+
+def _unset(kind: type[WorldOptions]) -> WorldOptions:
+    """Options of a world with those that the user has to give marked as missing."""
+    required = [field.name for field in dataclasses.fields(kind) if field.default is field.default_factory]
+    return kind(**dict.fromkeys(required, tyro.MISSING))
+
+
+def _train(command: TrainCommand, interruption: Interruption) -> int:
+    from curio_train.commands.finish import end
+    from curio_train.commands.prepare import prepared
+    from curio_train.learning.loop import Outcome
+    from curio_train.learning.runs.session import learn
+    from curio_train.learning.runs.without_training import draw_templates
+
+    session = command.session
+    config = command.config if session.resume else prepared(command.config, session.cache, warn, tell)
+    path = session.resume or session.out or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
+    if config.terms.templates:
+        seconds = draw_templates(config, path, session.cache).seconds
+        print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
+        tell(end(path, config, session.cache, warn))
+        return 0
+    outcome, course = learn(
+        config,
+        path,
+        interruption,
+        resume=session.resume is not None,
+        cache=session.cache,
+        device=session.device,
+        checkpoint_minutes=session.checkpoint_minutes,
+    )
+    if int(os.environ.get("RANK", "0")) == 0:
+        loss = "" if course.image_loss is None else f", image loss {course.image_loss:.4g}"
+        print(f"{path}: {outcome.value} after {course.images:,} images in {course.seconds / 60:.1f} minutes{loss}")
+        if outcome is Outcome.INTERRUPTED:
+            print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
+        else:
+            tell(end(path, config, session.cache, warn))
+    if outcome is Outcome.INTERRUPTED and interruption.signum is not None:
+        return 128 + interruption.signum
+    return 0

@@ -1,0 +1,69 @@
+"""Confidence calibration, and AUROC of telling frames with the object from frames without."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize
+from scipy.stats import rankdata
+
+NUM_BINS = 10
+_REGULARISATION = 1e-4
+
+
+def calibration_error(confidences: Sequence[float], correct: Sequence[bool]) -> float:
+    """Expected calibration error (Naeini et al. 2015) in ten equal bins: mean |confidence - fraction correct|.
+
+    Args:
+        confidences: In [0, 1].
+        correct: Whether each prediction was.
+
+    Raises:
+        ValueError: There are no predictions.
+    """
+    found, hits = np.asarray(confidences, dtype=np.float64), np.asarray(correct, dtype=np.float64)
+    if len(found) == 0:
+        raise ValueError("calibration of no confidences: there must be at least one")
+    bins = np.minimum((found * NUM_BINS).astype(int), NUM_BINS - 1)
+    gaps = [abs((found - hits)[bins == number].sum()) for number in range(NUM_BINS)]
+    return float(sum(gaps) / len(found))
+
+
+def fit_calibration(features: ArrayLike, correct: Sequence[bool]) -> list[float]:
+    """Logistic regression from features to the probability of being correct (Platt 1999).
+
+    A few hundred predictions determine a few numbers. No weight is negative, because every feature should raise the
+    probability.
+
+    Args:
+        features: [predictions, features], logits or the like.
+        correct: Whether each prediction was.
+
+    Returns:
+        A weight for each feature, then the offset.
+    """
+    found, hits = np.asarray(features, dtype=np.float64), np.asarray(correct, dtype=np.float64)
+    found = np.concatenate([found, np.ones((len(found), 1))], axis=1)
+    start = np.eye(1, found.shape[1])[0]
+
+    def loss(weights: np.ndarray) -> float:
+        logits = found @ weights
+        # Regularised towards the first feature alone: predictions may be too few, or separable.
+        penalty = _REGULARISATION * np.square(weights - start).sum()
+        return float(np.mean(np.logaddexp(0, logits) - hits * logits) + penalty)
+
+    bounds = [(0.0, None)] * (len(start) - 1) + [(None, None)]
+    weights: list[float] = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x.tolist()
+    return weights
+
+
+def auroc(with_object: Sequence[float], without: Sequence[float]) -> float:
+    """AUROC: how often a frame with the object has the higher confidence than one without; ties count half.
+
+    Raises:
+        ValueError: One of the two is empty.
+    """
+    if len(with_object) == 0 or len(without) == 0:
+        raise ValueError("AUROC needs frames with the object and frames without")
+    ranks = rankdata([*with_object, *without])[: len(with_object)]
+    return float((ranks.sum() / len(with_object) - (len(with_object) + 1) / 2) / len(without))

@@ -1,0 +1,94 @@
+"""Virtual crop cameras in torch: perspective-correct crops of a frame, inside an exported graph as well.
+
+K is in pixels with pixel centres at integer coordinates; the camera frame is OpenCV's: x right, y down, z forward, in
+metres.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from curio_train.geometry import rotation_between
+
+
+def project(points: Float[Tensor, "*#batch n 3"], matrix: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "... n 2"]:
+    """Pixels of points in the camera frame (metres). Points must lie in front: z > 0."""
+    homogeneous = points @ matrix.transpose(-1, -2)
+    return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+def rays(matrix: Float[Tensor, "*batch 3 3"], width: int, height: int) -> Float[Tensor, "*batch {height} {width} 3"]:
+    """The point at depth z = 1 that each pixel's centre sees, camera frame."""
+    pixels = _pixel_centres(matrix, width, height)
+    return (pixels @ inverse(matrix).transpose(-1, -2)).unflatten(-2, (height, width))
+
+
+def inverse(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """K⁻¹, written out: exact for K's triangle, and without a solver in an exported graph."""
+    fx, skew, cx = matrix[..., 0, :].unbind(-1)
+    _, fy, cy = matrix[..., 1, :].unbind(-1)
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    rows = [1 / fx, -skew / (fx * fy), (skew * cy / fy - cx) / fx, zero, 1 / fy, -cy / fy, zero, zero, one]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def _pixel_centres(like: Tensor, width: int, height: int) -> Tensor:
+    """Homogeneous pixel coordinates [height * width, 3] row after row."""
+    v, u = torch.meshgrid(
+        torch.arange(height, dtype=like.dtype, device=like.device),
+        torch.arange(width, dtype=like.dtype, device=like.device),
+        indexing="ij",
+    )
+    return torch.stack([u, v, torch.ones_like(u)], dim=-1).flatten(0, 1)
+
+
+class CropCamera(NamedTuple):
+    """A virtual camera at the frame camera's position that looks at one point."""
+
+    rotation: Tensor
+    """crop_from_cam, [batch, 3, 3]; its transpose turns a pose back into the frame's camera."""
+    matrix: Tensor
+    """K of the crop, [batch, 3, 3]; the principal point is the crop's centre."""
+    homography: Tensor
+    """From frame pixels to crop pixels, K_crop R K⁻¹, [batch, 3, 3]."""
+
+
+def crop_camera_at(
+    direction: Float[Tensor, "batch 3"],
+    focal_px: Float[Tensor, " batch"],
+    size: int,
+    matrix: Float[Tensor, "batch 3 3"],
+) -> CropCamera:
+    """The camera that looks along ``direction`` with the smallest turn from the frame's optical axis.
+
+    Args:
+        direction: Towards the crop's centre, camera frame, any length, in front (z > 0).
+        focal_px: Of the crop. An object of diameter d at distance z then covers focal_px * d / z pixels.
+        size: Width and height of the crop, pixels.
+        matrix: K of the frame.
+    """
+    axis = direction.new_tensor([0.0, 0.0, 1.0]).expand_as(direction)
+    rotation = rotation_between(direction, axis)
+    zero, one = torch.zeros_like(focal_px), torch.ones_like(focal_px)
+    centre = torch.full_like(focal_px, (size - 1) / 2)
+    rows = [focal_px, zero, centre, zero, focal_px, centre, zero, zero, one]
+    crop = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    return CropCamera(rotation, crop, crop @ rotation @ inverse(matrix))
+
+
+def sampling_grid(
+    crop: CropCamera, matrix: Float[Tensor, "batch 3 3"], size: int, frame_width: int, frame_height: int
+) -> Float[Tensor, "batch {size} {size} 2"]:
+    """Where ``grid_sample(frame, grid, align_corners=False)`` must look for each pixel of the crop.
+
+    ``align_corners=False`` puts -1 and 1 at the image's borders, which lie half a pixel outside the pixel centres. The
+    inverse homography K Rᵀ K_crop⁻¹ is written out: no solver then enters an exported graph.
+    """
+    seen = rays(crop.matrix, size, size).flatten(1, 2)
+    frame = seen @ crop.rotation @ matrix.transpose(-1, -2)
+    # Behind the frame's camera there is nothing to see: such pixels are sent far outside instead of mirrored into it.
+    depth = frame[..., 2:].clamp(min=1e-6)
+    border = frame.new_tensor([frame_width, frame_height])
+    return ((2 * frame[..., :2] / depth + 1) / border - 1).unflatten(1, (size, size))
