@@ -25,7 +25,7 @@ LAMP = (0.0, -0.7, -0.7)
 
 _MARGIN_PX = 16  # of crops in which templates are shifted, to each side
 _OVERSAMPLING = 2
-_STEPS, _LAST_STEPS = 8, 6
+_STEPS, _LAST_STEPS = 5, 4
 _ALIKE_COS = 0.94  # 20 degrees between the rotations of hypotheses at one place
 _ONE_PLACE = 0.5  # diameters
 _SHARPNESS = 20.0  # of the neighbours' weights, a unit of score
