@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 from curio_train.errors import CheckpointError, UsageError
+from curio_train.export.onnx import OnnxModel, to_onnx
 from curio_train.templates.alignment import Aligned, align, with_gradient
 from curio_train.templates.build import template_network
 from curio_train.templates.descriptors import Descriptors
 from curio_train.templates.geometry import Geometry, viewpoints
 from curio_train.templates.localiser import RANK, Localiser
-from curio_train.templates.network import TemplateNetwork
+from curio_train.templates.network import STEPS, TemplateNetwork
 from curio_train.templates.trunk import FINE_WIDTH, Trunk
 from curio_train.worlds import build
 from curio_train.worlds.options import CirclesOptions
@@ -105,8 +106,8 @@ def test_the_localiser_finds_the_template_it_holds() -> None:
     assert float(found.score[0, 0]) > 0.9
 
 
-def _random_network() -> TemplateNetwork:
-    network, random = TemplateNetwork(GEOMETRY), torch.Generator().manual_seed(0)
+def _random_network(steps: tuple[int, int] = STEPS) -> TemplateNetwork:
+    network, random = TemplateNetwork(GEOMETRY, steps), torch.Generator().manual_seed(0)
     network.trunk.load_state_dict(Trunk.pretrained().state_dict())
     for name, buffer in (*network.localiser.named_buffers(), *network.bank.named_buffers()):
         if name.startswith(("filters", "weights", "points")):
@@ -124,6 +125,31 @@ def test_a_frame_is_read_the_same_alone_and_among_others() -> None:
     for name, values in both.items():
         assert values.isfinite().all()
         torch.testing.assert_close(values[1:], alone[name], atol=1e-3, rtol=1e-3)
+
+
+class _Graph(torch.nn.Module):
+    """The network with a camera's pixels as its input, as an export has it."""
+
+    def __init__(self, network: TemplateNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(self.network(image.permute(0, 3, 1, 2).float() / 255).values())
+
+
+def test_the_exported_graph_equals_torch_for_any_batch() -> None:
+    graph, random = _Graph(_random_network((1, 1))).eval(), np.random.default_rng(0)
+    names = ["translation_m", "rotation_6d", "light", "confidence"]
+    model = OnnxModel(to_onnx(graph, 640, 480, names).SerializeToString(), "the graph")
+    coarse = torch.from_numpy(random.integers(0, 255, (3, 3, 60, 80))).float()
+    smooth = torch.nn.functional.interpolate(coarse, (480, 640), mode="bilinear")
+    images = smooth.round().byte().permute(0, 2, 3, 1).contiguous()
+    with torch.no_grad():
+        expected = dict(zip(names, graph(images), strict=True))
+    found = model(images.numpy())
+    for name in names:
+        torch.testing.assert_close(found[name], expected[name], atol=1e-3, rtol=1e-3)
 
 
 def test_templates_are_of_one_object_in_six_degrees_of_freedom() -> None:

@@ -20,12 +20,14 @@ NUM_HYPOTHESES = 3
 NUM_NEIGHBOURS = 12
 """Templates around the best hypothesis whose answers are averaged."""
 
+STEPS = (5, 4)
+"""Of the alignment: of every hypothesis, then of the best one with its neighbours."""
+
 LAMP = (0.0, -0.7, -0.7)
 """The light that templates are drawn under and that is answered: it is not read from images."""
 
 _MARGIN_PX = 16  # of crops in which templates are shifted, to each side
 _OVERSAMPLING = 2
-_STEPS, _LAST_STEPS = 5, 4
 _ALIKE_COS = 0.94  # 20 degrees between the rotations of hypotheses at one place
 _ONE_PLACE = 0.5  # diameters
 _SHARPNESS = 20.0  # of the neighbours' weights, a unit of score
@@ -79,10 +81,16 @@ class TemplateNetwork(nn.Module):
     _matrix: Tensor
     _lamp: Tensor
 
-    def __init__(self, geometry: Geometry) -> None:
+    def __init__(self, geometry: Geometry, steps: tuple[int, int] = STEPS) -> None:
+        """Build for frames and an object; all templates are still empty.
+
+        Args:
+            geometry: Of frames and object.
+            steps: See :data:`STEPS`.
+        """
         super().__init__()
         self.trunk, self.localiser, self.bank = Trunk(), Localiser(geometry), Bank()
-        self.geometry = geometry
+        self.geometry, self._steps = geometry, steps
         self.register_buffer("depth_factor", torch.ones(()))
         self.register_buffer("rightness", torch.tensor([1.0, 0.0, 0.0]))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]))
@@ -159,7 +167,7 @@ class TemplateNetwork(nn.Module):
         maps = with_gradient(self.bank.fine(self.trunk(crops)[0]))
         start = self._in_crop(poses.rotation, back, depth)
         nearest = (start.rotation.flatten(1) @ self.bank.rotations.flatten(1).T).argmax(dim=1)
-        found = align(maps, *self.bank.surface(nearest), start, focal_px, _STEPS)
+        found = align(maps, *self.bank.surface(nearest), start, focal_px, self._steps[0])
         return Poses(*self._in_frame(found, back), found.score, poses.place)
 
     def _averaged(self, images: Tensor, best: Poses) -> tuple[Poses, Float[Tensor, " batch"]]:
@@ -170,7 +178,7 @@ class TemplateNetwork(nn.Module):
         near = (start.rotation.flatten(1) @ self.bank.rotations.flatten(1).T).topk(NUM_NEIGHBOURS, dim=1).indices
         start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in start))
         maps, focal_px = (of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in (maps, focal_px))
-        found = align(maps, *self.bank.surface(near.flatten()), start, focal_px, _LAST_STEPS)
+        found = align(maps, *self.bank.surface(near.flatten()), start, focal_px, self._steps[1])
         rotation, position, score = (of_all.unflatten(0, (-1, NUM_NEIGHBOURS)) for of_all in found)
         weight = (_SHARPNESS * score).softmax(dim=1)
         log_depth = position[..., 2].clamp(min=1e-3).log()
