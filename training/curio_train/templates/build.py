@@ -28,6 +28,7 @@ from curio_train.templates.network import TemplateNetwork
 from curio_train.templates.trunk import COARSE_STRIDE, FINE_STRIDE, Trunk
 from curio_train.worlds.base import World
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.viewpoints import upper_views
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _NUM_FRAMES, _NUM_CROPS = 24, 256  # of backgrounds
@@ -41,7 +42,7 @@ def template_network(world: World) -> TemplateNetwork:
     """A network for a world's frames and object, empty until :func:`fill` or a checkpoint fills it.
 
     Raises:
-        UsageError: The world is not of one object that is read in two stages.
+        UsageError: The world is not of one object that is read in two stages, or templates cannot show the object.
     """
     if not isinstance(world, TwoStageWorld):
         raise UsageError(
@@ -50,6 +51,11 @@ def template_network(world: World) -> TemplateNetwork:
         )
     assert world.camera.matrix is not None
     thing = world.object
+    if thing.painted or thing.views is not upper_views:
+        raise UsageError(
+            f"--method templates: templates show {thing.kind.name} from above and in the colours of its mesh; capture "
+            "needs a mesh with colours, and --upright"
+        )
     return TemplateNetwork(
         Geometry(
             world.camera.matrix,
