@@ -15,10 +15,13 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from curio_train.commands import view as view_command
 from curio_train.data.clutter import dead_leaves_texture
 from curio_train.drawing.pictures import RenderOptions, SceneContext, picture
-from curio_train.drawing.scenes import Placed, Scene
+from curio_train.drawing.scenes import Placed, Scene, read_scenes
+from curio_train.errors import DataError
 from curio_train.geometry import Pose
+from curio_train.meshes.meshes import load_mesh
 from curio_train.meshes.shapes import chair
 from curio_train.viewing.saving import save
 from scipy.spatial.transform import Rotation
@@ -30,7 +33,9 @@ K = np.array([[400.0, 0, 159.5], [0, 400.0, 119.5], [0, 0, 1]])
 TRUE = Pose(Rotation.from_euler("xyz", [160, 35, 10], degrees=True).as_matrix(), np.array([0.01, 0.02, 0.6]))
 WINDOW = (1600, 800)
 
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine; .ci/run installs it where it can")
+needs_browser = pytest.mark.skipif(
+    BROWSER is None, reason="no chromium on this machine; .ci/run installs it where it can"
+)
 
 
 @pytest.fixture(scope="module")
@@ -45,19 +50,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     clutter = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
     dead_leaves_texture(clutter, np.random.default_rng(2))
     scene = Scene("photograph", WIDTH, HEIGHT, K, (Placed("chair", TRUE),), None, folder / "photograph.png")
-    context = SceneContext({"chair": colored(folder / "chair.ply")})
+    context = SceneContext({"chair": load_mesh(folder / "chair.ply", "m")})
     drawn = picture(scene, context, RenderOptions(), photograph=(255 * clutter.clip(0, 1)).astype(np.uint8))
     cv2.imwrite(str(folder / "photograph.png"), drawn[..., ::-1])
     off = Rotation.from_rotvec([4.0, -5.0, 3.0], degrees=True).as_matrix()
-    wrong = Pose(off @ TRUE.rotation, TRUE.translation_m + [0.006, -0.005, 0.005])
-    save(Scene("", WIDTH, HEIGHT, K, (Placed("chair", wrong),), None, folder / "photograph.png"), folder / "found.jsonl")
+    wrong = Pose(off @ TRUE.rotation, TRUE.translation_m + np.array([0.006, -0.005, 0.005]))
+    found = Scene("", WIDTH, HEIGHT, K, (Placed("chair", wrong),), None, folder / "photograph.png")
+    save(found, folder / "found.jsonl")
     return folder
-
-
-def colored(path: Path) -> Any:
-    from curio_train.meshes.meshes import load_mesh
-
-    return load_mesh(path, "m")
 
 
 class Command:
@@ -145,6 +145,7 @@ def drag(page: Any, start: np.ndarray, end: np.ndarray) -> None:
     page.mouse.up()
 
 
+@needs_browser
 def test_drag_fit_save_and_reload(files: Path, view: Callable[..., Command], browser: Any) -> None:
     out = files / "edited.jsonl"
     command = view(files / "found.jsonl", "--mesh", files / "chair.ply", "--out", out)
@@ -153,14 +154,14 @@ def test_drag_fit_save_and_reload(files: Path, view: Callable[..., Command], bro
     before, seen = loss(page), re_rendering(page)
     (record,) = [json.loads(line) for line in (files / "found.jsonl").read_text().splitlines()]
     start_pose = Pose(*(np.array(record["detections"][0][name]) for name in ("rotation", "translation_m")))
-    start, end = gizmo_arrow_px(start_pose, 0.6 * colored(files / "chair.ply").diameter_m)
+    start, end = gizmo_arrow_px(start_pose, 0.6 * load_mesh(files / "chair.ply", "m").diameter_m)
     grip = start + 0.8 * (end - start)
     drag(page, grip, grip + 0.15 * (end - start))
     until(lambda: loss(page) != before and re_rendering(page) != seen)
     other.close()  # a browser that leaves in the middle
     page.get_by_role("button", name="fit this object").click()
     page.get_by_text("fit: done").wait_for(timeout=120_000)
-    assert loss(page) < before / 2
+    until(lambda: loss(page) < before / 2)
     page.get_by_role("button", name="save the code").click()
     page.get_by_text("saved to").wait_for()
     (saved,) = [json.loads(line) for line in out.read_text().splitlines()]
@@ -170,4 +171,43 @@ def test_drag_fit_save_and_reload(files: Path, view: Callable[..., Command], bro
     assert np.degrees(turned) < 2
     page.reload()
     page.get_by_text("image loss").wait_for(timeout=60_000)
-    assert loss(page) < before / 2
+    until(lambda: loss(page) < before / 2)
+
+
+@needs_browser
+def test_a_world_and_a_photograph_with_a_model(files: Path, view: Callable[..., Command], browser: Any) -> None:
+    page = opened(browser, view("chairs", "--out", files / "chairs.jsonl").url)
+    assert page.get_by_text("000000-chairs").is_visible()
+    assert loss(page) < 20  # rendered from its own code: what is left is sampling noise
+    sample = min((ROOT / "samples").glob("*.jpg"), default=None) or min((ROOT / "samples").glob("*.png"))
+    camera = ROOT / "samples" / "camera.json"
+    given = [sample, "--model", ROOT / "models" / "ape", "--camera", camera, "--mesh", files / "chair.ply"]
+    page = opened(browser, view(*given, "--out", files / "ape.jsonl").url)
+    assert page.get_by_text("640x480 pixels").is_visible()
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    with pytest.raises(SystemExit) as exit_:
+        view_command.view([str(argument) for argument in arguments])
+    assert exit_.value.code in (1, 2)
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_bad_input_is_one_message(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other.jsonl"
+    other.write_text('{"name": "no result"}\n')
+    assert "expected a line of curio-detect" in refused(capsys, other, "--mesh", files / "chair.ply")
+    assert "there is no such file" in refused(capsys, tmp_path / "none.jsonl")
+    assert "add --mesh FILE" in refused(capsys, files / "found.jsonl")
+    assert "none.ply" in refused(capsys, files / "found.jsonl", "--mesh", tmp_path / "none.ply")
+    assert "add --model MODEL" in refused(capsys, files / "photograph.png")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        found = refused(capsys, files / "found.jsonl", "--mesh", files / "chair.ply", "--port", port)
+        assert f"cannot listen on 127.0.0.1:{port}" in found
+
+
+def test_a_code_that_cannot_be_saved(files: Path, tmp_path: Path) -> None:
+    (scene,) = read_scenes(files / "found.jsonl")
+    with pytest.raises(DataError, match="choose another --out"):
+        save(scene, tmp_path)

@@ -169,8 +169,17 @@ def test_missing_meshes_are_named(capsys, lines: Path, egg: Path, tmp_path: Path
     assert "with different names" in run(capsys, lines, "--out", tmp_path, "--mesh", egg, egg)[2]
 
 
+def test_a_scene_goes_to_a_3d_application_and_comes_back(capsys, lines: Path, egg: Path, tmp_path: Path) -> None:
+    assert run(capsys, lines, "--mesh", egg, "--out", tmp_path / "glb", "--format", "glb")[0] == 0
+    assert run(capsys, lines, "--mesh", egg, "--out", tmp_path / "there", "--height", 120)[0] == 0
+    file = min((tmp_path / "glb").iterdir())
+    assert run(capsys, file, "--mesh", egg, "--out", tmp_path / "back", "--height", 120)[0] == 0
+    there, back = (pixels(min((tmp_path / name).iterdir())) for name in ("there", "back"))
+    assert back == pytest.approx(there, abs=2 / 255)
+
+
 def test_a_folder_that_cannot_be_made(capsys, lines: Path, egg: Path, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("a file")
     status, _, err = run(capsys, lines, "--mesh", egg, "--out", tmp_path / "taken")
     assert status == 1
-    assert "the picture cannot be written" in err
+    assert "the file cannot be written" in err

@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Suppress
 
 from curio_train.errors import UsageError
 
-MethodName = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic"]
+MethodName = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic", "templates"]
 Preset = Literal["laptop", "paper"]
 DecoderKind = Literal["whole", "cells"]
 
@@ -30,6 +30,8 @@ class Method:
     """Error of what the network predicts for renderings of known scene codes."""
     label: bool = False
     """Error of what the network predicts for training images whose scene codes are given."""
+    templates: bool = False
+    """Nothing is trained: renderings of the object are stored and compared with frames by pretrained features."""
 
     @property
     def reads_images(self) -> bool:
@@ -49,6 +51,7 @@ METHODS: Mapping[MethodName, Method] = {
     "sleep": Method(sleep=True),
     "wake_sleep": Method(image=True, sleep=True),
     "wake_sleep_critic": Method(image=True, curiosity=True, sleep=True),
+    "templates": Method(templates=True),
 }
 """All methods by name; the first three are the paper's."""
 
@@ -211,7 +214,8 @@ class RunConfig:
     method: MethodName = "our"
     """our: image loss and critic. noncur: image loss alone. super: true scene codes. Beyond the paper, sleep: regress
     the scene codes of renderings, drawn from the world's known range. wake_sleep: image loss, and sleep with half of
-    the codes around own predictions. wake_sleep_critic: that and the critic."""
+    the codes around own predictions. wake_sleep_critic: that and the critic. templates: no
+    training; renderings of the object are compared with frames by pretrained features."""
     labels: float = 1.0
     """Fraction of the training images that --method super sees, with their true codes (paper: 0.05, 0.1, 1)."""
     preset: Preset = "laptop"

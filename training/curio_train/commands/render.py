@@ -19,7 +19,9 @@ class RenderCommand:
     scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
     """Lines of curio-detect, or of {"world": NAME, "code": {FIELD: numbers}}; or one such JSON object."""
     out: Path
-    """Folder for the pictures, one PNG a scene."""
+    """Folder for the files, one a scene."""
+    format: Literal["png", "glb"] = "png"
+    """png: a picture. glb: objects, light and camera in three dimensions, for Blender and other 3D applications."""
     mesh: tuple[str, ...] = ()
     """Mesh file of the objects, or NAME=FILE for each kind of them; a code's world brings its own."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
@@ -51,6 +53,8 @@ def _render(command: RenderCommand) -> int:
     options = RenderOptions(
         command.height, command.turn_deg, command.over_photograph, command.path_traced, command.samples
     )
-    for path in draw(command.scenes, command.out, command.mesh, command.mesh_unit, command.world, options):
+    for path in draw(
+        command.scenes, command.out, command.mesh, command.mesh_unit, command.world, options, command.format
+    ):
         print(path)
     return 0

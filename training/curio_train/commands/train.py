@@ -121,10 +121,16 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_train.commands.prepare import prepared
     from curio_train.learning.loop import Outcome
     from curio_train.learning.runs.session import learn
+    from curio_train.learning.runs.without_training import draw_templates
 
     session = command.session
     config = command.config if session.resume else prepared(command.config, session.cache, warn, tell)
     path = session.resume or session.out or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
+    if config.terms.templates:
+        seconds = draw_templates(config, path, session.cache).seconds
+        print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
+        tell(end(path, config, session.cache, warn))
+        return 0
     outcome, progress = learn(
         config,
         path,

@@ -1,21 +1,31 @@
-"""A file of scenes to a folder of pictures."""
+"""A file of scenes to a folder of pictures, or of files for 3D applications."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 
+from curio_train.drawing.glb import from_glb, to_glb
 from curio_train.drawing.pictures import RenderOptions, SceneContext, picture
-from curio_train.drawing.scenes import mesh_world, read_scenes
+from curio_train.drawing.scenes import Scene, mesh_world, read_scenes
 from curio_train.errors import DataError, UsageError
 from curio_train.meshes.meshes import Unit, load_mesh
 
+Format = Literal["png", "glb"]
+
 
 def draw(
-    scenes: Path, out: Path, meshes: Sequence[str], mesh_unit: Unit | None, world: str | None, options: RenderOptions
+    scenes: Path,
+    out: Path,
+    meshes: Sequence[str],
+    mesh_unit: Unit | None,
+    world: str | None,
+    options: RenderOptions,
+    form: Format = "png",
 ) -> Iterator[Path]:
-    """Draw every scene of a file and yield the pictures' paths as they are written.
+    """Draw every scene of a file and yield the paths as they are written.
 
     Args:
         scenes: See :func:`~curio_train.drawing.scenes.read_scenes`.
@@ -23,7 +33,8 @@ def draw(
         meshes: FILE or NAME=FILE, as on the command line.
         mesh_unit: Of their coordinates; the file's own unless given.
         world: Generated world that brings meshes, light and ground; a code names its own.
-        options: How to draw.
+        options: How to draw pictures.
+        form: ``png``: pictures. ``glb``: objects, light and camera in three dimensions.
 
     Raises:
         UsageError: Both meshes and a world, or neither where one is needed.
@@ -34,13 +45,22 @@ def draw(
     if meshes and world:
         raise UsageError("--mesh and --world exclude each other: a world brings its own meshes")
     given = SceneContext.of_world(mesh_world(world)) if world else scene_context(meshes, mesh_unit)
-    for scene in read_scenes(scenes):
+    for scene in scenes_of(scenes):
         around = SceneContext.of_world(mesh_world(scene.world)) if scene.world else given
         if around is None:
             raise UsageError(f"{scenes}: detections don't say what the objects look like; add --mesh FILE or --world")
-        path = out / f"{scene.name}.png"
-        _write(path, picture(scene, around, options))
+        path = out / f"{scene.name}.{form}"
+        _write(path, to_glb(scene, around) if form == "glb" else _png(picture(scene, around, options)))
         yield path
+
+
+def scenes_of(file: Path) -> Iterator[Scene]:
+    """The scenes of a GLB file that curio wrote, or of JSON Lines; see :func:`read_scenes`.
+
+    Raises:
+        DataError: The file cannot be read, or holds no scene.
+    """
+    return iter([from_glb(file)]) if file.suffix == ".glb" else read_scenes(file)
 
 
 def scene_context(meshes: Sequence[str], mesh_unit: Unit | None) -> SceneContext | None:
@@ -61,10 +81,14 @@ def _parts(text: str) -> tuple[str, str, str]:
     return (text, "", "") if Path(text).exists() else text.partition("=")
 
 
-def _write(path: Path, image: np.ndarray) -> None:
-    done, content = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+def _png(image: np.ndarray) -> bytes:
+    _, content = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+    return content.tobytes()
+
+
+def _write(path: Path, content: bytes) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content.tobytes() if done else b"")
+        path.write_bytes(content)
     except OSError as exc:
-        raise DataError(f"{path}: the picture cannot be written ({exc.strerror}); choose another --out") from exc
+        raise DataError(f"{path}: the file cannot be written ({exc.strerror}); choose another --out") from exc

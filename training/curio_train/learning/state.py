@@ -12,6 +12,7 @@ from curio_train.errors import UsageError
 from curio_train.learning.muon import Muon
 from curio_train.networks.base import StageNetwork
 from curio_train.networks.paper.critic import Critic
+from curio_train.templates.build import template_network
 from curio_train.worlds.base import StagedWorld, World, stages_of
 
 N = TypeVar("N", bound=nn.Module)
@@ -126,14 +127,18 @@ class TrainState:
             raise UsageError(f"--reading {decoder}: {world.name} has no such decoder; leave the flag out")
         torch.manual_seed(config.seed)
         self.progress = TrainingProgress()
-        self.stages = [stage.network(config.network) for stage in stages_of(world)]
+        templates = config.terms.templates
+        self.stages = [] if templates else [stage.network(config.network) for stage in stages_of(world)]
         if config.terms.perturbs_predictions and not self.stages[0].has_raw_values:
             raise UsageError(
                 f"--method {config.method} perturbs the network's raw outputs, and the dense decoder has none: "
                 "use --method sleep, or --reading whole"
             )
         recipe = config.recipe
-        network = world.assemble(self.stages) if isinstance(world, StagedWorld) else self.stages[0]
+        if templates:
+            network: nn.Module = template_network(world)
+        else:
+            network = world.assemble(self.stages) if isinstance(world, StagedWorld) else self.stages[0]
         self.pose = Learner(network.to(device), recipe.learning_rate, recipe.matrix_learning_rate)
         self.critic = None
         if config.terms.curiosity:

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from curio_train.data.photographs import read_photograph
-from curio_train.drawing.album import scene_context
+from curio_train.drawing.album import scene_context, scenes_of
 from curio_train.drawing.pictures import LIGHT, SceneContext
-from curio_train.drawing.scenes import Scene, mesh_world, read_scenes, scene_of_code
+from curio_train.drawing.scenes import Scene, mesh_world, scene_of_code
 from curio_train.errors import CurioError, DataError, UsageError
 from curio_train.evaluation.subject import load_subject
 from curio_train.learning.runs.checkpoint import RunFolder
@@ -48,7 +48,7 @@ class Page:
 
     @property
     def light(self) -> np.ndarray:
-        """The light that the scene is drawn under [3], camera frame: its own, else the context's, else the usual one."""
+        """The light that the scene is drawn under [3], camera frame; the usual one where neither knows it."""
         known = self.scene.light if self.scene.light is not None else self.context.light
         return np.array(LIGHT) if known is None else known
 
@@ -91,7 +91,7 @@ def open_pages(opening: Opening) -> list[Page]:
         raise UsageError(f"{path}: there is no such file or folder, and no world of that name; expected {_EXPECTED}")
     if (path / CONFIG_FILE).exists():
         return list(_of_run(path, opening.cache))
-    if path.suffix in (".json", ".jsonl"):
+    if path.suffix in (".json", ".jsonl", ".glb"):
         return _of_results(path, opening)
     return _of_photographs(path, opening)
 
@@ -115,7 +115,10 @@ def newer_pages(opening: Opening) -> Callable[[], list[Page] | None]:
     return reload
 
 
-_EXPECTED = f"a result file of curio-detect, a photograph, a run folder, or one of the worlds {', '.join(WORLDS)}"
+_EXPECTED = (
+    "a result file of curio-detect, a .glb of curio-render, a photograph, a run folder, or one of the worlds "
+    + ", ".join(WORLDS)
+)
 
 
 def _of_world(name: str) -> Iterator[Page]:
@@ -151,7 +154,7 @@ def _context(path: Path, world: World) -> SceneContext:
 def _of_results(path: Path, opening: Opening) -> list[Page]:
     pages = []
     given = scene_context(opening.meshes, opening.mesh_unit)
-    for scene in read_scenes(path):
+    for scene in scenes_of(path):
         context = SceneContext.of_world(mesh_world(scene.world)) if scene.world else given
         if context is None:
             raise UsageError(f"{path}: detections do not hold the shape of the objects; add --mesh FILE or NAME=FILE")

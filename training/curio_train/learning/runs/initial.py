@@ -60,7 +60,10 @@ def weights_file(state: TrainState, config: RunConfig, *, half: bool) -> bytes:
     """
     tensors = {name: value.contiguous() for name, value in state.pose.network.state_dict().items()}
     if half:
-        tensors = {name: value.half() if value.dim() > 1 else value for name, value in tensors.items()}
+        tensors = {
+            name: value.half() if value.dim() > 1 and value.is_floating_point() else value
+            for name, value in tensors.items()
+        }
         if not all(value.isfinite().all() for value in tensors.values()):
             raise ExportError("a weight is too large for float16; export without --half")
     notes = {
@@ -76,7 +79,7 @@ def uses_synthetic_labels(config: RunConfig) -> bool:
 
     The runs and models that it was initialised from count, too; one that cannot be read any more counts as yes.
     """
-    if config.terms.label or config.terms.sleep:
+    if config.terms.label or config.terms.sleep or config.terms.templates:
         return True
     if config.init is None:
         return False

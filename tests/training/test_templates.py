@@ -1,0 +1,157 @@
+"""Templates on frozen features: what needs no renderer."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from curio_train.errors import CheckpointError, UsageError
+from curio_train.export.onnx import to_onnx
+from curio_train.templates.alignment import Aligned, align, with_gradient
+from curio_train.templates.build import template_network
+from curio_train.templates.descriptors import Descriptors
+from curio_train.templates.geometry import Geometry, viewpoints
+from curio_train.templates.localiser import RANK, Localiser
+from curio_train.templates.network import STEPS, TemplateNetwork
+from curio_train.templates.trunk import FINE_WIDTH, Trunk
+from curio_train.worlds import build
+from curio_train.worlds.options import CirclesOptions
+
+MATRIX = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
+GEOMETRY = Geometry(MATRIX, 640, 480, 0.2, 0.5, 1.5)
+
+
+def test_the_trunk_says_the_same_of_an_image_wherever_it_is_in_a_batch() -> None:
+    trunk, images = Trunk.pretrained(), torch.rand(3, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    fine, coarse = trunk(images)
+    assert fine.shape == (3, 24, 16, 16)
+    assert coarse.shape == (3, 40, 8, 8)
+    torch.testing.assert_close(trunk(images[1:2])[1][0], coarse[1], atol=1e-4, rtol=1e-3)
+    assert not any(parameter.requires_grad for parameter in trunk.parameters())
+
+
+def test_truncated_weights_are_named(tmp_path: Path) -> None:
+    whole = tmp_path / "whole.pth"
+    torch.save(Trunk().state_dict(), whole)
+    cut = tmp_path / "cut.pth"
+    cut.write_bytes(whole.read_bytes()[:20_000])
+    with pytest.raises(CheckpointError, match=r"cut\.pth.*cannot be read.*reinstall"):
+        Trunk.pretrained(cut)
+    with pytest.raises(CheckpointError, match=r"missing\.pth"):
+        Trunk.pretrained(tmp_path / "missing.pth")
+
+
+def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
+    other = tmp_path / "other.pth"
+    torch.save({"weight": torch.zeros(3)}, other)
+    with pytest.raises(CheckpointError, match="not the weights of EfficientNet-Lite0"):
+        Trunk.pretrained(other)
+
+
+def test_viewpoints_are_rotations_of_the_upper_hemisphere() -> None:
+    found = viewpoints(20, 3)
+    torch.testing.assert_close(found @ found.mT, torch.eye(3).expand(60, 3, 3), atol=1e-6, rtol=0)
+    assert (torch.linalg.det(found) > 0).all()
+    camera_height = -(found[:, 2, 2])  # the camera looks along the third row, from above downwards
+    assert (camera_height > 0).all()
+
+
+def test_descriptors_have_unit_length_and_lose_what_all_backgrounds_share() -> None:
+    random = torch.Generator().manual_seed(0)
+    background = torch.randn(4, 8, 16, 16, generator=random) * torch.tensor([10.0, *[1.0] * 7])[:, None, None]
+    descriptors = Descriptors(8, 8)
+    descriptors.projection.copy_(descriptors.whiten(background + 5))
+    found = descriptors(background + 5)
+    torch.testing.assert_close(found.square().sum(dim=1), torch.ones(4, 16, 16))
+    assert float(found.movedim(1, 0).flatten(1).std(dim=1).max()) < 0.5  # no direction rules
+
+
+def test_a_pose_is_aligned_with_the_crop_that_it_belongs_to() -> None:
+    random = np.random.default_rng(0)
+    waves = torch.from_numpy(random.uniform(-0.35, 0.35, (FINE_WIDTH, 2))).float()
+    phases = torch.from_numpy(random.uniform(0, 2 * math.pi, FINE_WIDTH)).float()
+    v, u = torch.meshgrid(torch.arange(32.0), torch.arange(32.0), indexing="ij")
+
+    def seen(cells: torch.Tensor) -> torch.Tensor:
+        values = torch.sin(cells @ waves.T + phases)
+        return values / values.norm(dim=-1, keepdim=True)
+
+    maps = with_gradient(seen(torch.stack([u, v], dim=-1)).permute(2, 0, 1)[None])
+    points = torch.from_numpy(random.uniform(-0.4, 0.4, (1, 200, 3))).float()
+    focal, true = torch.tensor([400.0]), torch.tensor([[0.02, -0.01, 4.4]])
+    at = points + true[:, None]
+    wanted = seen((focal * at[..., :2] / at[..., 2:] + 63.5) / 4)
+    start = Aligned(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 4.2]]), torch.zeros(1))
+    found = align(maps, points, wanted, start, focal, 12)
+    torch.testing.assert_close(found.position, true, atol=0.02, rtol=0)
+    torch.testing.assert_close(found.rotation, torch.eye(3)[None], atol=0.02, rtol=0)
+    assert float(found.score) > 0.98
+
+
+def test_the_localiser_finds_the_template_it_holds() -> None:
+    localiser = Localiser(GEOMETRY)
+    features = torch.randn(1, 40, *GEOMETRY.frame_cells, generator=torch.Generator().manual_seed(0))
+    number = 3
+    side = localiser.filters(number).shape[-1]
+    row, column = 9, 21
+    patch = localiser.descriptors(features)[:, :, row : row + side, column : column + side]
+    localiser.filters(number).copy_(patch.expand(RANK, -1, -1, -1) / side**2)
+    localiser.weights[number] = 1 / RANK
+    found = localiser(features)
+    pixel = MATRIX @ found.position_m[0, 0].numpy()
+    expected = (np.array([column, row]) + side // 2) * 16 + 0.5
+    np.testing.assert_allclose(pixel[:2] / pixel[2], expected, atol=0.01)
+    assert float(found.position_m[0, 0].norm()) == pytest.approx(GEOMETRY.depths_m[number], rel=1e-4)
+    assert float(found.score[0, 0]) > 0.9
+
+
+def _random_network(steps: tuple[int, int] = STEPS) -> TemplateNetwork:
+    network, random = TemplateNetwork(GEOMETRY, steps), torch.Generator().manual_seed(0)
+    network.trunk.load_state_dict(Trunk.pretrained().state_dict())
+    for name, buffer in (*network.localiser.named_buffers(), *network.bank.named_buffers()):
+        if name.startswith(("filters", "weights", "points")):
+            buffer.copy_(torch.randn(buffer.shape, generator=random) * (0.2 if name == "points" else 0.05))
+        if name == "described":
+            buffer.copy_(torch.randint(-40, 40, buffer.shape, generator=random))
+    return network
+
+
+def test_a_frame_is_read_the_same_alone_and_among_others() -> None:
+    network = _random_network()
+    images = torch.rand(2, 3, 480, 640, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        both, alone = network(images), network(images[1:])
+    for name, values in both.items():
+        assert values.isfinite().all()
+        torch.testing.assert_close(values[1:], alone[name], atol=1e-3, rtol=1e-3)
+
+
+class _Graph(torch.nn.Module):
+    """The network with a camera's pixels as its input, as an export has it."""
+
+    def __init__(self, network: TemplateNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(self.network(image.permute(0, 3, 1, 2).float() / 255).values())
+
+
+def test_the_exported_graph_equals_torch_for_any_batch() -> None:
+    graph, random = _Graph(_random_network((1, 1))).eval(), np.random.default_rng(0)
+    names = ["translation_m", "rotation_6d", "light", "confidence"]
+    session = onnxruntime.InferenceSession(to_onnx(graph, 640, 480, names).SerializeToString())
+    coarse = torch.from_numpy(random.integers(0, 255, (3, 3, 60, 80))).float()
+    smooth = torch.nn.functional.interpolate(coarse, (480, 640), mode="bilinear")
+    images = smooth.round().byte().permute(0, 2, 3, 1).contiguous()
+    with torch.no_grad():
+        expected = dict(zip(names, graph(images), strict=True))
+    for name, found in zip(names, session.run(names, {"image": images.numpy()}), strict=True):
+        torch.testing.assert_close(torch.from_numpy(found), expected[name], atol=1e-3, rtol=1e-3)
+
+
+def test_templates_are_of_one_object_in_six_degrees_of_freedom() -> None:
+    with pytest.raises(UsageError, match="--method templates"):
+        template_network(build(CirclesOptions()))

@@ -1,0 +1,43 @@
+"""The run folder of a method that trains nothing."""
+
+import time
+from pathlib import Path
+
+import torch
+
+from curio_train.config import RunConfig
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.provenance import record_session
+from curio_train.learning.state import TrainingProgress, TrainState
+from curio_train.templates.build import fill
+from curio_train.templates.calibration import calibrate
+from curio_train.templates.network import TemplateNetwork
+from curio_train.worlds import build
+from curio_train.worlds.single_object.world import SingleObjectWorld
+
+
+def draw_templates(config: RunConfig, path: Path, cache: Path) -> TrainingProgress:
+    """Draw an object's templates, calibrate their confidence, and write both as a run.
+
+    Args:
+        config: Of the object.
+        path: The run folder, a new one.
+        cache: Where worlds keep the image sets that they render once.
+
+    Raises:
+        CurioError: Any of this package's errors. The folder then holds no checkpoint.
+    """
+    world = build(config.world)
+    state = TrainState(config, world, torch.device("cpu"))
+    network = state.pose.network
+    assert isinstance(world, SingleObjectWorld)  # template networks are made for no other
+    assert isinstance(network, TemplateNetwork)
+    run = RunFolder(path, config)
+    run.write_config(new=True)
+    record_session(path)
+    begin = time.monotonic()
+    fill(network, world, cache)
+    calibrate(network, world, cache)
+    state.progress.seconds = time.monotonic() - begin
+    run.save(state)
+    return state.progress

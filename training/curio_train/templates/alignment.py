@@ -1,0 +1,133 @@
+"""A pose aligned with a crop by features at surface points: no rendering, six unknowns (as in FoundPose, 2024).
+
+Levenberg–Marquardt on the distance between the descriptor that a template has at a surface point and the one that the
+crop has where the pose projects it, with a robust weight for each point. All of it is plain tensor arithmetic, so that
+it can be part of an exported graph.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from curio_train.templates.trunk import FINE_STRIDE, FINE_WIDTH
+
+_DAMPING = 1e-2  # of the Hessian's diagonal
+_RIDGE = 1e-6
+_LARGEST_STEP = 0.2  # radians and diameters together
+_OUTLIER = 0.5  # squared distance of descriptors at which a point counts a quarter (Geman and McClure 1985)
+_CROSS = [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]]
+"""A vector times this is its cross-product matrix, row by row."""
+
+
+class Aligned(NamedTuple):
+    """Poses in the cameras of their crops."""
+
+    rotation: Float[Tensor, "batch 3 3"]
+    """crop_from_obj."""
+    position: Float[Tensor, "batch 3"]
+    """Diameters."""
+    score: Float[Tensor, " batch"]
+    """Mean cosine of template and crop over the points."""
+
+
+def with_gradient(descriptors: Float[Tensor, "batch size side side"]) -> Float[Tensor, "batch 3*size side side"]:
+    """Descriptors, then their derivatives across and down, a cell."""
+    padded = F.pad(descriptors, (1, 1, 1, 1), mode="replicate")
+    across = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
+    down = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
+    return torch.cat([descriptors, across, down], dim=1)
+
+
+def align(
+    maps: Float[Tensor, "batch 3*size side side"],
+    points: Float[Tensor, "batch points 3"],
+    wanted: Float[Tensor, "batch points size"],
+    start: Aligned,
+    focal_px: Float[Tensor, " batch"],
+    num_steps: int,
+) -> Aligned:
+    """Move poses to where the crops look most like the templates.
+
+    Args:
+        maps: Of :func:`with_gradient`; cell (i, j) lies at crop pixel (4 i, 4 j).
+        points: Object frame, diameters.
+        wanted: Descriptors of the points.
+        start: Poses to begin with.
+        focal_px: Of the crops, whose principal point is their middle.
+        num_steps: How many steps to take.
+    """
+    rotation, position = start.rotation, start.position
+    for _ in range(num_steps):
+        step = _step(maps, points, wanted, rotation, position, focal_px)
+        rotation, position = _turn(step[:, :3]) @ rotation, position + step[:, 3:]
+    _, seen = _sample(maps, points, rotation, position, focal_px)
+    here = seen[..., :FINE_WIDTH]
+    cosine = (here * wanted).sum(dim=-1) / here.square().sum(dim=-1).clamp(min=1e-12).sqrt()
+    return Aligned(rotation, position, cosine.mean(dim=1))
+
+
+def _sample(
+    maps: Tensor, points: Tensor, rotation: Tensor, position: Tensor, focal_px: Tensor
+) -> tuple[Float[Tensor, "batch points 3"], Float[Tensor, "batch points 3*size"]]:
+    """Points in the crop's camera, and the maps where it sees them."""
+    seen = points @ rotation.transpose(1, 2) + position[:, None]
+    side = maps.shape[-1]
+    middle = (side * FINE_STRIDE - 1) / 2
+    cells = (focal_px[:, None, None] * seen[..., :2] / seen[..., 2:].clamp(min=1e-3) + middle) / FINE_STRIDE
+    grid = ((2 * cells + 1) / side - 1)[:, :, None]
+    found = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
+    return seen, found[..., 0].transpose(1, 2)
+
+
+def _step(
+    maps: Tensor, points: Tensor, wanted: Tensor, rotation: Tensor, position: Tensor, focal_px: Tensor
+) -> Float[Tensor, "batch 6"]:
+    """A rotation vector about the object's centre, then a shift in diameters."""
+    seen, found = _sample(maps, points, rotation, position, focal_px)
+    here, across, down = found.split(FINE_WIDTH, dim=-1)
+    residual = here - wanted
+    weight = 1 / (1 + residual.square().sum(dim=-1) / _OUTLIER).square()
+    x, y, z = seen.unbind(-1)
+    scale, zero = focal_px[:, None] / FINE_STRIDE / z, torch.zeros_like(z)
+    arm = seen - position[:, None]
+    u = _by_pose(torch.stack([scale, zero, -scale * x / z], dim=-1), arm)
+    v = _by_pose(torch.stack([zero, scale, -scale * y / z], dim=-1), arm)
+    jacobian = torch.cat([u, v], dim=1)  # [batch, 2 points, 6]
+    uu, uv, vv = ((a * b).sum(dim=-1) * weight for a, b in ((across, across), (across, down), (down, down)))
+    of_u = uu[..., None] * u + uv[..., None] * v
+    of_v = uv[..., None] * u + vv[..., None] * v
+    hessian = jacobian.transpose(1, 2) @ torch.cat([of_u, of_v], dim=1)
+    slope = torch.cat([(across * residual).sum(dim=-1) * weight, (down * residual).sum(dim=-1) * weight], dim=1)
+    gradient = (jacobian.transpose(1, 2) @ slope[..., None])[..., 0]
+    step = -_solve(hessian, gradient)
+    length = step.square().sum(dim=1, keepdim=True).clamp(min=1e-12).sqrt()
+    return step * (_LARGEST_STEP / length).clamp(max=1)
+
+
+def _by_pose(by_point: Float[Tensor, "batch points 3"], arm: Float[Tensor, "batch points 3"]) -> Tensor:
+    """The derivative by rotation and shift from the one by a point's position, [batch, points, 6]."""
+    return torch.cat([torch.linalg.cross(arm, by_point), by_point], dim=-1)
+
+
+def _solve(hessian: Float[Tensor, "batch 6 6"], gradient: Float[Tensor, "batch 6"]) -> Float[Tensor, "batch 6"]:
+    """Of the damped system, by Gauss–Jordan elimination written out: a positive matrix needs no pivots."""
+    identity = torch.eye(6, dtype=hessian.dtype, device=hessian.device)
+    diagonal = (hessian * identity).sum(dim=2)
+    damped = hessian + identity * (_DAMPING * diagonal + _RIDGE * (1 + diagonal.mean(dim=1, keepdim=True)))[:, None]
+    system = torch.cat([damped, gradient[..., None]], dim=2)
+    for number in range(6):
+        row = system[:, number] / system[:, number, number, None]
+        system = system - (system[:, :, number] - identity[number])[..., None] * row[:, None]
+    return system[:, :, 6]
+
+
+def _turn(vector: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
+    """The rotation by a short rotation vector, by Cayley's formula."""
+    half = vector / 2
+    cross = (half @ vector.new_tensor(_CROSS)).unflatten(1, (3, 3))
+    scale = 2 / (1 + half.square().sum(dim=1))
+    identity = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return identity + scale[:, None, None] * (cross + cross @ cross)

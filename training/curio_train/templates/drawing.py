@@ -1,0 +1,87 @@
+"""Templates drawn by the renderer, as the frame's camera shows the object, then sampled as a crop of a frame is."""
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from curio_train.meshes.meshes import Mesh
+from curio_train.rendering.renderer import Renderer
+from curio_train.worlds.single_object.viewpoints import AMBIENT
+
+LOOKS = (((0.0, -0.7, -0.7), 1.0), ((0.7, -0.5, -0.5), 1.6), ((-0.7, -0.5, -0.5), 1.2))
+"""Lamps, and what colours are multiplied by: descriptors are means over these and over as many backgrounds."""
+
+_BORDER_PX = 4
+
+
+class Drawn:
+    """Objects under several lamps, without a background."""
+
+    colors: list[Tensor]
+    """sRGB over black under each lamp, [templates, 3, side, side]."""
+    alpha: Tensor
+    """Fraction of each pixel that the object covers, [templates, 1, side, side]."""
+
+    def __init__(self, stacked: Float[Tensor, "templates channels side side"]) -> None:
+        *self.colors, self.alpha = stacked.split([3] * (stacked.shape[1] // 3) + [1], dim=1)
+
+    def over(self, number: int, backgrounds: Tensor, exposure: float = 1.0) -> Tensor:
+        """Pictures under one of the lamps, in [0, 1]."""
+        return (exposure * self.colors[number] + (1 - self.alpha) * backgrounds).clamp(0, 1)
+
+
+class Easel:
+    """Draws an object on the optical axis of a camera whose principal point is the picture's middle."""
+
+    def __init__(self, mesh: Mesh, depth_m: float, focal_px: float, side: int) -> None:
+        """Choose distance and camera.
+
+        Raises:
+            RendererError: The mesh cannot be rendered.
+        """
+        self._renderer = Renderer([mesh], [0], side, side, ambient=AMBIENT)
+        middle = (side - 1) / 2
+        self._matrix = np.array([[focal_px, 0, middle], [0, focal_px, middle], [0, 0, 1]])
+        self._position, self._side = torch.tensor([0.0, 0.0, depth_m]), side
+
+    def draw(self, rotations: Float[Tensor, "templates 3 3"], num_lamps: int = 1) -> Drawn:
+        """Seen with rotations cam_from_obj, under the first of :data:`LOOKS`."""
+        over_black = [self._draw(rotations, lamp, 0.0) for lamp, _ in LOOKS[:num_lamps]]
+        over_white = self._draw(rotations, LOOKS[0][0], 1.0)
+        alpha = 1 - (over_white - over_black[0]).mean(dim=1, keepdim=True)
+        return Drawn(torch.cat([*over_black, alpha], dim=1))
+
+    def _draw(self, rotations: Tensor, lamp: tuple[float, float, float], shade: float) -> Tensor:
+        count = len(rotations)
+        return self._renderer(
+            rotations[:, None],
+            self._position.expand(count, 1, 3),
+            camera_matrix=self._matrix,
+            backgrounds=torch.full((count, 3, self._side, self._side), shade),
+            light=torch.tensor(lamp).expand(count, 3),
+        )
+
+
+class CropEasel:
+    """Draws an object as a crop of a frame shows it: no sharper than the frame is."""
+
+    def __init__(self, mesh: Mesh, depth_m: float, frame_focal_px: float, crop_focal_px: float, side: int) -> None:
+        """Choose distance, cameras and the crop's side.
+
+        Raises:
+            RendererError: The mesh cannot be rendered.
+        """
+        share = min(1.0, frame_focal_px / crop_focal_px)  # frame pixels a crop pixel
+        frame_side = 2 * int(np.ceil(side * share / 2)) + 2 * _BORDER_PX
+        self._easel = Easel(mesh, depth_m, share * crop_focal_px, frame_side)
+        steps = (torch.arange(2 * side) - (2 * side - 1) / 2) * share / frame_side
+        self._grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1)[None]
+
+    def draw(self, rotations: Float[Tensor, "templates 3 3"]) -> Drawn:
+        """Seen with rotations cam_from_obj, under all of :data:`LOOKS`."""
+        drawn = self._easel.draw(rotations, len(LOOKS))
+        stacked = torch.cat([*drawn.colors, drawn.alpha], dim=1)
+        grid = self._grid.expand(len(rotations), -1, -1, -1)
+        return Drawn(F.avg_pool2d(F.grid_sample(stacked, grid, align_corners=False), 2))

