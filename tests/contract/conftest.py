@@ -31,7 +31,7 @@ def texts(root: Path, tracked: list[Path]) -> dict[Path, str]:
     found = {}
     for path in tracked:
         content = (root / path).read_bytes()
-        if b"\0" not in content:
+        if b"\0" not in content and path.suffix != ".bin":
             found[path] = content.decode()
     return found
 
