@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 
 from curio_serve.errors import ImageError, UsageError
+from curio_serve.files import read_file
+from curio_serve.imaging.image import MAX_FILE_BYTES
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v"})
@@ -37,7 +39,7 @@ class SourceImage:
         path: The file it comes from.
         video_frame: Its number in a video; None for an image file.
         pixels: uint8 RGB [height, width, 3] of a video's frame.
-        error: Why a video has no frames to give.
+        error: Why a video has no frames to give, or a folder no images.
     """
 
     name: str
@@ -50,12 +52,12 @@ class SourceImage:
         """The bytes of an image file.
 
         Raises:
-            ImageError: The file cannot be read, or there is none.
+            ImageError: The file cannot be read, is no regular file or too large, or there is none.
         """
         if self.error:
             raise ImageError(self.error)
         try:
-            return Path(self.path).read_bytes()
+            return read_file(self.path, MAX_FILE_BYTES)
         except (OSError, ValueError) as exc:  # ValueError: a null byte in the name
             reason = exc.strerror if isinstance(exc, OSError) else str(exc)
             raise ImageError(f"cannot be read: {reason}") from exc
@@ -82,11 +84,7 @@ def check_arguments(arguments: Sequence[str]) -> None:
 
 
 def images(arguments: Sequence[str]) -> Iterator[SourceImage]:
-    """Every image that the arguments name, in order.
-
-    Raises:
-        UsageError: A folder cannot be listed.
-    """
+    """Every image that the arguments name, in order; a folder that cannot be listed is one image with that error."""
     for argument in arguments:
         if argument == STANDARD_INPUT:
             for line in sys.stdin.buffer:
@@ -128,11 +126,14 @@ def _images_at(path: str) -> Iterator[SourceImage]:
 def _images_below(folder: str) -> Iterator[SourceImage]:
     """Image files of a folder and its sub-folders; of a BOP scene the photographs alone, not its depths and masks."""
     is_bop_scene = any(os.path.exists(os.path.join(folder, name)) for name in _BOP_SCENE_FILES)
-    for name, is_folder in _sorted_entries(folder):
-        if not is_folder:
-            yield SourceImage(os.path.join(folder, name), os.path.join(folder, name))
-        elif not is_bop_scene or name in _BOP_IMAGE_FOLDERS:
-            yield from _images_below(os.path.join(folder, name))
+    try:
+        for name, is_folder in _sorted_entries(folder):
+            if not is_folder:
+                yield SourceImage(os.path.join(folder, name), os.path.join(folder, name))
+            elif not is_bop_scene or name in _BOP_IMAGE_FOLDERS:
+                yield from _images_below(os.path.join(folder, name))
+    except OSError as exc:
+        yield SourceImage(folder, folder, error=f"cannot be listed: {exc.strerror}")
 
 
 def _sorted_entries(folder: str) -> Iterator[tuple[str, bool]]:
@@ -147,16 +148,13 @@ def _sorted_entries(folder: str) -> Iterator[tuple[str, bool]]:
 
 
 def _entries_after(folder: str, last: str) -> Iterator[tuple[str, bool]]:
-    try:
-        with os.scandir(folder) as entries:
-            for entry in entries:
-                if entry.name <= last or entry.name.startswith("."):
-                    continue
-                is_folder = entry.is_dir(follow_symlinks=False)
-                if is_folder or (os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES and not entry.is_dir()):
-                    yield entry.name, is_folder
-    except OSError as exc:
-        raise UsageError(f"{folder}: cannot be listed: {exc.strerror}") from exc
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name <= last or entry.name.startswith("."):
+                continue
+            is_folder = entry.is_dir(follow_symlinks=False)
+            if is_folder or (os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES and not entry.is_dir()):
+                yield entry.name, is_folder
 
 
 def _video_frames(path: str) -> Iterator[SourceImage]:
