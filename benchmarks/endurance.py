@@ -44,7 +44,7 @@ from typing import Any
 import tyro
 from curio_serve.client import PoseClient
 from curio_serve.errors import CurioError
-from load.attacks import much_work, raw_frames, unfinished, unfolding
+from load.attacks import empty_calls, much_work, raw_frames, unfinished, unfolding
 from load.generator import MODEL, WIDTH, K, closed_loop_of, make_frames, pose_target
 from load.hostile import hostile
 from load.network import write_model
@@ -213,7 +213,7 @@ def attacked(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any
     """Each attack on a server of its own, beside an honest client; SIGTERM while the attack goes on."""
     peaks_mb, parts, stops_s = {}, {}, {}
     cores = sorted(os.sched_getaffinity(0))
-    for attack in (unfolding, raw_frames, much_work, unfinished):
+    for attack in (unfolding, raw_frames, much_work, unfinished, empty_calls):
         with (
             _memory_cgroup() as cgroup,
             running_server(models, cores, "--grace-s", "3", cgroup=cgroup) as (address, pid),

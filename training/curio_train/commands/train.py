@@ -127,7 +127,11 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
 
     session = command.session
     config = command.config if session.resume else prepared(command.config, session.cache, warn, tell)
-    path = session.resume or (session.out and direct(session.out)) or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
+    path = (
+        session.resume
+        or (session.out and direct(session.out))
+        or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
+    )
     if config.terms.templates:
         seconds = draw_templates(config, path, session.cache).seconds
         print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")

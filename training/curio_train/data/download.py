@@ -145,7 +145,13 @@ def _inside(member: zipfile.ZipInfo, archive: str) -> PurePosixPath:
         DataError: Somewhere else, or it is a link.
     """
     path = PurePosixPath(member.filename.replace("\\", "/"))
-    if not path.parts or path.is_absolute() or ".." in path.parts or ":" in path.parts[0] or stat.S_ISLNK(member.external_attr >> 16):
+    if (
+        not path.parts
+        or path.is_absolute()
+        or ".." in path.parts
+        or ":" in path.parts[0]
+        or stat.S_ISLNK(member.external_attr >> 16)
+    ):
         raise DataError(
             f"{REPOSITORY}/{archive}: holds {member.filename!r}, which would be written outside its folder or is a "
             "link; nothing of it was unpacked. Is HF_ENDPOINT a hub that you trust?"

@@ -48,7 +48,9 @@ def record_session(run: Path) -> None:
         with (run / SESSIONS_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(asdict(this_session())) + "\n")
     except OSError as exc:
-        raise CheckpointError(f"cannot write {run / SESSIONS_FILE}: {exc.strerror}; name another run folder: --out") from exc
+        raise CheckpointError(
+            f"cannot write {run / SESSIONS_FILE}: {exc.strerror}; name another run folder: --out"
+        ) from exc
 
 
 def run_sessions(run: Path) -> list[RunSession]:
@@ -64,7 +66,9 @@ def run_sessions(run: Path) -> list[RunSession]:
     except (OSError, ValueError, TypeError, RecursionError) as exc:
         raise CheckpointError(f"{run / SESSIONS_FILE} cannot be read ({exc}); is {run} a whole run folder?") from exc
     if not found:
-        raise CheckpointError(f"{run / SESSIONS_FILE} has no whole line, expected one a session; is {run} a whole run folder?")
+        raise CheckpointError(
+            f"{run / SESSIONS_FILE} has no whole line, expected one a session; is {run} a whole run folder?"
+        )
     return found
 
 
