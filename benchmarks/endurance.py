@@ -16,8 +16,8 @@ attacked_mb           largest resident memory of a server under each of the atta
                       within 5 s, ``attacked_stop_s`` how long SIGTERM takes in the middle of the work, and
                       ``attacked_limit_mb`` the limit of the memory cgroup that the server was in, if one can be made
 hostile_codes         statuses of the hostile messages of ``load/hostile.py``, sent for so many seconds: none may be
-                      UNKNOWN or INTERNAL, and no line of the log a traceback; ``hostile_growth`` is the memory after all
-                      of them over that after a tenth
+                      UNKNOWN or INTERNAL, and no line of the log a traceback; ``hostile_growth`` is the memory after
+                      all of them over that after a tenth
 A part is left out with 0. Exit status 1: one of them does not hold. What has been reached is said on stderr. With
 ``--out`` the figures are written to a file after each part and each 10,000 strange requests, and a run that was cut off
 goes on after the last of them; for another version of the server, take another file.

@@ -195,9 +195,9 @@ def test_the_metrics_port_answers_one_path_within_a_limit(
     http.start()
     address = ("127.0.0.1", http.server_port)
     silent = socket.create_connection(address)
-    for opening in (b"GET /metrics HTTP/1.1\r\n\r\n", b"\xff\xfe\r\n\r\n", b""):
+    for beginning in (b"GET /metrics HTTP/1.1\r\n\r\n", b"\xff\xfe\r\n\r\n", b""):
         with socket.create_connection(address) as broken_off:
-            broken_off.sendall(opening)
+            broken_off.sendall(beginning)
             broken_off.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     with urllib.request.urlopen(f"http://127.0.0.1:{http.server_port}/metrics", timeout=30) as answer:
         assert answer.status == 200

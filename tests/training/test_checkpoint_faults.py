@@ -1,4 +1,4 @@
-"""Every step of writing a run folder is interrupted once, by kill -9 and by a full disk: the run goes on bit for bit."""
+"""Each file operation in a run folder fails once, by kill -9 and by a full disk: the run goes on bit for bit."""
 
 import gc
 import os

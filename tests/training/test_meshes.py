@@ -106,8 +106,8 @@ def test_missing_and_folder(tmp_path: Path) -> None:
 
 
 def test_sizes_that_cannot_be(tmp_path: Path) -> None:
-    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000000000\nproperty float x\nproperty float y\n"
-    head += b"property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000000000\nproperty float x\n"
+    head += b"property float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
     with pytest.raises(MeshError, match="not a readable PLY"):
         load_mesh(write(tmp_path / "a.ply", head + bytes(100)))
     with (tmp_path / "b.stl").open("wb") as sparse:
