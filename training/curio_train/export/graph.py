@@ -35,11 +35,11 @@ from curio_train.worlds.base import ObjectKind, World
 LARGEST_PARITY_ERROR = 1e-4
 """Largest absolute difference between torch and onnxruntime that an export may have, in any output."""
 
-_NUM_CHECK_IMAGES = 8  # of either kind
+_NUM_CHECK_IMAGES = 4  # of either kind
 _CHECK_SEED = (20_210,)
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
-_NUM_JITTERED = 16  # a tie is missed once in 2 to the power of this
+_NUM_JITTERED = 12  # a tie is missed once in 2 to the power of this
 _LEAST_STABLE = 0.25  # of the check images
 
 
