@@ -112,9 +112,9 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
         store_half(model)
     spec = model_spec(world, target.path.name)
     spec.recipe = json.dumps(to_portable(folder.config))
-    first = run_sessions(run)[0]
+    sessions = run_sessions(run)
     spec.commit, spec.images_seen, spec.training_seconds = (
-        first.commit,
+        sessions[0].commit,
         state.progress.all_images,
         state.progress.all_seconds,
     )
@@ -126,7 +126,7 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     spec.parity_max_abs_error = refuse_disparity(answers, found)
     put_spec(model, spec)
     version = target.next_version()
-    made = Provenance(run, folder.config, first, state.progress, _weights(half, rounding_error))
+    made = Provenance(run, folder.config, sessions, state.progress, _weights(half, rounding_error))
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),
