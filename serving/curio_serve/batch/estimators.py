@@ -37,41 +37,35 @@ _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 @dataclass(frozen=True)
 class Settings:
-    """What holds for all images of a run.
-
-    Attributes:
-        cameras: Their intrinsics; None for 2D worlds and models that allow a default.
-        min_confidence: Detections below are left out.
-        max_detections: Most confident first; None: all.
-        apply_exif_rotation: Turn pixels, and K with them.
-        overlays: Where drawings go; None: nowhere.
-        sources_root: Folder below which the images' paths are told apart.
-    """
+    """What holds for all images of a run."""
 
     cameras: CameraFile | None = None
+    """Their intrinsics; None for 2D worlds and models that allow a default."""
     min_confidence: float = 0.0
+    """Detections below are left out."""
     max_detections: int | None = None
+    """Most confident first; None: all."""
     apply_exif_rotation: bool = False
+    """Turn pixels, and K with them."""
     overlays: Path | None = None
+    """Where drawings go; None: nowhere."""
     sources_root: Path = Path("/")
+    """Folder below which the images' paths are told apart."""
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a model saw in one image.
-
-    Attributes:
-        camera: The one that was used, of the frame as turned.
-        frame: Where the frame was decoded here in its full size.
-    """
+    """What a model saw in one image."""
 
     width: int
     height: int
     camera: PinholeCamera | None
+    """The one that was used, of the frame as turned."""
     results: Sequence[RegionResult]
     decode_ms: float | None
     inference_ms: float
     frame: images.Frame | None = None
+    """Where the frame was decoded here in its full size."""
 
 
 class Estimator(ABC):
