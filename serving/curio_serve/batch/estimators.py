@@ -69,13 +69,14 @@ class _Seen:
 
 
 class Estimator(ABC):
-    """Answers images one at a time; safe to share between threads.
+    """Answers images one at a time; safe to share between threads."""
 
-    Attributes:
-        name: Of the model.
-        version: Of the model.
-        spec: What the model says about itself.
-    """
+    name: str
+    """Of the model."""
+    version: int
+    """Of the model."""
+    spec: ModelSpec
+    """What the model says about itself."""
 
     def __init__(self, name: str, version: int, spec: ModelSpec, settings: Settings) -> None:
         self.name, self.version, self.spec = name, version, spec

@@ -22,21 +22,18 @@ _ALL_PAIRS = 30  # so many photographs are compared pair by pair, longer sequenc
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Cameras and points in a frame of arbitrary place and scale.
-
-    Attributes:
-        photographs: Those that were placed, in the order given.
-        cam_from_world: [n, 4, 4], rigid.
-        camera: Of all photographs.
-        points: [m, 3], world frame.
-        error_px: Mean distance of points from where they are seen.
-    """
+    """Cameras and points in a frame of arbitrary place and scale."""
 
     photographs: tuple[Path, ...]
+    """Those that were placed, in the order given."""
     cam_from_world: np.ndarray
+    """[n, 4, 4], rigid."""
     camera: Intrinsics
+    """Of all photographs."""
     points: np.ndarray
+    """[m, 3], world frame."""
     error_px: float
+    """Mean distance of points from where they are seen."""
 
     @property
     def centres(self) -> np.ndarray:

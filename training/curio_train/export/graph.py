@@ -35,11 +35,13 @@ from curio_train.worlds.base import ObjectKind, World
 LARGEST_PARITY_ERROR = 1e-4
 """Largest absolute difference between torch and onnxruntime that an export may have, in any output."""
 
+NUM_JITTERED = 12
+"""Rounds of jitter in the check of numerical stability; it misses a tie once in 2 to the power of this."""
+
 _NUM_CHECK_IMAGES = 4  # of either kind
 _CHECK_SEED = (20_210,)
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
-_NUM_JITTERED = 12  # a tie is missed once in 2 to the power of this
 _LEAST_STABLE = 0.25  # of the check images
 
 
@@ -106,6 +108,7 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
     config = triton_config(target.path.name, tuple(images.shape[1:]), shapes)
     target.refuse_other_tensors(config)
+    known = numerically_stable(deployed if half else trained, images)
 
     model = to_onnx(deployed, world.camera.width, world.camera.height, list(expected))
     if half:
@@ -121,7 +124,6 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     put_spec(model, spec)
 
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
-    known = numerically_stable(deployed if half else trained, images)
     answers, found = ({name: v[known] for name, v in of.items()} for of in (expected if half else learned, found))
     spec.parity_max_abs_error = refuse_disparity(answers, found)
     put_spec(model, spec)
@@ -207,7 +209,7 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
     pixels = images.permute(0, 3, 1, 2).float() / 255
     known = torch.ones(len(images), dtype=torch.bool)
     with _jittered_layers(graph.network, generator):
-        for _ in range(_NUM_JITTERED):
+        for _ in range(NUM_JITTERED):
             jittered = graph.read(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
             for name, values in answers.items():
                 known &= (values - jittered[name]).abs().flatten(1).amax(dim=1) <= LARGEST_PARITY_ERROR
