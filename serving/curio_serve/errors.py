@@ -46,7 +46,7 @@ class ArgumentError(RequestError):
 
 
 class ImageError(RequestError):
-    """Not an image, damaged, or of a kind or size that is not accepted."""
+    """The bytes are no image, are damaged, or have a format or size that is not accepted."""
 
 
 class CameraError(RequestError):

@@ -212,13 +212,13 @@ def _estimator(arguments: DetectArguments, settings: "Settings") -> "Estimator":
 
 
 def _answering(arguments: DetectArguments, settings: "Settings") -> "Callable[[SourceImage], ImageLines]":
-    """What answers images in another process."""
+    """Build the function that answers images in another process."""
     estimator = _estimator(arguments, settings)
     return partial(_answer, estimator, _format(arguments, estimator.spec))
 
 
 def _answer(estimator: "Estimator", form: "ResultFormat", image: "SourceImage") -> "ImageLines":
-    """What is written of an image. One thread that made the lines of all images would keep the others waiting."""
+    """Answer an image and format its lines, both in the worker: one thread for all lines would be too slow."""
     return form.lines(estimator(image))
 
 

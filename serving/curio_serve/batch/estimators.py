@@ -37,7 +37,7 @@ _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 @dataclass(frozen=True)
 class Settings:
-    """What holds for all images of a run."""
+    """The settings that all images of a run share."""
 
     cameras: CameraFile | None = None
     """Their intrinsics; None for 2D worlds and models that allow a default."""
@@ -55,7 +55,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a model saw in one image."""
+    """The answer of a model to one image."""
 
     width: int
     height: int
@@ -76,7 +76,7 @@ class Estimator(ABC):
     version: int
     """Of the model."""
     spec: ModelSpec
-    """What the model says about itself."""
+    """The model's specification."""
 
     def __init__(self, name: str, version: int, spec: ModelSpec, settings: Settings) -> None:
         self.name, self.version, self.spec = name, version, spec

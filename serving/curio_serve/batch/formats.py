@@ -39,7 +39,7 @@ LINEMOD_OBJECT_IDS: Mapping[str, int] = {
 
 @dataclass(frozen=True)
 class ImageResult:
-    """What became of one image."""
+    """The detections of one image, or its error."""
 
     image: str
     """Its path as given."""
@@ -73,7 +73,7 @@ class ImageResult:
 
 @dataclass(frozen=True)
 class ImageLines:
-    """What a result file gets of one image."""
+    """The lines of a result file that belong to one image."""
 
     image: str
     """Its path as given."""
@@ -110,7 +110,7 @@ class ResultFormat(ABC):
     """A complete line is then a complete image."""
 
     def lines(self, result: ImageResult) -> ImageLines:
-        """What a file gets of an image."""
+        """Format the lines of an image."""
         return ImageLines(result.image, result.error, self.encode(result))
 
     @abstractmethod
@@ -119,7 +119,7 @@ class ResultFormat(ABC):
 
     @abstractmethod
     def key(self, image: str) -> str:
-        """How lines of this format name an image."""
+        """The name of an image in lines of this format."""
 
     @abstractmethod
     def parse(self, line: bytes) -> Line:

@@ -28,7 +28,7 @@ NamedT = TypeVar("NamedT", bound=Named)
 
 
 class ResultFile:
-    """Where results go, in the order of the images.
+    """Writes results in the order of the images, and resumes after a stop.
 
     Args:
         path: The file; None: standard output.

@@ -85,7 +85,7 @@ class PassedOver:
         self._empty.append(path)
 
     def lines(self) -> Iterator[str]:
-        """What a person should know."""
+        """The lines that tell a person what was passed over."""
         yield from (f"{path} holds no image" for path in self._empty)
         if self._num_files:
             more = ", …" if self._num_files > len(self._first) else ""

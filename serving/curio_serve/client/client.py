@@ -168,7 +168,7 @@ class PoseClient(_Client):
             call.cancel()  # the caller may have stopped listening early
 
     def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
-        """What the server has loaded."""
+        """The models that the server has loaded."""
         return list(self._call(self._stub.ListModels, messages.ListModelsRequest(), timeout_s).models)
 
     def get_model(self, model: str, *, timeout_s: float | None = None) -> messages.GetModelResponse:
@@ -234,7 +234,7 @@ class AsyncPoseClient(_Client):
             call.cancel()
 
     async def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
-        """What the server has loaded."""
+        """The models that the server has loaded."""
         return list((await self._call(self._stub.ListModels, messages.ListModelsRequest(), timeout_s)).models)
 
     async def get_model(self, model: str, *, timeout_s: float | None = None) -> messages.GetModelResponse:

@@ -43,7 +43,7 @@ _DERIVED = {"rotation", "rotation_6d"}
 
 @dataclass(frozen=True)
 class Runtime:
-    """How networks are run."""
+    """The settings that networks run with."""
 
     providers: tuple[str, ...] = ("CPUExecutionProvider",)
     """onnxruntime's execution providers in order of preference."""

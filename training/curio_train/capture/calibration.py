@@ -20,7 +20,7 @@ _LARGEST_UNCERTAINTY = 0.01  # of the focal length, one standard deviation
 
 @dataclass(frozen=True)
 class Board:
-    """What was photographed."""
+    """The calibration board that the photographs show."""
 
     columns: int
     """Squares along the longer side."""

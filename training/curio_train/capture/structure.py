@@ -37,7 +37,7 @@ class Structure:
 
     @property
     def centres(self) -> np.ndarray:
-        """Where the cameras stood, [n, 3], world frame."""
+        """Positions of the cameras, [n, 3], world frame."""
         rotations, shifts = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
         return -np.einsum("nji,nj->ni", rotations, shifts)
 
@@ -150,7 +150,7 @@ def _checked(photographs: Sequence[Path], found: Any, known: Intrinsics | None) 
 
 
 def _intrinsics(camera: Any, where: str) -> Intrinsics:
-    """Of a SIMPLE_RADIAL camera: one focal length, the centre, and k1."""
+    """Intrinsics of a SIMPLE_RADIAL camera: one focal length, the centre, and k1."""
     matrix = np.array(camera.calibration_matrix())
     matrix[:2, 2] -= 0.5
     k1 = float(camera.params[3])

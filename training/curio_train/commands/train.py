@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Session:
-    """Where and how this process trains; may differ between the sessions of one run."""
+    """Where and how this process trains. Sessions of one run may differ in it."""
 
     out: Path | None = None
     """Folder of the new run; runs/WORLD-METHOD-SEED unless given."""

@@ -27,7 +27,7 @@ _SUPERVISION = {
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a version comes from."""
+    """The origin of a version: its run, configuration, sessions and progress."""
 
     run: Path
     """The run folder."""
@@ -94,7 +94,7 @@ def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[s
 
 
 def _sum(before: float, here: float, form: str) -> str:
-    """Of a run, or of a run and the network that it began with."""
+    """Text of a total and, if the run began with another network, of its two parts."""
     total = form.format(before + here)
     return (
         f"{total} ({form.format(before)} of the network it began with, {form.format(here)} here)" if before else total
@@ -138,7 +138,7 @@ def _metrics(evaluation: Mapping[str, Any]) -> str:
 
 
 def _real_frames(evaluation: Mapping[str, Any]) -> str:
-    """Of the frames of a data set, whose labels are for scoring alone."""
+    """Table of the scores on real frames of a data set, whose labels only score."""
     real, refined = evaluation["real"], evaluation.get("refined", {}).get("real", {}).get("metrics", {})
     rows = [
         (name, f"{value:.4g}", f"{refined[name]:.4g}" if name in refined else "–")
