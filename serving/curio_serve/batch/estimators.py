@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
-from curio_proto.v1.detector_pb2 import RegionResult
+import numpy as np
+from curio_proto.v1.detector_pb2 import Detection, RegionResult
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_serve.batch.formats import ImageResult
@@ -109,6 +110,21 @@ class Estimator(ABC):
             seen.decode_ms,
             seen.inference_ms,
         )
+
+    def overlay(self, pixels: np.ndarray) -> tuple[np.ndarray, list[Detection]]:
+        """A video's frame with its detections drawn in, and the detections, most confident first.
+
+        Args:
+            pixels: uint8 RGB [height, width, 3].
+
+        Raises:
+            RequestError: The frame or its camera is not acceptable.
+            ServiceError: The server is out of reach or overloaded.
+        """
+        image = SourceImage("frame", "frame", 0, pixels)
+        seen = self._look(image, b"", self._camera(image))
+        found = [detection for result in seen.results for detection in result.detections]
+        return draw(pixels, seen.results, self.spec, seen.camera), found
 
     @abstractmethod
     def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> _Seen:
