@@ -44,7 +44,7 @@ ERRORS = {
     "eval-nothing-there": "curio-eval nowhere",
     "eval-no-model": "curio-eval text.onnx",
     "export-no-run": "curio-export empty",
-    "doctor-unknown-unit": "curio-doctor --mesh gone.stl --mesh-unit furlong",
+    "doctor-no-mesh-named": "curio-doctor --mesh",
     "render-unknown-world": "curio-render atlantis --out renderings",
     "serve-no-folder": "curio-serve nowhere",
     "serve-port": "curio-serve empty --port 70000",

@@ -13,6 +13,7 @@ from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.camera_files import read_camera_file
 from curio_serve.imaging.image import MAX_FILE_BYTES
+from curio_serve.imaging.image_header import read_header
 from curio_serve.imaging.view import Region
 
 ImageLike: TypeAlias = str | Path | bytes | np.ndarray
@@ -48,12 +49,13 @@ def detect_request(
     Raises:
         ArgumentError: A value is of the wrong shape or kind.
         ImageError: The file cannot be read, or the array is no image.
-        CameraError: The camera file cannot be read, or the matrix is no K.
+        CameraError: The camera file cannot be read or is of another image size, or the matrix is no K.
     """
+    found = None if camera is None else _camera(camera, image)
     request = messages.DetectRequest(
         request_id=request_id,
         models=[selector(name) for name in ([model] if isinstance(model, str) else model)],
-        camera=_camera(camera, image),
+        camera=None if found is None else _message(found),
         regions=[_region(region) for region in regions],
         min_confidence=min_confidence,
         max_detections=max_detections,
@@ -63,6 +65,9 @@ def detect_request(
         request.raw.CopyFrom(_raw(image))
     else:
         request.encoded = image if isinstance(image, bytes) else _read(image)
+    if found is not None and found.size is not None:  # the message has no field for it: a server cannot check
+        size = request.raw if isinstance(image, np.ndarray) else read_header(request.encoded)
+        found.check_frame(size.width, size.height)
     return request
 
 
@@ -95,14 +100,14 @@ def _read(path: str | Path) -> bytes:
         raise ImageError(f"{path} cannot be read: {exc.strerror}") from exc
 
 
-def _camera(camera: CameraLike, image: ImageLike) -> messages.Camera | None:
-    if camera is None:
-        return None
+def _camera(camera: CameraLike, image: ImageLike) -> PinholeCamera:
     if isinstance(camera, str | Path):
-        found = read_camera_file(camera).camera_for(image if isinstance(image, str | Path) else "")
-    else:
-        found = camera if isinstance(camera, PinholeCamera) else PinholeCamera(_matrix(camera))
-    return messages.Camera(camera_matrix=found.matrix.ravel(), distortion=found.distortion)
+        return read_camera_file(camera).camera_for(image if isinstance(image, str | Path) else "")
+    return camera if isinstance(camera, PinholeCamera) else PinholeCamera(_matrix(camera))
+
+
+def _message(camera: PinholeCamera) -> messages.Camera:
+    return messages.Camera(camera_matrix=camera.matrix.ravel(), distortion=camera.distortion)
 
 
 def _matrix(values: Any) -> np.ndarray:
