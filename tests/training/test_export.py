@@ -149,13 +149,13 @@ def test_versions_stand_beside_each_other(single: Exported, half: Exported, mode
 def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Exported, tmp_path: Path) -> None:
     spec = ExportedModel.open(single.path / "model.onnx").spec
     config, progress = RunConfig(CirclesOptions(), method="noncur"), TrainingProgress(step=2, images=64, seconds=1.5)
-    made = Provenance(tmp_path, config, this_session(), progress, "float32")
+    made = Provenance(tmp_path, config, [this_session()], progress, "float32")
     result = {"split": "test", "num_images": 500, "metrics": {"position_px": 1.25}, "untrained": {"position_px": 40.0}}
     for images_seen, quoted in ((32, False), (64, True)):
         (tmp_path / EVALUATION_FILE).write_text(json.dumps(result | {"images_seen": images_seen}))
         text = card(1, spec, {TRANSLATION: (1, 3)}, Circles.objects, made)
         assert ("| position_px | 1.25 | 40 |" in text) == quoted
-        assert ("Not evaluated" in text) != quoted
+        assert ("had not scored it" in text) != quoted
         assert "real frames" not in text
     real = {"dataset": "lmo", "split_name": "bop19 targets", "num_targets": 89, "metrics": {"add_recall": 0.25}}
     for refined, column in (({}, "–"), ({"refined": {"real": {"metrics": {"add_recall": 0.5}}}}, "0.5")):

@@ -78,7 +78,8 @@ def test_images_count_on_over_models_and_in_their_cards(model: Path, tmp_path: P
     assert spec.images_seen == 64 + 12
     assert spec.training_seconds > 1.5
     card = (version.parent / "CARD.md").read_text()
-    assert "| images seen | 76, 12 of them since it was circles |" in card
+    assert "| images seen | 76 (64 of the network it began with, 12 here) |" in card
+    assert card.count("; then `") == 1  # the second session
     assert "| a | 2 |" in card
     assert "`curio-train circles --init models/circles/1`" in card
     assert begun(version).progress.images_before == 76

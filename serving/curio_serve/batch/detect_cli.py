@@ -109,7 +109,7 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.parallel import in_order
     from curio_serve.batch.progress import Progress
     from curio_serve.batch.result_file import ResultFile
-    from curio_serve.batch.sources import check_arguments, images
+    from curio_serve.batch.sources import PassedOver, check_arguments, images
     from curio_serve.models.model_check import ChildCheck
 
     _check_numbers(arguments)
@@ -121,9 +121,9 @@ def run(arguments: DetectArguments) -> int:
     estimator = _estimator(arguments, settings)
     form = _format(arguments, estimator.spec)
     _check_camera(arguments, estimator)
-    model = (estimator.name, estimator.version)
+    model, passed_over = (estimator.name, estimator.version), PassedOver()
     with ResultFile(arguments.out, form, model, overwrite=arguments.overwrite) as output:
-        remaining = output.unanswered(images(arguments.images))
+        remaining = output.unanswered(images(arguments.images, passed_over))
         if arguments.ray is None:
             results = in_order(partial(_answer, estimator, form), remaining, arguments.jobs)
         else:  # other nodes have another working folder
@@ -137,6 +137,8 @@ def run(arguments: DetectArguments) -> int:
             for result in results:
                 output.write(result)
                 progress.count(result)
+        for line in passed_over.lines():
+            print(f"curio-detect: {line}", file=sys.stderr)
         if output.num_images == 0:
             raise UsageError(
                 f"no images in {' '.join(arguments.images)}; looked for .jpg, .jpeg, .png and .webp in folders, "
@@ -210,13 +212,13 @@ def _estimator(arguments: DetectArguments, settings: "Settings") -> "Estimator":
 
 
 def _answering(arguments: DetectArguments, settings: "Settings") -> "Callable[[SourceImage], ImageLines]":
-    """What answers images in another process."""
+    """Build the function that answers images in another process."""
     estimator = _estimator(arguments, settings)
     return partial(_answer, estimator, _format(arguments, estimator.spec))
 
 
 def _answer(estimator: "Estimator", form: "ResultFormat", image: "SourceImage") -> "ImageLines":
-    """What is written of an image. One thread that made the lines of all images would keep the others waiting."""
+    """Answer an image and format its lines, both in the worker: one thread for all lines would be too slow."""
     return form.lines(estimator(image))
 
 

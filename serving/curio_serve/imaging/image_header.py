@@ -22,7 +22,7 @@ MAX_JPEG_SCANS = 64
 
 @dataclass(frozen=True)
 class Header:
-    """What the head of an image file declares."""
+    """The properties that the header of an image file declares."""
 
     format: ImageFormat
     """Container."""

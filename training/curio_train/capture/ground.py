@@ -76,7 +76,7 @@ def scaled(structure: Structure, factor: float) -> Structure:
 
 
 def scale_by_distance(structure: Structure, first: int, second: int, distance_m: float) -> Structure:
-    """In metres, by the distance of two cameras.
+    """Scale a structure to metres by the known distance of two cameras.
 
     Raises:
         CameraError: The two stood at one place, or the distance is none.
@@ -91,7 +91,7 @@ def scale_by_distance(structure: Structure, first: int, second: int, distance_m:
 
 
 def scale_by_height(structure: Structure, height_m: float) -> Structure:
-    """In metres, by the height of the one object that stands on the ground, as its mesh has it.
+    """Scale a structure to metres by the height of the one object that stands on the ground; its mesh has the height.
 
     Args:
         structure: In the world's frame.

@@ -71,7 +71,7 @@ def _refuse_unreadable(options: LinemodOptions) -> None:
 
 
 def _with_paint(options: CaptureOptions, tell: Callable[[str], None]) -> CaptureOptions:
-    """Off the plane an unpainted part is drawn in the colour that photographs over a background image show."""
+    """In free space, find an unpainted part's colour in photographs over a background image, and set it."""
     from curio_train.camera import load_intrinsics
     from curio_train.data.part_color import find_color, is_unpainted
     from curio_train.meshes.meshes import load_mesh

@@ -13,7 +13,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes
 
 from curio_train.capture.options import CalibrateCommand
-from curio_train.commands.field_help import join_help_lines
+from curio_train.commands.field_help import join_help_lines, parsed
 from curio_train.commands.project_file import with_project
 from curio_train.commands.running import CACHE, answer, tell, warn
 from curio_train.config import NetworkConfig, Preset, Recipe, RunConfig, WorldOptions, preset_recipe
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Session:
-    """Where and how this process trains; may differ between the sessions of one run."""
+    """Where and how this process trains. Sessions of one run may differ in it."""
 
     out: Path | None = None
     """Folder of the new run; runs/WORLD-METHOD-SEED unless given."""
@@ -55,7 +55,7 @@ def train(arguments: Sequence[str] | None = None) -> None:
     """``curio-train WORLD …``: exit status 0 done, 1 failed, 2 wrong call, 128 + signal when interrupted."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     if given[:1] == ["capture"] and "--calibrate" in given:
-        calibration = tyro.cli(CalibrateCommand, args=given[1:], prog="curio-train capture")
+        calibration = parsed(CalibrateCommand, given[1:], "curio-train capture")
         sys.exit(answer(lambda _: _calibrate(calibration)))
     sys.exit(answer(lambda interruption: _train(parse(given), interruption)))
 

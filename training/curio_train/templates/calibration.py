@@ -59,7 +59,7 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -
 
 
 def _depth_factor(found: list[Pose], true: list[Pose], nearly: np.ndarray) -> float:
-    """By which distances that were nearly right are too small, in the median; 1 where there are none."""
+    """Median ratio of true to predicted distance over poses that were nearly right; 1 if there are none."""
     ratios = [t.translation_m[2] / f.translation_m[2] for f, t in zip(found, true, strict=True)]
     return float(np.median(np.array(ratios)[nearly])) if nearly.any() else 1.0
 

@@ -187,7 +187,7 @@ class TemplateNetwork(nn.Module):
         return Poses(*self._in_frame(Aligned(turn, placed, total), back), total, best.place), spread
 
     def _best(self, poses: Poses, num_images: int) -> Poses:
-        """Of the hypotheses of each image the one with the highest score."""
+        """The hypothesis of each image that has the highest score."""
         by_image = poses.score.unflatten(0, (num_images, -1))
         row = torch.arange(num_images, device=by_image.device) * by_image.shape[1] + by_image.argmax(dim=1)
         return Poses(*(of_all[row] for of_all in poses))
@@ -195,7 +195,7 @@ class TemplateNetwork(nn.Module):
     def _crops(
         self, images: Tensor, positions_m: Float[Tensor, "batch num 3"], side: int
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What cameras turned towards places see: crops, cam_from_crop, distances and focal lengths, a row a place."""
+        """Crops of cameras that look at positions; cam_from_crop, distances and focal lengths, a row a position."""
         place = positions_m.flatten(0, 1)
         depth = place.square().sum(dim=1).sqrt().clamp(min=self.geometry.near_m / 2)
         focal_px = FILL * CROP_PX * depth / self.geometry.diameter_m
@@ -226,5 +226,5 @@ def _shifts() -> Float[Tensor, "shifts 2"]:
 
 
 def _probability(evidence: Float[Tensor, "batch 2"], weights: Float[Tensor, " 3"]) -> Float[Tensor, " batch"]:
-    """Of the weighed sum as a logit; the offset is last."""
+    """Sigmoid of the weighted sum of calibration features; the last weight is the offset."""
     return torch.sigmoid(evidence @ weights[:-1] + weights[-1])

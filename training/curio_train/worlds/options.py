@@ -195,7 +195,7 @@ class CaptureOptions(WorldOptions):
             )
 
     def _given_flags(self, names: tuple[str, ...]) -> str:
-        """Those flags whose value is not the default."""
+        """The flags of these fields whose values are not the defaults."""
         given = [name for name in names if getattr(self, name) != getattr(CaptureOptions, name)]
         return ", ".join(f"--{name.replace('_', '-')}" for name in given)
 
