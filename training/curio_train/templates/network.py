@@ -67,8 +67,6 @@ class TemplateNetwork(nn.Module):
     """All templates."""
     geometry: Geometry
     """Of frames and object."""
-    depth_factor: Tensor
-    """Predicted distances are multiplied by it; calibrated on renderings."""
     rightness: Tensor
     """Weights [2] and offset of the pose-correct logit; calibrated on renderings."""
     presence: Tensor
@@ -86,7 +84,6 @@ class TemplateNetwork(nn.Module):
         super().__init__()
         self.trunk, self.localiser, self.bank = Trunk(), Localiser(geometry), Bank()
         self.geometry, self._steps = geometry, steps
-        self.register_buffer("depth_factor", torch.ones(()))
         self.register_buffer("rightness", torch.tensor([1.0, 0.0, 0.0]))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]))
         self.register_buffer("_matrix", torch.from_numpy(geometry.matrix).float()[None], persistent=False)
@@ -108,7 +105,7 @@ class TemplateNetwork(nn.Module):
             torch.stack([10 * last.score, -100 * spread], dim=1), torch.stack([10 * last.score, last.place], dim=1)
         )
         return {
-            TRANSLATION: (last.position_m * self.depth_factor)[:, None],
+            TRANSLATION: last.position_m[:, None],
             ROTATION_6D: rotation_6d_from_matrix(last.rotation)[:, None],
             LIGHT: self._lamp.expand(images.shape[0], 3),
         }, evidence
