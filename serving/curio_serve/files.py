@@ -1,9 +1,11 @@
 """Reads files that users name, which may be anything: pipes, devices, sparse files larger than the memory."""
 
 import errno
+import json
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 
 def read_file(path: str | Path, max_bytes: int) -> bytes:
@@ -20,6 +22,24 @@ def read_file(path: str | Path, max_bytes: int) -> bytes:
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         check_regular(os.fstat(file.fileno()), path, max_bytes)
         return file.read(max_bytes)
+
+
+def read_json(path: str | Path, max_bytes: int) -> Any:
+    """The value in a JSON file in UTF-8.
+
+    Raises:
+        OSError: As :func:`read_file`.
+        ValueError: It is not JSON, or nested more deeply than Python's recursion goes.
+    """
+    try:
+        return json.loads(read_file(path, max_bytes).decode("utf-8"))
+    except RecursionError as exc:
+        raise ValueError("nested too deeply") from exc
+
+
+def direct(path: Path) -> Path:
+    """The path without ``..``, so that making its folders makes none that it only passes through."""
+    return Path(os.path.realpath(path.parent), path.name) if ".." in path.parts else path
 
 
 def check_regular(status: os.stat_result, path: str | Path, max_bytes: int | None = None) -> None:

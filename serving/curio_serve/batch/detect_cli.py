@@ -196,7 +196,7 @@ def _settings(arguments: DetectArguments) -> "Settings":
         arguments.min_confidence,
         arguments.max_detections,
         arguments.exif_rotation,
-        arguments.overlays and arguments.overlays.absolute(),
+        arguments.overlays and Path(os.path.abspath(arguments.overlays)),
         common_folder(arguments.images or ["."]),
     )
 
@@ -211,7 +211,7 @@ def _check_overlays(folder: Path, images: tuple[str, ...]) -> None:
         if target == source or (not os.path.isfile(argument) and argument != "-" and target.is_relative_to(source)):
             raise UsageError(f"--overlays {folder} lies within the images' own folder {source}; choose one outside it")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        target.mkdir(parents=True, exist_ok=True)
     except OSError as exc:
         raise UsageError(f"--overlays {folder}: cannot be made: {exc.strerror}") from exc
 

@@ -15,6 +15,7 @@ from typing import BinaryIO, Protocol, TypeVar
 
 from curio_serve.batch.formats import ImageLines, Line, ResultFormat
 from curio_serve.errors import OutputError, UsageError
+from curio_serve.files import direct
 
 
 class Named(Protocol):
@@ -176,6 +177,7 @@ class ResultFile:
 def _open_locked(path: Path) -> int:
     """A descriptor for reading and appending that no other process of ours has open."""
     try:
+        path = direct(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
     except OSError as exc:

@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 
 from curio_serve.errors import ImageError, UsageError
+from curio_serve.files import read_file
+from curio_serve.imaging.image import MAX_FILE_BYTES
 from curio_serve.models.model_folder import CONFIG_FILE
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
@@ -44,18 +46,18 @@ class SourceImage:
     pixels: Pixels | None = None
     """Uint8 RGB [height, width, 3] of a video's frame."""
     error: str = ""
-    """Why a video has no frames to give."""
+    """Why a video has no frames to give, or a folder no images."""
 
     def read(self) -> bytes:
         """The bytes of an image file.
 
         Raises:
-            ImageError: The file cannot be read, or there is none.
+            ImageError: The file cannot be read, is no regular file or too large, or there is none.
         """
         if self.error:
             raise ImageError(self.error)
         try:
-            return Path(self.path).read_bytes()
+            return read_file(self.path, MAX_FILE_BYTES)
         except (OSError, ValueError) as exc:  # ValueError: a null byte in the name
             reason = exc.strerror if isinstance(exc, OSError) else str(exc)
             raise ImageError(f"cannot be read: {reason}") from exc
@@ -113,14 +115,11 @@ def check_arguments(arguments: Sequence[str]) -> None:
 
 
 def images(arguments: Sequence[str], passed_over: PassedOver) -> Iterator[SourceImage]:
-    """Every image that the arguments name, in order.
+    """Every image that the arguments name, in order; a folder that cannot be listed is one image with that error.
 
     Args:
         arguments: As on the command line.
         passed_over: Counts what is no image.
-
-    Raises:
-        UsageError: A folder cannot be listed.
     """
     for argument in arguments:
         if argument == STANDARD_INPUT:
@@ -169,11 +168,14 @@ def _images_at(path: str, passed_over: PassedOver) -> Iterator[SourceImage]:
 def _images_below(folder: str, passed_over: PassedOver) -> Iterator[SourceImage]:
     """Image files of a folder and its sub-folders; of a BOP scene the photographs alone, not its depths and masks."""
     is_bop_scene = any(os.path.exists(os.path.join(folder, name)) for name in _BOP_SCENE_FILES)
-    for name, is_folder in _sorted_entries(folder, passed_over):
-        if not is_folder:
-            yield SourceImage(os.path.join(folder, name), os.path.join(folder, name))
-        elif not is_bop_scene or name in _BOP_IMAGE_FOLDERS:
-            yield from _images_below(os.path.join(folder, name), passed_over)
+    try:
+        for name, is_folder in _sorted_entries(folder, passed_over):
+            if not is_folder:
+                yield SourceImage(os.path.join(folder, name), os.path.join(folder, name))
+            elif not is_bop_scene or name in _BOP_IMAGE_FOLDERS:
+                yield from _images_below(os.path.join(folder, name), passed_over)
+    except OSError as exc:
+        yield SourceImage(folder, folder, error=f"cannot be listed: {exc.strerror}")
 
 
 def _sorted_entries(folder: str, passed_over: PassedOver) -> Iterator[tuple[str, bool]]:
@@ -188,17 +190,14 @@ def _sorted_entries(folder: str, passed_over: PassedOver) -> Iterator[tuple[str,
 
 
 def _entries_after(folder: str, last: str, passed_over: PassedOver) -> Iterator[tuple[str, bool]]:
-    try:
-        with os.scandir(folder) as entries:
-            for entry in entries:
-                is_hidden, is_folder = entry.name.startswith("."), entry.is_dir(follow_symlinks=False)
-                is_image = not is_hidden and os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES
-                if not is_image and not last and not entry.is_dir():  # in the first pass alone
-                    passed_over.file(entry.name)
-                if entry.name > last and ((is_folder and not is_hidden) or (is_image and not entry.is_dir())):
-                    yield entry.name, is_folder
-    except OSError as exc:
-        raise UsageError(f"{folder}: cannot be listed: {exc.strerror}") from exc
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            is_hidden, is_folder = entry.name.startswith("."), entry.is_dir(follow_symlinks=False)
+            is_image = not is_hidden and os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES
+            if not is_image and not last and not entry.is_dir():  # in the first pass alone
+                passed_over.file(entry.name)
+            if entry.name > last and ((is_folder and not is_hidden) or (is_image and not entry.is_dir())):
+                yield entry.name, is_folder
 
 
 def _video_frames(path: str) -> Iterator[SourceImage]:

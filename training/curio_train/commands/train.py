@@ -120,6 +120,8 @@ def _unset(kind: type[WorldOptions]) -> WorldOptions:
 
 
 def _train(command: TrainCommand, interruption: Interruption) -> int:
+    from curio_serve.files import direct
+
     from curio_train.commands.finish import end
     from curio_train.commands.prepare import prepared
     from curio_train.learning.loop import Outcome
@@ -128,7 +130,11 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
 
     session = command.session
     config = command.config if session.resume else prepared(command.config, session.cache, warn, tell)
-    path = session.resume or session.out or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
+    path = (
+        session.resume
+        or (session.out and direct(session.out))
+        or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
+    )
     if config.terms.templates:
         seconds = draw_templates(config, path, session.cache).seconds
         print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")

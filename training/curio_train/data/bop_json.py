@@ -1,12 +1,15 @@
 """JSON files read with a name for every value, so that an error says which file and which key."""
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from curio_serve.files import read_json
+
 from curio_train.errors import DataError
+
+_MAX_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ def read_records(path: Path) -> Record:
         DataError: The file is missing or not JSON.
     """
     try:
-        return Record(json.loads(path.read_text(encoding="utf-8")), str(path))
+        return Record(read_json(path, _MAX_BYTES), str(path))
     except OSError as exc:
         raise DataError(f"{path}: cannot be read ({exc.strerror}); is the data set complete?") from exc
     except ValueError as exc:

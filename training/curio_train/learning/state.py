@@ -1,6 +1,6 @@
 """All that changes while a run learns: what a checkpoint holds."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -92,6 +92,15 @@ class TrainingProgress:
     """Images shown before this run, where it began with trained weights (``--init``)."""
     seconds_before: float = 0.0
     """Time spent training before this run."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no run can reach.
+
+        Raises:
+            ValueError: One is negative, not finite or larger than 2⁵³.
+        """
+        if not all(value is None or 0 <= value <= 1 << 53 for value in astuple(self)):
+            raise ValueError(f"found {self}, expected numbers from 0 to 2⁵³")
 
     @property
     def all_images(self) -> int:

@@ -6,6 +6,7 @@ Units are settled here, once: nothing behind :func:`load_mesh` knows millimetres
 import hashlib
 import io
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 import trimesh
+from curio_serve.files import read_file
 
 from curio_train.errors import MeshError
 from curio_train.meshes.extent import box_corners, diameter
@@ -20,10 +22,14 @@ from curio_train.meshes.extent import box_corners, diameter
 Unit = Literal["m", "cm", "mm", "inch"]
 METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 SMALLEST_M, LARGEST_M = 0.001, 20.0
+MAX_BYTES = 1 << 28  # of a mesh, a material or a texture; in memory a mesh takes eight times that
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 
 # What trimesh's readers let through on damaged files, found by feeding them such.
-_READER_ERRORS = (ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError, OSError, MemoryError)
+_READER_ERRORS = (
+    ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError, OSError, MemoryError,
+    ArithmeticError,
+)  # fmt: skip
 _TRIMESH_DEFAULT_COLOR = (102, 102, 102)
 
 
@@ -100,7 +106,7 @@ def _read(path: Path) -> bytes:
     if path.suffix.lower() not in SUFFIXES:
         raise MeshError(f"{path}: unknown kind of mesh {path.suffix!r}; expected one of {' '.join(SUFFIXES)}")
     try:
-        content = path.read_bytes()
+        content = read_file(path, MAX_BYTES)
     except OSError as exc:
         raise MeshError(f"{path}: the mesh cannot be read ({exc.strerror})") from exc
     if not content:
@@ -108,9 +114,24 @@ def _read(path: Path) -> bytes:
     return content
 
 
+class _Beside(trimesh.resolvers.FilePathResolver):
+    """Materials and textures, which lie beside the mesh."""
+
+    def get(self, name: str) -> bytes:
+        """The content of one; only of regular files.
+
+        Raises:
+            OSError: There is none, or it is too large.
+        """
+        for candidate in (name, name.strip().lstrip("/"), Path(name).name):
+            with suppress(FileNotFoundError, ValueError):  # ValueError: it would lie elsewhere
+                return read_file(self.absolute(candidate), MAX_BYTES)
+        raise FileNotFoundError(name)
+
+
 def _parse(path: Path, content: bytes) -> Any:
     kind = path.suffix.lower().lstrip(".")
-    resolver = trimesh.resolvers.FilePathResolver(str(path))  # materials and textures lie beside the mesh
+    resolver = _Beside(str(path))
     try:
         return trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
     except _READER_ERRORS as exc:

@@ -5,28 +5,37 @@
     RUN/config.json
         checkpoints/00001200/tensors.safetensors     weights, buffers, the optimisers' moments
                              course.json             see TrainingProgress
+                             SHA256SUMS              of both
         checkpoints/00001400/…                       the last two are kept
         history.jsonl  samples.png  tensorboard/     written by ``progress``
 """
 
+import fcntl
+import hashlib
 import json
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
 import torch
+from curio_serve.files import read_file
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, UsageError
-from curio_train.learning.runs.configuration import CONFIG_FILE, load_config, to_json
+from curio_train.learning.runs.configuration import CONFIG_FILE, MAX_JSON_BYTES, load_config, structured, to_json
+from curio_train.learning.runs.provenance import SESSIONS_FILE, last_session
 from curio_train.learning.state import TrainingProgress, TrainState
 from curio_train.worlds.base import World
 
 _NUM_KEPT = 2
+_TENSORS, _PROGRESS, _SUMS = "tensors.safetensors", "course.json", "SHA256SUMS"
+_MAX_TENSOR_BYTES = 1 << 31
 
 
 class RunFolder:
@@ -69,9 +78,31 @@ class RunFolder:
             draft.replace(file)
             _sync_folder(self.path)
         except OSError as exc:
-            raise CheckpointError(
-                f"cannot write the run folder {self.path}: {exc.strerror}; name another: --out"
-            ) from exc
+            raise self._not_writable(exc) from exc
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep other processes from training this run for as long as the block lasts.
+
+        Raises:
+            CheckpointError: Another process trains it, or the folder cannot be written.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            sessions = (self.path / SESSIONS_FILE).open("ab")
+        except OSError as exc:
+            raise self._not_writable(exc) from exc
+        with sessions:
+            try:
+                fcntl.flock(sessions, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as exc:
+                raise CheckpointError(
+                    f"another process trains {self.path}: {last_session(self.path)}; end it first, or name another "
+                    "folder: --out"
+                ) from exc
+            except OSError:
+                pass  # a file system without locks
+            yield
 
     def checkpoints(self) -> list[Path]:
         """Complete checkpoints, oldest first."""
@@ -89,8 +120,10 @@ class RunFolder:
             shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed while writing
             draft.mkdir(parents=True)
             tensors = {name: value.detach().cpu().contiguous() for name, value in state.tensors().items()}
-            _write_synced(draft / "tensors.safetensors", save(tensors))
-            _write_synced(draft / "course.json", json.dumps(asdict(state.progress)).encode())
+            contents = {_TENSORS: save(tensors), _PROGRESS: json.dumps(asdict(state.progress)).encode()}
+            contents[_SUMS] = "".join(f"{_sha256(data)}  {name}\n" for name, data in contents.items()).encode()
+            for name, data in contents.items():
+                _write_synced(draft / name, data)
             _sync_folder(draft)
             if not target.exists():  # the same step is the same checkpoint
                 draft.rename(target)
@@ -121,9 +154,14 @@ class RunFolder:
             raise CheckpointError(f"{self.path} has no checkpoint yet; train it first: --resume {self.path}")
         last = checkpoints[-1]
         try:
-            progress = TrainingProgress(**json.loads((last / "course.json").read_bytes()))
-            return load((last / "tensors.safetensors").read_bytes()), progress
-        except (OSError, ValueError, TypeError, SafetensorError) as exc:
+            tensors = read_file(last / _TENSORS, _MAX_TENSOR_BYTES)
+            progress = read_file(last / _PROGRESS, MAX_JSON_BYTES)
+            if (last / _SUMS).exists():  # earlier versions wrote none
+                sums = read_file(last / _SUMS, MAX_JSON_BYTES).decode().split()
+                if sums != [_sha256(tensors), _TENSORS, _sha256(progress), _PROGRESS]:
+                    raise ValueError(f"it is not what {_SUMS} says: damaged after it was written")
+            return load(tensors), structured(json.loads(progress), TrainingProgress, _PROGRESS)
+        except (OSError, ValueError, RecursionError, SafetensorError) as exc:
             raise CheckpointError(_unreadable(last, exc)) from exc
 
     def trained(self, world: World) -> TrainState:
@@ -144,6 +182,9 @@ class RunFolder:
         except RuntimeError as exc:
             raise CheckpointError(_unreadable(self.checkpoints()[-1], exc)) from exc
 
+    def _not_writable(self, exc: OSError) -> CheckpointError:
+        return CheckpointError(f"cannot write the run folder {self.path}: {exc.strerror}; name another: --out")
+
     def _not_written(self, target: Path, exc: OSError) -> str:
         kept = self.checkpoints()
         remains = (
@@ -156,6 +197,10 @@ class RunFolder:
 
 def _unreadable(checkpoint: Path, exc: Exception) -> str:
     return f"checkpoint {checkpoint} cannot be read ({exc}); delete this folder to go on from the one before it"
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def _write_synced(path: Path, content: bytes) -> None:

@@ -1,11 +1,12 @@
 """A run's configuration as JSON, and whether two of them are the same run."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from curio_serve.files import read_json
 
 from curio_train.config import RunConfig, WorldOptions
 from curio_train.errors import CheckpointError, ResumeMismatch, UsageError
@@ -15,6 +16,10 @@ if TYPE_CHECKING:
     from cattrs import Converter
 
 CONFIG_FILE = "config.json"
+MAX_JSON_BYTES = 1 << 20
+"""Of the largest JSON file that a run folder may hold."""
+
+T = TypeVar("T")
 _MAY_CHANGE = ("minutes", "images", "stop_below")  # when to stop is not what to learn
 
 
@@ -82,14 +87,28 @@ def from_json(data: Mapping[str, Any]) -> RunConfig:
     Raises:
         ValueError: A field is missing, unknown or impossible; the text names it.
     """
+    return structured(data, RunConfig, "config")
+
+
+def structured(data: Any, kind: type[T], name: str) -> T:
+    """A dataclass of JSON values.
+
+    Args:
+        data: An object with the values of its fields.
+        kind: The dataclass.
+        name: Of the whole, for messages.
+
+    Raises:
+        ValueError: A field is missing, unknown or impossible; the text names it.
+    """
     from cattrs import BaseValidationError, transform_error
 
     if not isinstance(data, Mapping):
         raise ValueError(f"found {data!r}, expected an object")
     try:
-        return _converter().structure(data, RunConfig)
+        return _converter().structure(data, kind)
     except BaseValidationError as exc:
-        raise ValueError("; ".join(transform_error(exc, path="config", format_exception=_reason))) from exc
+        raise ValueError("; ".join(transform_error(exc, path=name, format_exception=_reason))) from exc
 
 
 def _reason(exc: BaseException, kind: type | None) -> str:
@@ -107,7 +126,7 @@ def load_config(run: Path) -> RunConfig:
     """
     file = run / CONFIG_FILE
     try:
-        return from_json(json.loads(file.read_bytes()))
+        return from_json(read_json(file, MAX_JSON_BYTES))
     except OSError as exc:
         raise CheckpointError(
             f"{run} is no run folder: cannot read {file} ({exc.strerror}); expected a folder named by --out"

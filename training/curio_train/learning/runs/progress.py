@@ -136,16 +136,29 @@ def _writing_into(run: Path) -> Iterator[None]:
 
 
 def read_history(run: Path) -> list[dict[str, Any]]:
-    """The lines of ``history.jsonl``, without one that was cut off by a kill; none where there is no such file."""
+    """The lines of ``history.jsonl``, without one that was cut off by a kill; none where there is no such file.
+
+    Raises:
+        CheckpointError: The file is damaged.
+    """
     file = run / _HISTORY
-    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
-    return [json.loads(line) for line in lines if line.endswith("}")]
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        rows = [json.loads(line) for line in lines if line.endswith("}")]
+        if all(isinstance(row, dict) and type(row.get("step")) is int for row in rows):
+            return rows
+        reason = "a line without a step"
+    except (ValueError, RecursionError) as exc:
+        reason = str(exc)
+    raise CheckpointError(f"{file} cannot be read ({reason}); delete it to go on without the curves so far")
 
 
 def _drop_after(run: Path, step: int) -> None:
     if (run / _HISTORY).exists():
         kept = [row for row in read_history(run) if row["step"] <= step]
-        (run / _HISTORY).write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
+        draft = run / f"{_HISTORY}.tmp"
+        draft.write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
+        draft.replace(run / _HISTORY)
 
 
 def _clock(seconds: float) -> str:

@@ -1,6 +1,6 @@
 """One session of training: from a configuration to a run folder, new or resumed."""
 
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Literal
 
@@ -46,7 +46,7 @@ def learn(
     Raises:
         CurioError: Any of this package's errors; checkpoints that were written stay.
     """
-    with ranks(device) as here:
+    with ranks(device) as here, ExitStack() as own:
         # The world comes first, so that an error in its data leaves no run folder behind.
         world = build(config.world)
         sources = [
@@ -56,6 +56,7 @@ def learn(
             sources = [source.subset(config.labels) for source in sources]
         run = RunFolder(path, config)
         if here.leads:
+            own.enter_context(run.lock())
             run.write_config(new=not resume)
             record_session(path)
         trainer = Trainer(config, world, sources, here)

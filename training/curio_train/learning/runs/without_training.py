@@ -33,11 +33,12 @@ def draw_templates(config: RunConfig, path: Path, cache: Path) -> TrainingProgre
     assert isinstance(world, SingleObjectWorld)  # template networks are made for no other
     assert isinstance(network, TemplateNetwork)
     run = RunFolder(path, config)
-    run.write_config(new=True)
-    record_session(path)
-    begin = time.monotonic()
-    fill(network, world, cache)
-    calibrate(network, world, cache)
-    state.progress.seconds = time.monotonic() - begin
-    run.save(state)
+    with run.lock():
+        run.write_config(new=True)
+        record_session(path)
+        begin = time.monotonic()
+        fill(network, world, cache)
+        calibrate(network, world, cache)
+        state.progress.seconds = time.monotonic() - begin
+        run.save(state)
     return state.progress
