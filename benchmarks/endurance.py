@@ -2,7 +2,7 @@
 
     python benchmarks/endurance.py [--json] [--out FILE]
                                    [--requests 50000] [--replacements 50] [--connections 10000] [--fuzz 100000]
-                                   [--attacks 20]
+                                   [--attacks 20] [--hostile 60]
 
 rss_growth            memory after all requests over memory after a tenth of them, after the same pause; at most 1.05
 failed_calls          calls of clients with retries that failed while a model was replaced so many times; none may
@@ -13,7 +13,11 @@ fuzzed                so many strange requests by ``tests/serving/test_fuzz.py``
 
 attacked_mb           largest resident memory of a server under each of the attacks of ``load/attacks.py``, for so many
                       seconds each; ``answered`` the part of the calls of an honest client beside them that is answered
-                      within 5 s, and ``attacked_stop_s`` how long SIGTERM takes in the middle of the work
+                      within 5 s, ``attacked_stop_s`` how long SIGTERM takes in the middle of the work, and
+                      ``attacked_limit_mb`` the limit of the memory cgroup that the server was in, if one can be made
+hostile_codes         statuses of the hostile messages of ``load/hostile.py``, sent for so many seconds: none may be
+                      UNKNOWN or INTERNAL, and no line of the log a traceback; ``hostile_growth`` is the memory after
+                      all of them over that after a tenth
 A part is left out with 0. Exit status 1: one of them does not hold. What has been reached is said on stderr. With
 ``--out`` the figures are written to a file after each part and each 10,000 strange requests, and a run that was cut off
 goes on after the last of them; for another version of the server, take another file.
@@ -30,7 +34,9 @@ import tempfile
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,8 +44,9 @@ from typing import Any
 import tyro
 from curio_serve.client import PoseClient
 from curio_serve.errors import CurioError
-from load.attacks import much_work, raw_frames, unfinished, unfolding
+from load.attacks import empty_calls, much_work, raw_frames, unfinished, unfolding
 from load.generator import MODEL, WIDTH, K, closed_loop_of, make_frames, pose_target
+from load.hostile import hostile
 from load.network import write_model
 
 from serving import memory_mb, running_server, worker
@@ -71,6 +78,8 @@ class Arguments:
     """Strange requests."""
     attacks: float = 20.0
     """Seconds of each attack."""
+    hostile: float = 60.0
+    """Seconds of hostile messages."""
 
 
 def main() -> None:
@@ -87,6 +96,7 @@ def main() -> None:
             ("connections_survived", connections, arguments.connections),
             ("failed_calls", replacements, arguments.replacements),
             ("attacked_mb", attacked, arguments.attacks),
+            ("hostile_codes", hostile_messages, arguments.hostile),
         )
         for figure, part, number in parts:
             if number and figure not in figures:
@@ -100,6 +110,9 @@ def main() -> None:
     print(json.dumps(figures) if arguments.json else "\n".join(f"{k:22} {v}" for k, v in figures.items()))
     holds = (
         figures.get("rss_growth", 1.0) <= _LARGEST_GROWTH
+        and figures.get("hostile_growth", 1.0) <= _LARGEST_GROWTH
+        and not figures.get("hostile_tracebacks")
+        and not {"UNKNOWN", "INTERNAL"} & figures.get("hostile_codes", {}).keys()
         and not figures.get("failed_calls")
         and figures.get("fuzz_status", 0) == 0
         and max(figures.get("attacked_mb", {"": 0}).values()) <= _LARGEST_MB
@@ -200,9 +213,10 @@ def attacked(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any
     """Each attack on a server of its own, beside an honest client; SIGTERM while the attack goes on."""
     peaks_mb, parts, stops_s = {}, {}, {}
     cores = sorted(os.sched_getaffinity(0))
-    for attack in (unfolding, raw_frames, much_work, unfinished):
+    for attack in (unfolding, raw_frames, much_work, unfinished, empty_calls):
         with (
-            running_server(models, cores, "--grace-s", "3") as (address, pid),
+            _memory_cgroup() as cgroup,
+            running_server(models, cores, "--grace-s", "3", cgroup=cgroup) as (address, pid),
             worker(cores) as attacker,
             ThreadPoolExecutor(1) as pool,
         ):
@@ -214,7 +228,53 @@ def attacked(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any
             _wait_until(lambda pid=pid: _has_ended(pid))
             stops_s[attack.__name__] = round(time.monotonic() - begun, 2)
             _say(f"{attack.__name__}: {running.result()} calls, {peaks_mb}, {parts}, {stops_s}")
-    return {"attacked_mb": peaks_mb, "answered": parts, "attacked_stop_s": stops_s}
+    limit_mb = None if cgroup is None else _LARGEST_MB
+    return {"attacked_mb": peaks_mb, "answered": parts, "attacked_stop_s": stops_s, "attacked_limit_mb": limit_mb}
+
+
+@contextmanager
+def _memory_cgroup() -> Iterator[Path | None]:
+    """The folder of a memory cgroup with the container's limit, of version 1 or 2; None if none can be made."""
+    for root, limit in (("/sys/fs/cgroup/memory", "memory.limit_in_bytes"), ("/sys/fs/cgroup", "memory.max")):
+        folder = Path(root) / f"curio-endurance-{os.getpid()}"
+        try:
+            folder.mkdir()
+        except OSError:
+            continue
+        try:
+            (folder / limit).write_text(str(_LARGEST_MB << 20))
+            yield folder
+        finally:
+            folder.rmdir()
+        return
+    yield None
+
+
+def hostile_messages(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any]:
+    """Hostile messages in ten parts, a good call after each."""
+    cores = sorted(os.sched_getaffinity(0))
+    codes: Counter[str] = Counter()
+    sizes_mb = []
+    log = models.with_name(f"{models.name}.log")
+    with (
+        running_server(models, cores, log=log) as (address, pid),
+        worker(cores) as attacker,
+        PoseClient(address, timeout_s=60) as client,
+    ):
+        for part in range(10):
+            codes.update(attacker(hostile, address, part, seconds / 10))
+            assert client.detect(MODEL, frames[0], K).results
+            time.sleep(1)
+            sizes_mb.append(memory_mb(pid)[0])
+            _say(f"{codes.total()} hostile messages, {sizes_mb[-1]} MB, {dict(codes)}")
+    num_tracebacks = log.read_text(errors="replace").count("Traceback")
+    log.unlink()
+    return {
+        "hostile_messages": codes.total(),
+        "hostile_codes": dict(codes),
+        "hostile_growth": round(sizes_mb[-1] / sizes_mb[0], 4),
+        "hostile_tracebacks": num_tracebacks,
+    }
 
 
 def _has_ended(pid: int) -> bool:

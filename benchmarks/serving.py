@@ -26,6 +26,7 @@ its version, the CPU time a request of all its processes, the answers a second a
 on the same cores, latency at concurrency 1, and the memory of all its processes.
 """
 
+import contextlib
 import json
 import math
 import multiprocessing
@@ -205,14 +206,27 @@ def start_time_s(models: Path) -> float:
 
 
 @contextmanager
-def running_server(models: Path, cores: Sequence[int], *flags: str) -> Iterator[tuple[str, int]]:
-    """Address and process id of a server on these cores, once its health service says SERVING."""
+def running_server(
+    models: Path, cores: Sequence[int], *flags: str, cgroup: Path | None = None, log: Path | None = None
+) -> Iterator[tuple[str, int]]:
+    """Address and process id of a server on these cores, once its health service says SERVING.
+
+    Args:
+        models: Its models.
+        cores: Its cores.
+        flags: Of its command line.
+        cgroup: Folder of the control group to start it in.
+        log: File for its log; None: our stderr.
+    """
     program = "from curio_serve.server.serve_cli import main; main()"
     call = [sys.executable, "-c", program, str(models), "--port", "0", "--log-level", "warning", *flags]
+    if cgroup:
+        call = ["sh", "-c", 'echo $$ > "$0" && exec "$@"', str(cgroup / "cgroup.procs"), *call]
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)  # inherited
     try:
-        process = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
+        with contextlib.nullcontext() if log is None else log.open("w") as stderr:
+            process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=stderr, text=True)
     finally:
         os.sched_setaffinity(0, before)
     try:

@@ -57,6 +57,27 @@ def unfinished(address: str, seconds: float, num_calls: int = 160) -> int:
         return sum(threads.map(lambda _: _unfinished_call(address, end), range(num_calls)))
 
 
+def empty_calls(address: str, seconds: float, num_connections: int = 16) -> int:
+    """Calls that never send their message, some 300 a second on so many connections; the number begun."""
+    host, port = address.rsplit(":", 1)
+    connections: dict[int, tuple[socket.socket, int]] = {}
+    end, num_begun = time.monotonic() + seconds, 0
+    while time.monotonic() < end:
+        for number in range(num_connections):
+            try:
+                if number not in connections:
+                    connections[number] = (socket.create_connection((host, int(port)), timeout=5), 1)
+                    connections[number][0].sendall(opening())
+                connection, stream = connections[number]
+                connection.sendall(_call(stream + 2))
+                connections[number] = (connection, stream + 2)
+                num_begun += 1
+            except OSError:  # the server has closed it
+                connections.pop(number, None)
+        time.sleep(num_connections / 300)
+    return num_begun
+
+
 def _repeat(address: str, seconds: float, num_callers: int, send: Callable[[grpc.Channel], None]) -> int:
     end = time.monotonic() + seconds
 
@@ -97,7 +118,7 @@ class _Connection:
         self._window = {0: 65_535, 1: 65_535}
         self._is_open = True
         self._received = b""
-        connection.sendall(_PREFACE + _frame(_SETTINGS, 0, 0, b"") + _frame(_HEADERS, _END_HEADERS, 1, _call_headers()))
+        connection.sendall(opening())
 
     def hang(self, num_bytes: int, end: float) -> None:
         """Announce a message, send it but for its last bytes, and wait until the server ends the call."""
@@ -148,11 +169,17 @@ def _frame(kind: int, flags: int, stream: int, data: bytes) -> bytes:
     return len(data).to_bytes(3, "big") + struct.pack(">BBI", kind, flags, stream) + data
 
 
-def _call_headers() -> bytes:
-    """The headers of a call of Detect, as literals without an index (HPACK)."""
+def opening(*more: tuple[bytes, bytes]) -> bytes:
+    """The beginning of a connection, and of a call of Detect on it, with further headers."""
+    return _PREFACE + _frame(_SETTINGS, 0, 0, b"") + _call(1, *more)
+
+
+def _call(stream: int, *more: tuple[bytes, bytes]) -> bytes:
+    """A call of Detect without its message. Headers are literals without an index (HPACK)."""
     headers = {
         ":method": "POST", ":scheme": "http", ":path": _DETECT, ":authority": "attack",
         "te": "trailers", "content-type": "application/grpc",
     }  # fmt: skip
-    texts = ((text.encode() for text in pair) for pair in headers.items())
-    return b"".join(b"\x00" + b"".join(bytes([len(text)]) + text for text in pair) for pair in texts)
+    texts = [*(tuple(text.encode() for text in pair) for pair in headers.items()), *more]
+    block = b"".join(b"\x00" + b"".join(bytes([len(text)]) + text for text in pair) for pair in texts)
+    return _frame(_HEADERS, _END_HEADERS, stream, block)

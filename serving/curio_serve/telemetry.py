@@ -57,6 +57,7 @@ class LogWriter(logging.Handler):
     def __init__(self) -> None:
         super().__init__()
         self.setFormatter(JsonFormatter())
+        self.addFilter(_is_ours_to_say)
         self._lines: queue.Queue[str | None] = queue.Queue(_MAX_WAITING_LINES)
         self._thread = threading.Thread(target=self._write, name="curio-log", daemon=True)
         self._thread.start()
@@ -76,6 +77,11 @@ class LogWriter(logging.Handler):
         while (line := self._lines.get()) is not None:
             with contextlib.suppress(OSError):  # a line that cannot be written is lost, not the request
                 os.write(_STDERR, f"{line}\n".encode(errors="replace"))
+
+
+def _is_ours_to_say(record: logging.LogRecord) -> bool:
+    """False for gRPC's traceback for each header of a client that is no UTF-8."""
+    return not (record.name.startswith("grpc") and record.exc_info and record.exc_info[0] is UnicodeDecodeError)
 
 
 def start_logging(level: str) -> LogWriter:

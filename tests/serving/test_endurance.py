@@ -9,7 +9,7 @@ _SCRIPT = Path(__file__).parents[2] / "benchmarks" / "endurance.py"
 
 
 def test_a_server_survives_requests_connections_and_replacements() -> None:
-    numbers = {"requests": 200, "connections": 100, "replacements": 2, "fuzz": 0, "attacks": 0}
+    numbers = {"requests": 200, "connections": 100, "replacements": 2, "fuzz": 0, "attacks": 0, "hostile": 5}
     flags = [text for name, number in numbers.items() for text in (f"--{name}", str(number))]
     ended = subprocess.run(
         [sys.executable, str(_SCRIPT), "--json", *flags], capture_output=True, text=True, timeout=300, check=False
@@ -22,3 +22,6 @@ def test_a_server_survives_requests_connections_and_replacements() -> None:
     assert figures["failed_calls"] == 0
     assert figures["versions_seen"] == 3
     assert figures["replaced_answers"] > 0
+    assert figures["hostile_messages"] > 100
+    assert not {"UNKNOWN", "INTERNAL"} & figures["hostile_codes"].keys()
+    assert figures["hostile_tracebacks"] == 0

@@ -2,9 +2,14 @@
 
 import os
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
+import time
+import urllib.error
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +18,9 @@ import grpc
 import pytest
 from curio_proto.v1 import detector_pb2 as pb
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
+from curio_serve.server import metrics_port
+from load.attacks import opening
+from prometheus_client import CollectorRegistry
 
 DETECT = "/curio.v1.PoseDetector/Detect"
 FLAT = pb.ModelSelector(name="flat")
@@ -177,6 +185,41 @@ def test_it_serves_and_ends_while_its_stdout_is_full(models_dir: Path, tmp_path:
     process.terminate()
     assert process.wait(timeout=30) == 0
     assert "Traceback" not in log.read_text()
+
+
+def test_the_metrics_port_answers_one_path_within_a_limit(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(metrics_port, "_LIMIT_S", 0.3)
+    http = metrics_port.MetricsPort("127.0.0.1", 0, CollectorRegistry())
+    http.start()
+    address = ("127.0.0.1", http.server_port)
+    silent = socket.create_connection(address)
+    for beginning in (b"GET /metrics HTTP/1.1\r\n\r\n", b"\xff\xfe\r\n\r\n", b""):
+        with socket.create_connection(address) as broken_off:
+            broken_off.sendall(beginning)
+            broken_off.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    with urllib.request.urlopen(f"http://127.0.0.1:{http.server_port}/metrics", timeout=30) as answer:
+        assert answer.status == 200
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(f"http://127.0.0.1:{http.server_port}/other", timeout=30)
+    silent.settimeout(30)
+    assert silent.recv(1) == b""
+    http.shutdown()
+    http.server_close()
+    assert capfd.readouterr().err == ""
+
+
+def test_a_header_beyond_utf8_leaves_no_traceback(start_server: StartServer, models_dir: Path) -> None:
+    server = start_server(models_dir)
+    host, port = server.address.rsplit(":", 1)
+    with socket.create_connection((host, int(port)), timeout=30) as connection:
+        connection.sendall(opening((b"x-name", b"\xff\xfe")))
+        time.sleep(0.5)
+    with grpc.insecure_channel(server.address) as channel:
+        assert PoseDetectorStub(channel).Detect(REQUEST, timeout=30).results
+    assert server.stop() == 0
+    assert "Invalid encoding" not in server.log.read_text()
 
 
 def test_a_hang_up_drains(start_server: StartServer, models_dir: Path) -> None:

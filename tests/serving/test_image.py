@@ -60,6 +60,23 @@ def test_truncated_images_are_refused(suffix: str, share: float) -> None:
         decode(data[: int(len(data) * share)])
 
 
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_a_jpeg_larger_than_its_data(progressive: int) -> None:
+    jpeg = _encode(_scene(640, 480), ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, progressive)
+    marker = jpeg.index(b"\xff\xc2" if progressive else b"\xff\xc0")
+    larger = jpeg[: marker + 5] + struct.pack(">HH", 5792, 5792) + jpeg[marker + 9 :]
+    with pytest.raises(ImageError, match=r"declares 5792x5792 pixels, which take at least \d+ bytes"):
+        decode(larger)
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_jpeg_of_one_color_has_bytes_enough(progressive: int, channels: int) -> None:
+    flat = np.full((2048, 2048, channels), 128, np.uint8)
+    options = [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive, cv2.IMWRITE_JPEG_OPTIMIZE, 1, cv2.IMWRITE_JPEG_QUALITY, 1]
+    assert decode(cv2.imencode(".jpg", flat, options)[1].tobytes()).width == 2048
+
+
 def test_a_thumbnails_end_is_not_the_pictures_end() -> None:
     jpeg = _encode(_scene(320, 240), ".jpg")
     body = b"Exif\x00\x00" + _encode(_scene(32, 24), ".jpg")

@@ -134,6 +134,11 @@ def test_missing_folders_are_made(tmp_path: Path) -> None:
     assert (tmp_path / "a" / "b" / "out.jsonl").stat().st_size
 
 
+def test_folders_that_a_path_only_passes_through_are_not_made(tmp_path: Path) -> None:
+    run(tmp_path / "a" / ".." / "b" / "out.jsonl", JsonLines())
+    assert [path.name for path in tmp_path.iterdir()] == ["b"]
+
+
 @pytest.fixture
 def limited_file_size() -> Iterator[int]:
     """The kernel refuses to let any file of this process grow beyond that: a full disk."""

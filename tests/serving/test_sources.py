@@ -5,6 +5,7 @@ import os
 import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -79,11 +80,32 @@ def test_arguments_that_name_nothing_are_refused_before_the_start(tmp_path: Path
             check_arguments(arguments)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may list every folder")
-def test_a_folder_that_may_not_be_listed_is_named(tmp_path: Path) -> None:
-    tmp_path.chmod(0)
-    with pytest.raises(UsageError, match=str(tmp_path)):
-        names(tmp_path)
+def test_a_folder_that_may_not_be_listed_is_an_error_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    touch(tmp_path, "a/0.png", "b/0.png", "c/0.png")
+    scandir = os.scandir
+
+    def refuse(folder: str) -> Any:
+        if folder.endswith("b"):
+            raise PermissionError(13, "Permission denied", folder)
+        return scandir(folder)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    found = list(images([str(tmp_path)]))
+    assert [image.name for image in found] == [f"{tmp_path}/a/0.png", f"{tmp_path}/b", f"{tmp_path}/c/0.png"]
+    with pytest.raises(ImageError, match="cannot be listed: Permission denied"):
+        found[1].read()
+
+
+def test_pipes_devices_and_endless_files_are_errors_of_these_images(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.png")
+    (tmp_path / "b.png").symlink_to("/dev/zero")
+    with (tmp_path / "c.png").open("wb") as sparse:
+        sparse.truncate(20 << 30)
+    for image, text in zip(images([str(tmp_path)]), ["not a regular", "not a regular", "at most"], strict=True):
+        with pytest.raises(ImageError, match=text):
+            image.read()
 
 
 def test_relative_names_stay_apart_below_the_common_folder(tmp_path: Path) -> None:

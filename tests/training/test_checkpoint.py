@@ -1,6 +1,7 @@
 """Run folders: what is saved is restored bit for bit, and nothing that goes wrong costs what was saved."""
 
 import json
+import os
 import resource
 import signal
 from collections.abc import Iterator
@@ -162,6 +163,60 @@ def test_a_damaged_checkpoint_is_named(tmp_path: Path, cache: Path, file: str) -
         train(tmp_path / "run", cache, resume=True)
 
 
+def test_a_flipped_bit_is_found(tmp_path: Path, cache: Path) -> None:
+    train(tmp_path / "run", cache)
+    file = tmp_path / "run/checkpoints/00000006/tensors.safetensors"
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+    with pytest.raises(CheckpointError, match="not what SHA256SUMS says"):
+        train(tmp_path / "run", cache, resume=True)
+
+
+@pytest.mark.parametrize("value", ['"7"', "-5", "1e30", "NaN", "null", "[" * 100_000])
+@pytest.mark.parametrize("field", ["step", "seconds"])
+def test_impossible_progress_is_refused(tmp_path: Path, cache: Path, field: str, value: str) -> None:
+    train(tmp_path / "run", cache)
+    last = tmp_path / "run/checkpoints/00000006"
+    (last / "SHA256SUMS").unlink()  # as earlier versions wrote it
+    progress = json.loads((last / "course.json").read_text()) | {field: "@"}
+    (last / "course.json").write_text(json.dumps(progress).replace('"@"', value))
+    with pytest.raises(CheckpointError, match="00000006 cannot be read"):
+        train(tmp_path / "run", cache, resume=True)
+
+
+def test_files_that_are_pipes_or_endless_are_refused(tmp_path: Path, cache: Path) -> None:
+    train(tmp_path / "run", cache)
+    tensors = tmp_path / "run/checkpoints/00000006/tensors.safetensors"
+    os.truncate(tensors, 50 << 30)
+    with pytest.raises(CheckpointError, match="at most"):
+        train(tmp_path / "run", cache, resume=True)
+    (tmp_path / "run/config.json").unlink()
+    os.mkfifo(tmp_path / "run/config.json")
+    with pytest.raises(CheckpointError, match="not a regular file"):
+        load_config(tmp_path / "run")
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe}\n", b"[]}\n", b'{"images": 8}\n', b"[" * 100_000 + b"}\n"])
+def test_a_damaged_history_is_named(tmp_path: Path, cache: Path, content: bytes) -> None:
+    train(tmp_path / "run", cache)
+    (tmp_path / "run/history.jsonl").write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"history.jsonl cannot be read .*delete it"):
+        train(tmp_path / "run", cache, resume=True)
+
+
+def test_two_processes_do_not_train_one_run(tmp_path: Path, cache: Path) -> None:
+    train(tmp_path / "run", cache)
+    wanted = replace(CONFIG, images=56)
+    with (
+        RunFolder(tmp_path / "run", CONFIG).lock(),
+        pytest.raises(CheckpointError, match=r"another process trains .*run: `.*`, started 20"),
+    ):
+        train(tmp_path / "run", cache, wanted, resume=True)
+    assert load_config(tmp_path / "run") == CONFIG
+    train(tmp_path / "run", cache, wanted, resume=True)
+
+
 def test_history_has_no_line_twice_after_a_kill(tmp_path: Path, cache: Path) -> None:
     train(tmp_path / "run", cache)
     with (tmp_path / "run/history.jsonl").open("a") as file:
@@ -213,6 +268,7 @@ def test_configurations_survive_their_file(tmp_path: Path, config: RunConfig) ->
         ('{"world": {"name": "circles"}, "labels": 7.0}', "is no fraction"),
         ('{"method": "our"}', "required field missing @ config.world"),
         ("[]", "is no configuration of this version"),
+        ("[" * 100_000, "is no configuration of this version"),
     ],
 )
 def test_damaged_configurations_are_named(tmp_path: Path, content: str | None, message: str) -> None:

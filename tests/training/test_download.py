@@ -151,6 +151,14 @@ def link(name: str) -> bytes:
     return buffer.getvalue()
 
 
+def marked(position: int, byte: bytes) -> bytes:
+    """An archive whose headers have that byte: its flags are at 6, its method at 8, two bytes later at its end."""
+    data = bytearray(archive({"fine": "x"}))
+    for signature, offset in ((b"PK\x03\x04", position), (b"PK\x01\x02", position + 2)):
+        data[data.index(signature) + offset : data.index(signature) + offset + 1] = byte
+    return bytes(data)
+
+
 @pytest.mark.parametrize(
     ("content", "text"),
     [
@@ -159,6 +167,9 @@ def link(name: str) -> bytes:
         (archive({"fine": "", "..\\out": "x"}), "would be written outside"),
         (link("models"), "is a link"),
         (b"no archive", "damaged as published"),
+        (archive({".": "x"}), "would be written outside"),
+        (marked(6, b"\x01"), "damaged as published .*encrypted"),
+        (marked(8, b"\x63"), "damaged as published .*not supported"),
     ],
 )
 def test_archives_that_cannot_be_unpacked_leave_nothing(hub: Hub, tmp_path: Path, content: bytes, text: str) -> None:

@@ -105,6 +105,29 @@ def test_missing_and_folder(tmp_path: Path) -> None:
         load_mesh(tmp_path / "folder.ply")
 
 
+def test_sizes_that_cannot_be(tmp_path: Path) -> None:
+    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000000000\nproperty float x\n"
+    head += b"property float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    with pytest.raises(MeshError, match="not a readable PLY"):
+        load_mesh(write(tmp_path / "a.ply", head + bytes(100)))
+    with (tmp_path / "b.stl").open("wb") as sparse:
+        sparse.truncate(60 << 30)
+    with pytest.raises(MeshError, match="at most"):
+        load_mesh(tmp_path / "b.stl")
+
+
+def test_pipes_are_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.ply")
+    with pytest.raises(MeshError, match="not a regular file"):
+        load_mesh(tmp_path / "a.ply")
+    for name in ("b.mtl", "c.png"):
+        os.mkfifo(tmp_path / name)
+    write(tmp_path / "c.mtl", "newmtl m\nmap_Kd c.png\n")
+    for name in ("b", "c"):
+        mesh = load_mesh(write(tmp_path / f"{name}.obj", f"mtllib {name}.mtl\nusemtl m\n{TRIANGLE}f 1 2 3\n"))
+        assert mesh.texture is None
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".glb"])
 @pytest.mark.parametrize("kept", [0.02, 0.3, 0.9])
 def test_truncated_binary(tmp_path: Path, suffix: str, kept: float) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve.errors import InternalError, ModelError
+from curio_serve.files import read_file
 from curio_serve.models import model as serving
 from curio_serve.models.model_folder import MODEL_FILE, versions
 from torch import Tensor
@@ -41,7 +42,7 @@ class ExportedModel:
             ExportError: It cannot be read or used.
         """
         try:
-            return ExportedModel(path.read_bytes(), str(path))
+            return ExportedModel(read_file(path, serving.MAX_BYTES), str(path))
         except OSError as exc:
             raise ExportError(f"{path} cannot be read: {exc.strerror}; expected an exported .onnx file") from exc
 

@@ -18,6 +18,9 @@ _SOF_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _PROGRESSIVE = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
 _BARE_MARKERS = frozenset(range(0xD0, 0xD8)) | {0x01}
 MAX_JPEG_SCANS = 64
+# A block of 8x8 samples takes at least a Huffman code of one bit for its mean, and, unless the picture is progressive,
+# another one for the rest. With arithmetic codes it may take less.
+_HUFFMAN_BITS = {0xC0: 2, 0xC1: 2, 0xC2: 1}
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ def read_header(data: bytes) -> Header:
 def _read_jpeg(data: bytes) -> Header:
     """Walk the marker segments up to the first scan (ITU-T T.81, annex B)."""
     size: tuple[int, int, int] | None = None
-    is_progressive, orientation, position = False, 1, 2
+    is_progressive, orientation, position, least_bytes = False, 1, 2, 0
     while True:
         marker, position = _next_marker(data, position)
         if marker in _BARE_MARKERS:
@@ -80,15 +83,30 @@ def _read_jpeg(data: bytes) -> Header:
                 raise ImageError(f"the JPEG has {precision} bits a sample; expected 8: convert it")
             size = (width, height, num_channels)
             is_progressive = marker in _PROGRESSIVE
+            least_bytes = _num_blocks(width, height, segment[6:]) * _HUFFMAN_BITS.get(marker, 0) // 8
         elif marker == 0xE1 and segment[:6] == b"Exif\x00\x00":
             orientation = exif_orientation(segment[6:])
         position += length
     if size is None:
         raise ImageError("the JPEG has no frame header before its first scan; the file is damaged")
     _check_jpeg_end(data, position)
+    if len(data) - position < least_bytes:
+        raise ImageError(
+            f"the JPEG declares {size[0]}x{size[1]} pixels, which take at least {least_bytes} bytes, and has "
+            f"{len(data) - position}; send the file again"
+        )
     if is_progressive or data[position + 2] < size[2]:
         _check_jpeg_scans(data, position)
     return Header("jpeg", *size, orientation)
+
+
+def _num_blocks(width: int, height: int, components: bytes) -> int:
+    """Blocks of all components, whose sampling factors stand in the frame header (ITU-T T.81, A.1.1 and B.2.2)."""
+    factors = [(code >> 4, code & 15) for code in components[1::3]]
+    most = [max((pair[axis] for pair in factors), default=0) for axis in (0, 1)]
+    if 0 in most:
+        return 0
+    return sum(-(-width * h // (8 * most[0])) * -(-height * v // (8 * most[1])) for h, v in factors)
 
 
 def _next_marker(data: bytes, position: int) -> tuple[int, int]:

@@ -12,7 +12,7 @@ from curio_proto.inference import inference_pb2
 from curio_proto.v1 import detector_pb2
 from grpc_health.v1 import health, health_pb2
 from grpc_reflection.v1alpha import reflection, reflection_pb2
-from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client import CollectorRegistry
 
 from curio_serve.api.admission import WorkQueue
 from curio_serve.api.kserve import InferenceService
@@ -25,6 +25,7 @@ from curio_serve.models.model_check import ChildCheck
 from curio_serve.models.repository import Change, Repository
 from curio_serve.server import memory
 from curio_serve.server.config import ServeConfig
+from curio_serve.server.metrics_port import MetricsPort
 from curio_serve.server.reception import Reception, ReceptionLimits
 from curio_serve.server.security import TokenInterceptor, Tokens, read_tokens, server_credentials
 from curio_serve.telemetry import Metrics, log
@@ -136,11 +137,12 @@ class PoseServer:
 
     def _open_metrics(self, port: int) -> str:
         try:
-            http, _thread = start_http_server(port, addr=self.config.host, registry=self._registry)
+            http = MetricsPort(self.config.host, port, self._registry)
         except OSError as exc:
             raise Unavailable(
                 f"cannot serve metrics on port {port}: {exc.strerror}; choose another --metrics-port"
             ) from exc
+        http.start()
         return f"http://{self.config.host}:{http.server_port}/metrics"
 
     def _announce(self) -> None:

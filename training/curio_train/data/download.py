@@ -16,6 +16,7 @@ import shutil
 import stat
 import sys
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -71,7 +72,8 @@ def _as_data_errors(failure: str) -> Iterator[None]:
         if status in (401, 403, 404):
             raise DataError(f"{failure}: the hub answers {status}; does HF_ENDPOINT name a hub? {_OFFLINE}") from exc
         raise DataError(f"{failure}: {_first_line(exc)}; {again}, {_OFFLINE}") from exc
-    except zipfile.BadZipFile as exc:
+    # RuntimeError: encrypted; NotImplementedError, one of those: packed by a method that zipfile does not know.
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as exc:
         raise DataError(f"{failure}: the archive is damaged as published ({exc}); {_OFFLINE}") from exc
     except OSError as exc:
         reason = exc.strerror or _first_line(exc)
@@ -143,7 +145,13 @@ def _inside(member: zipfile.ZipInfo, archive: str) -> PurePosixPath:
         DataError: Somewhere else, or it is a link.
     """
     path = PurePosixPath(member.filename.replace("\\", "/"))
-    if path.is_absolute() or ".." in path.parts or ":" in path.parts[0] or stat.S_ISLNK(member.external_attr >> 16):
+    if (
+        not path.parts
+        or path.is_absolute()
+        or ".." in path.parts
+        or ":" in path.parts[0]
+        or stat.S_ISLNK(member.external_attr >> 16)
+    ):
         raise DataError(
             f"{REPOSITORY}/{archive}: holds {member.filename!r}, which would be written outside its folder or is a "
             "link; nothing of it was unpacked. Is HF_ENDPOINT a hub that you trust?"

@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.image import MAX_FILE_BYTES
 from curio_serve.imaging.view import undistort
 from jaxtyping import Bool, Float
 from PIL import Image
@@ -65,7 +67,7 @@ def read_photograph(path: Path) -> np.ndarray:
         DataError: Missing, empty, truncated, no image, or too large to be decoded with a good conscience.
     """
     try:
-        content = path.read_bytes()
+        content = read_file(path, MAX_FILE_BYTES)
     except OSError as exc:
         raise DataError(f"{path}: the image cannot be read ({exc.strerror})") from exc
     if not content:

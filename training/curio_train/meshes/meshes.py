@@ -27,9 +27,9 @@ SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 
 # What trimesh's readers let through on damaged files, found by feeding them such.
 _READER_ERRORS = (
-    ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError, OSError, MemoryError,
-    ArithmeticError,
-)  # fmt: skip
+    *(ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError, OSError),
+    *(MemoryError, ArithmeticError),
+)
 _TRIMESH_DEFAULT_COLOR = (102, 102, 102)
 
 

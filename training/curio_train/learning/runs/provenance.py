@@ -14,7 +14,7 @@ import torch
 
 from curio_train.errors import CheckpointError
 
-SESSIONS_FILE = "sittings.jsonl"
+SESSIONS = "sittings.jsonl"
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,10 @@ def record_session(run: Path) -> None:
         CheckpointError: The folder cannot be written.
     """
     try:
-        with (run / SESSIONS_FILE).open("a", encoding="utf-8") as file:
+        with (run / SESSIONS).open("a", encoding="utf-8") as file:
             file.write(json.dumps(asdict(this_session())) + "\n")
     except OSError as exc:
-        raise CheckpointError(
-            f"cannot write {run / SESSIONS_FILE}: {exc.strerror}; name another run folder: --out"
-        ) from exc
+        raise CheckpointError(f"cannot write {run / SESSIONS}: {exc.strerror}; name another run folder: --out") from exc
 
 
 def run_sessions(run: Path) -> list[RunSession]:
@@ -60,14 +58,14 @@ def run_sessions(run: Path) -> list[RunSession]:
         CheckpointError: They cannot be read.
     """
     try:
-        lines = (run / SESSIONS_FILE).read_text(encoding="utf-8").splitlines()
+        lines = (run / SESSIONS).read_text(encoding="utf-8").splitlines()
         whole = [line for line in lines if line.endswith("}")]  # a kill may cut off the last one
         found = [RunSession(**json.loads(line)) for line in whole]
     except (OSError, ValueError, TypeError, RecursionError) as exc:
-        raise CheckpointError(f"{run / SESSIONS_FILE} cannot be read ({exc}); is {run} a whole run folder?") from exc
+        raise CheckpointError(f"{run / SESSIONS} cannot be read ({exc}); is {run} a whole run folder?") from exc
     if not found:
         raise CheckpointError(
-            f"{run / SESSIONS_FILE} has no whole line, expected one a session; is {run} a whole run folder?"
+            f"{run / SESSIONS} has no whole line, expected one a session; is {run} a whole run folder?"
         )
     return found
 
