@@ -25,13 +25,10 @@ A text says what was found, what was expected, whose it is (file, field, flag) a
 
 
 class CurioError(Exception):
-    """Base of all errors of this package.
-
-    Attributes:
-        exit_status: Of a command line that ends with this error.
-    """
+    """Base of all errors of this package."""
 
     exit_status = 1
+    """Of a command line that ends with this error."""
 
 
 class UsageError(CurioError):
@@ -49,7 +46,7 @@ class ArgumentError(RequestError):
 
 
 class ImageError(RequestError):
-    """Not an image, damaged, or of a kind or size that is not accepted."""
+    """The bytes are no image, are damaged, or have a format or size that is not accepted."""
 
 
 class CameraError(RequestError):
@@ -93,11 +90,10 @@ class ServiceError(CurioError):
 
 
 class Overloaded(ServiceError):
-    """The queue is full.
+    """The queue is full."""
 
-    Attributes:
-        retry_after_s: When another attempt makes sense.
-    """
+    retry_after_s: float
+    """Seconds after which another attempt makes sense."""
 
     def __init__(self, text: str, retry_after_s: float = 0.1) -> None:
         super().__init__(text)

@@ -95,7 +95,7 @@ def start_logging(level: str) -> LogWriter:
 
 
 class Metrics:
-    """What the server counts. Names are part of the operator's interface: dashboards and alerts use them."""
+    """The server's counters. Their names are part of the operator's interface: dashboards and alerts use them."""
 
     def __init__(self, registry: "CollectorRegistry") -> None:
         from prometheus_client import Counter, Gauge, Histogram

@@ -27,6 +27,44 @@ distortion_coefficients: !!opencv-matrix
    dt: d
    data: [0.1, -0.2, 0.001, 0.002, 0.0]
 """
+ROS_CALIBRATION = """image_width: 640
+image_height: 480
+camera_name: wrist
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [572.4, 0.0, 325.3, 0.0, 573.6, 242.0, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0.1, -0.2, 0.001, 0.002, 0.0]
+"""
+ROS_ECHO = """header:
+  frame_id: wrist
+height: 480
+width: 640
+distortion_model: plumb_bob
+d:
+- 0.1
+- -0.2
+- 0.001
+- 0.002
+- 0.0
+k:
+- 572.4
+- 0.0
+- 325.3
+- 0.0
+- 573.6
+- 242.0
+- 0.0
+- 0.0
+- 1.0
+binning_x: 0
+---
+"""
+ROS_MESSAGE = {"distortion_model": "plumb_bob", **SIZE}
 GOOD = {
     "json": {"camera_matrix": K, **SIZE},
     "json with whole floats": {"camera_matrix": K, "width": 640.0, "height": 480.0},
@@ -34,6 +72,10 @@ GOOD = {
     "eight coefficients": {"camera_matrix": K, "distortion": [0.1, 0, 0, 0, 0, 0, 0, 0], **SIZE},
     "bop": {"fx": 572.4, "fy": 573.6, "cx": 325.3, "cy": 242.0, "depth_scale": 1.0, **SIZE},
     "yaml": YAML,
+    "ros calibration": ROS_CALIBRATION,
+    "ros topic echo": ROS_ECHO,
+    "ros 1 message": {"K": np.ravel(K).tolist(), "D": [0.1, 0, 0, 0, 0], **ROS_MESSAGE},
+    "ros 2 message": {"k": np.ravel(K).tolist(), "d": [], **ROS_MESSAGE},
 }
 BAD = {
     "skew of a pixel": {"camera_matrix": [[572.4, 1, 325.3], *K[1:]], **SIZE},
@@ -45,12 +87,14 @@ BAD = {
     "three coefficients": {"camera_matrix": K, "distortion": [0.1, 0, 0], **SIZE},
     "coefficients as text": {"camera_matrix": K, "distortion": "none", **SIZE},
     "no matrix": SIZE,
+    "fisheye lens": {"k": np.ravel(K).tolist(), "d": [0.1, 0, 0, 0], **SIZE, "distortion_model": "equidistant"},
+    "skew of a focal length": {"camera_matrix": [[572.4, 573, 325.3], *K[1:]], **SIZE},
     "no json": "{",
 }
 
 
 def write(folder: Path, content: object) -> Path:
-    path = folder / ("camera.yaml" if content == YAML else "camera.json")
+    path = folder / ("camera.yaml" if isinstance(content, str) and ": " in content else "camera.json")
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     return path
 

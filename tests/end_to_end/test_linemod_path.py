@@ -3,50 +3,73 @@
 import csv
 import json
 import os
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from curio_train.commands.evaluate import evaluate
+from curio_train.commands.export import export
+from curio_train.commands.train import train
+from curio_train.export import graph
+from curio_train.worlds.single_object import confidence
 
 if not os.environ.get("CURIO_DATA"):
     pytest.skip("CURIO_DATA is unset: no real data here", allow_module_level=True)
 
 DATA = Path(os.environ.get("CURIO_DATA", "")) / "lmo"
 FRAMES = DATA / "test" / "000002" / "rgb"
-Call = Callable[..., object]
+Call = Callable[..., "subprocess.CompletedProcess[str]"]
+SMALL = ["--images", "16", "--batch-size", "8", "--micro-batch-size", "8"]
+
+
+def status_of(command: Callable[[list[str]], None], *arguments: object) -> int | str | None:
+    """Exit status of a command in this process, which spares some ten seconds of imports a call."""
+    with pytest.raises(SystemExit) as exit_:
+        command([str(word) for word in arguments])
+    return exit_.value.code
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, call: Call) -> Path:
-    folder = tmp_path_factory.mktemp("linemod")
-    flags = [
-        "--class",
-        "ape",
-        "--data",
-        DATA,
-        "--images",
-        "64",
-        "--out",
-        folder / "run",
-        "--cache",
-        folder / "cache",
-    ]
-    call("curio-train", "linemod", *flags)
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where runs, models and caches are; calibration and the check of numerical stability are small meanwhile."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(confidence, "NUM_FRAMES", 25)
+        patch.setattr(graph, "NUM_JITTERED", 2)
+        yield tmp_path_factory.mktemp("linemod")
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path) -> Path:
+    words = ["linemod", "--class", "ape", "--data", DATA, "--out", folder / "run", "--cache", folder / "cache", *SMALL]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["curio-train", *map(str, words)])  # which the model's card names
+        assert status_of(train, *words) == 0
     return folder / "run"
 
 
 @pytest.fixture(scope="module")
-def model(run: Path, call: Call) -> Path:
-    call("curio-export", run, "--out", run.parent / "models")
+def model(run: Path) -> Path:
+    assert status_of(export, run, "--out", run.parent / "models") == 0
     return run.parent / "models" / "ape"
 
 
 @pytest.fixture(scope="module")
-def result(run: Path, call: Call) -> dict:
+def result(run: Path) -> dict[str, Any]:
     flags = ["--data", DATA, "--bop-results", run.parent, "--num-images", "20", "--cache", run.parent / "cache"]
-    return json.loads(call("curio-eval", run, *flags, "--json").stdout.splitlines()[-1])
+    assert status_of(evaluate, run, *flags) == 0
+    return json.loads((run / "evaluation.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def detected(folder: Path, model: Path, call: Call) -> list[dict[str, Any]]:
+    """What curio-detect finds in every frame, with drawings in FOLDER/overlays."""
+    done = call("curio-detect", model, FRAMES, "--camera", DATA / "camera.json", "--overlays", folder / "overlays")
+    return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 def test_training_and_evaluation_leave_a_report(run: Path, result: dict) -> None:
@@ -55,31 +78,28 @@ def test_training_and_evaluation_leave_a_report(run: Path, result: dict) -> None
     assert f"{result['real']['metrics']['lateral_mm_median']:.4g}</td>" in page
 
 
-def test_every_real_frame_gets_an_answer_and_a_drawing(model: Path, call: Call, tmp_path: Path) -> None:
-    out = tmp_path / "found.jsonl"
-    flags = ["--camera", DATA / "camera.json", "--out", out, "--overlays", tmp_path / "overlays"]
-    call("curio-detect", model, FRAMES, *flags)
+def test_every_real_frame_gets_an_answer_and_a_drawing(folder: Path, detected: list[dict[str, Any]]) -> None:
     frames = sorted(FRAMES.iterdir())
-    rows = [json.loads(line) for line in out.read_text().splitlines()]
-    assert [Path(row["image"]) for row in rows] == frames
-    for row in rows:
+    assert [Path(row["image"]) for row in detected] == frames
+    for row in detected:
         (found,) = row["detections"]
         assert found["object"] == "ape"
         rotation = np.array(found["rotation"])
         assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-5)
         assert found["translation_m"][2] > 0.2
-    drawn = [cv2.imread(str(tmp_path / "overlays" / frame.name)) for frame in frames]
+    drawn = [cv2.imread(str(folder / "overlays" / frame.name)) for frame in frames]
     assert all(picture is not None and picture.shape == (480, 640, 3) for picture in drawn)
 
 
-def test_evaluation_sees_frames_as_serving_does(run: Path, model: Path, call: Call, tmp_path: Path) -> None:
+def test_evaluation_sees_frames_as_serving_does(
+    model: Path, detected: list[dict[str, Any]], folder: Path, tmp_path: Path
+) -> None:
     """The exported model's own results file against curio-detect's answers: two implementations of one view."""
-    flags = ["--data", DATA, "--bop-results", tmp_path, "--num-images", "2", "--cache", run.parent / "cache"]
-    call("curio-eval", model, *flags)
+    flags = ["--data", DATA, "--bop-results", tmp_path, "--num-images", "2", "--cache", folder / "cache"]
+    assert status_of(evaluate, model, *flags) == 0
     with next(tmp_path.glob("*_lmo-test.csv")).open() as file:
         rows = list(csv.DictReader(file))
-    done = call("curio-detect", model, FRAMES, "--camera", DATA / "camera.json")
-    served = {int(Path(row["image"]).stem): row["detections"][0] for row in map(json.loads, done.stdout.splitlines())}
+    served = {int(Path(row["image"]).stem): row["detections"][0] for row in detected}
     assert len(rows) == 89
     for row in rows:
         found = served[int(row["im_id"])]
@@ -108,6 +128,6 @@ def test_the_card_names_the_meshes_and_no_folder_of_this_machine(model: Path) ->
     assert str(DATA.parent) not in card
 
 
-def test_a_model_needs_the_data_of_its_world(model: Path, call: Call) -> None:
-    done = call("curio-eval", model, status=2)
-    assert "needs its data: --data DIR" in done.stderr
+def test_a_model_needs_the_data_of_its_world(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert status_of(evaluate, model) == 2
+    assert "needs its data: --data DIR" in capsys.readouterr().err

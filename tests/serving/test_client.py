@@ -70,6 +70,24 @@ def test_a_file_a_camera_and_a_matrix_are_the_same_k(client: PoseClient, png: Pa
     assert all(answer == answers[0] for answer in answers)
 
 
+def test_a_camera_file_of_another_size_is_refused(client: PoseClient, png: Path, tmp_path: Path) -> None:
+    file = tmp_path / "camera.json"
+    file.write_text(f'{{"camera_matrix": {K.tolist()}, "width": 640, "height": 480}}')
+    for image in (png, png.read_bytes(), np.zeros((240, 320, 3), np.uint8)):
+        with pytest.raises(errors.CameraError, match="640x480, this one has 320x240"):
+            client.detect("pinhole", image, camera=file)
+    request = detect_request("pinhole", png, K)  # another client may not check it: then the server does
+    request.camera.width, request.camera.height = 640, 480
+    (answer,) = client.detect_stream([request], timeout_s=30)
+    assert "640x480, this one has 320x240" in answer.error.message
+
+
+def test_pixels_in_the_order_of_opencv(client: PoseClient, pixels: np.ndarray) -> None:
+    assert client.detect("flat", pixels[..., ::-1], color="bgr").results == client.detect("flat", pixels).results
+    with pytest.raises(errors.ArgumentError, match="expected rgb or bgr"):
+        client.detect("flat", pixels, color="hsv")  # type: ignore[arg-type]
+
+
 def test_regions_models_and_thresholds(client: PoseClient, png: Path) -> None:
     answer = client.detect("flat/1", png, regions=[(0, 0, 320, 240), (100, 60, 96, 64)], request_id="seven")
     assert [(r.model_version, r.region) for r in answer.results] == [(1, 0), (1, 1)]

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from curio_serve.batch import sources
-from curio_serve.batch.sources import check_arguments, common_folder, images
+from curio_serve.batch.sources import PassedOver, check_arguments, common_folder, images
 from curio_serve.errors import ImageError, UsageError
 
 
@@ -23,7 +23,7 @@ def touch(folder: Path, *names: str) -> None:
 
 
 def names(*arguments: str | Path) -> list[str]:
-    return [image.name for image in images([str(a) for a in arguments])]
+    return [image.name for image in images([str(a) for a in arguments], PassedOver())]
 
 
 def test_a_folder_gives_its_images_and_those_below_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,7 +127,7 @@ def clip(tmp_path: Path) -> Path:
 
 
 def test_a_video_gives_its_frames(clip: Path) -> None:
-    frames = list(images([str(clip)]))
+    frames = list(images([str(clip)], PassedOver()))
     assert [f.name for f in frames] == [f"{clip}#{i}" for i in range(5)]
     for i, frame in enumerate(frames):
         assert frame.pixels is not None
@@ -138,7 +138,7 @@ def test_a_video_gives_its_frames(clip: Path) -> None:
 
 def test_a_video_that_is_none_gives_one_error(tmp_path: Path) -> None:
     touch(tmp_path, "clip.mp4")
-    (image,) = images([str(tmp_path / "clip.mp4")])
+    (image,) = images([str(tmp_path / "clip.mp4")], PassedOver())
     with pytest.raises(ImageError, match="not a video"):
         image.read()
 
@@ -153,7 +153,28 @@ def test_memory_does_not_grow_with_the_folder(tmp_path: Path, monkeypatch: pytes
         for i in range(count):
             (folder / f"{i:06d}.png").touch()
         tracemalloc.start()
-        assert sum(1 for _ in images([str(folder)])) == count
+        assert sum(1 for _ in images([str(folder)], PassedOver())) == count
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.5 * peaks[0] + 20_000
+
+
+def test_what_is_no_image_is_counted_and_named(tmp_path: Path) -> None:
+    for name in ("a.jpg", "._a.jpg", "b.HEIC", "notes.txt", "more.txt", "deep/c.png", "empty/readme.md"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    passed_over = PassedOver()
+    assert [Path(image.name).name for image in images([str(tmp_path)], passed_over)] == ["a.jpg", "c.png"]
+    assert list(images([str(tmp_path / "empty")], passed_over)) == []
+    empty, counted, heic = passed_over.lines()
+    assert empty == f"{tmp_path / 'empty'} holds no image"
+    assert counted.startswith("passed over: 6 files are no images: ")
+    assert counted.count(", ") == 3  # three names and an ellipsis
+    assert heic.startswith("HEIC pictures have to be converted")
+
+
+def test_a_second_model_is_no_folder_of_images(tmp_path: Path) -> None:
+    (tmp_path / "can").mkdir()
+    (tmp_path / "can" / "config.pbtxt").touch()
+    with pytest.raises(UsageError, match="a call takes one model"):
+        check_arguments([str(tmp_path / "can"), str(tmp_path)])

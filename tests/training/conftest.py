@@ -9,6 +9,8 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.config import RunConfig, WorldOptions
 from curio_train.data.backgrounds import ClutterBackgrounds
+from curio_train.export import graph
+from curio_train.export.graph import Exported, export
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress, TrainState
@@ -16,6 +18,7 @@ from curio_train.meshes.shapes import box
 from curio_train.worlds import build
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.options import CirclesOptions
+from curio_train.worlds.single_object import confidence
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
 
@@ -43,6 +46,26 @@ def write_run() -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture(scope="session")
+def circles_run(tmp_path_factory: pytest.TempPathFactory, write_run: Callable[..., Path]) -> Path:
+    """A run of circles; copy it before you change it."""
+    return write_run(tmp_path_factory.mktemp("runs") / "circles")
+
+
+@pytest.fixture(scope="session")
+def circles_models(tmp_path_factory: pytest.TempPathFactory, circles_run: Path) -> tuple[Exported, Exported]:
+    """That run exported in float32 (version 1) and in float16 (version 2); copy the folder before you change it."""
+    models = tmp_path_factory.mktemp("out") / "models"
+    return export(circles_run, models), export(circles_run, models, half=True)
+
+
+@pytest.fixture
+def small_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calibration on 25 frames instead of 300, and 2 rounds of the check of numerical stability instead of 16."""
+    monkeypatch.setattr(confidence, "NUM_FRAMES", 25)
+    monkeypatch.setattr(graph, "NUM_JITTERED", 2)
 
 
 @pytest.fixture(scope="session")

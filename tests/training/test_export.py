@@ -2,9 +2,8 @@
 
 import hashlib
 import json
+import resource
 import shlex
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from curio_train.commands import export as export_command
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, ExportError, UsageError
 from curio_train.export.card import EVALUATION_FILE, Provenance, card, portable
+from curio_train.export.folder import ModelFolder
 from curio_train.export.graph import (
     Exported,
     Graph,
@@ -37,27 +37,27 @@ from curio_train.worlds.options import CirclesOptions
 WriteRun = Callable[..., Path]
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, write_run: WriteRun) -> Path:
-    return write_run(tmp_path_factory.mktemp("runs") / "circles")
+@pytest.fixture
+def run(circles_run: Path) -> Path:
+    return circles_run
 
 
-@pytest.fixture(scope="module")
-def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("out") / "models"
+@pytest.fixture
+def single(circles_models: tuple[Exported, Exported]) -> Exported:
+    return circles_models[0]
 
 
-@pytest.fixture(scope="module")
-def single(run: Path, models: Path) -> Exported:
-    return export(run, models)
+@pytest.fixture
+def half(circles_models: tuple[Exported, Exported]) -> Exported:
+    return circles_models[1]
 
 
-@pytest.fixture(scope="module")
-def half(run: Path, models: Path, single: Exported) -> Exported:
-    return export(run, models, half=True)
+@pytest.fixture
+def models(single: Exported) -> Path:
+    return single.path.parents[1]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def network(run: Path) -> torch.nn.Module:
     folder = RunFolder.open(run)
     return folder.trained(build(folder.config.world)).pose.network
@@ -149,13 +149,13 @@ def test_versions_stand_beside_each_other(single: Exported, half: Exported, mode
 def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Exported, tmp_path: Path) -> None:
     spec = ExportedModel.open(single.path / "model.onnx").spec
     config, progress = RunConfig(CirclesOptions(), method="noncur"), TrainingProgress(step=2, images=64, seconds=1.5)
-    made = Provenance(tmp_path, config, this_session(), progress, "float32")
+    made = Provenance(tmp_path, config, [this_session()], progress, "float32")
     result = {"split": "test", "num_images": 500, "metrics": {"position_px": 1.25}, "untrained": {"position_px": 40.0}}
     for images_seen, quoted in ((32, False), (64, True)):
         (tmp_path / EVALUATION_FILE).write_text(json.dumps(result | {"images_seen": images_seen}))
         text = card(1, spec, {TRANSLATION: (1, 3)}, Circles.objects, made)
         assert ("| position_px | 1.25 | 40 |" in text) == quoted
-        assert ("Not evaluated" in text) != quoted
+        assert ("had not scored it" in text) != quoted
         assert "real frames" not in text
     real = {"dataset": "lmo", "split_name": "bop19 targets", "num_targets": 89, "metrics": {"add_recall": 0.25}}
     for refined, column in (({}, "–"), ({"refined": {"real": {"metrics": {"add_recall": 0.5}}}}, "0.5")):
@@ -292,17 +292,16 @@ def test_a_place_that_cannot_be_written_is_told(run: Path, tmp_path: Path, capsy
     assert "--out" in said
 
 
-def test_a_full_disk_leaves_nothing_behind(run: Path, tmp_path: Path) -> None:
-    limited = (
-        f'ulimit -f 2000; exec "{sys.executable}" -c "from curio_train.commands.export import export; export()" "$@"'
-    )
-    command = ["bash", "-c", limited, "curio-export", str(run), "--out", str(tmp_path / "models")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "File too large; name another folder: --out" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not any(tmp_path.rglob("*.onnx"))
-    assert not any(tmp_path.rglob("*.tmp"))
+def test_a_full_disk_leaves_nothing_behind(tmp_path: Path) -> None:
+    folder = ModelFolder.named(tmp_path / "models", "circles")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, limits[1]))
+    try:
+        with pytest.raises(ExportError, match="File too large; name another folder: --out"):
+            folder.add(1, {"golden.npz": b"small", "model.onnx": bytes(2_000_000)}, "config", "card")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert files(tmp_path) == ["models"]
 
 
 class _Everything(Circles):

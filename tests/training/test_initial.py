@@ -1,5 +1,6 @@
 """What a run may begin with: runs and exported models give the same network, and what they are not is told."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import torch
 from curio_train.config import NetworkConfig, RunConfig
 from curio_train.errors import CheckpointError, CurioError, UsageError
 from curio_train.export.card import EVALUATION_FILE
-from curio_train.export.graph import export
+from curio_train.export.graph import Exported, export
 from curio_train.exported_model import ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.initial import begin_with, uses_synthetic_labels
@@ -20,21 +21,18 @@ from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions
 from torch import Tensor
 
-WriteRun = Callable[..., Path]
 CONFIG = RunConfig(CirclesOptions(), method="noncur")
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, write_run: WriteRun) -> Path:
-    return write_run(tmp_path_factory.mktemp("runs") / "circles")
+@pytest.fixture
+def run(circles_run: Path) -> Path:
+    return circles_run
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory, run: Path) -> Path:
+@pytest.fixture
+def model(circles_models: tuple[Exported, Exported]) -> Path:
     """Version 1 in float32, version 2 in float16."""
-    models = tmp_path_factory.mktemp("models")
-    export(run, models)
-    return export(run, models, half=True).path.parent
+    return circles_models[0].path.parent
 
 
 def begun(path: Path, config: RunConfig = CONFIG) -> TrainState:
@@ -80,7 +78,8 @@ def test_images_count_on_over_models_and_in_their_cards(model: Path, tmp_path: P
     assert spec.images_seen == 64 + 12
     assert spec.training_seconds > 1.5
     card = (version.parent / "CARD.md").read_text()
-    assert "| images seen | 76, 12 of them since it was circles |" in card
+    assert "| images seen | 76 (64 of the network it began with, 12 here) |" in card
+    assert card.count("; then `") == 1  # the second session
     assert "| a | 2 |" in card
     assert "`curio-train circles --init models/circles/1`" in card
     assert begun(version).progress.images_before == 76
@@ -128,9 +127,9 @@ def of_nothing(version: Path) -> None:
     ],
 )
 def test_what_cannot_be_begun_with_is_told(
-    run: Path, tmp_path: Path, damage: Callable[[Path], None], error: type[CurioError], text: str
+    model: Path, tmp_path: Path, damage: Callable[[Path], None], error: type[CurioError], text: str
 ) -> None:
-    version = export(run, tmp_path).path
+    version = Path(shutil.copytree(model / "1", tmp_path / "circles" / "1"))
     damage(version)
     with pytest.raises(error, match=text):
         begun(version)

@@ -8,7 +8,8 @@ import pytest
 import torch
 import trimesh
 from curio_train.commands.prepare import prepared
-from curio_train.config import RunConfig, preset_recipe
+from curio_train.commands.train import parse
+from curio_train.config import RunConfig
 from curio_train.errors import CameraError, DataError, UsageError
 from curio_train.export.graph import export
 from curio_train.geometry import matrix_from_rotation_6d
@@ -197,11 +198,13 @@ def test_where_frames_were_taken_is_known_in_metres_or_not_at_all(data, tmp_path
         )
 
 
-def test_a_run_without_such_frames_says_so(data, tmp_path):
+def test_a_run_without_such_frames_learns_nothing_from_them(data, tmp_path):
     frames = tmp_path / "frames"
     frames.mkdir()
     cv2.imwrite(str(frames / "0.png"), np.zeros((480, 640, 3), np.uint8))
-    for photos, share in ((None, 0.0), (frames, 0.5)):
-        options = LinemodOptions("ape", data, photos=photos)
-        config = RunConfig(options, method="sleep", recipe=preset_recipe("laptop", LinemodOptions))
-        assert prepared(config, tmp_path, print, print).recipe.self_training == share
+    call = ["linemod", "--class", "ape", "--data", str(data)]
+    for words, fraction in (([], 0.0), (["--photos", str(frames)], 0.5)):
+        config = parse(call + words).config
+        assert prepared(config, tmp_path, print, print).recipe.self_training == fraction
+    with pytest.raises(UsageError, match=r"--self-training 0\.5: found no photographs .* expected --photos"):
+        prepared(parse([*call, "--self-training", "0.5"]).config, tmp_path, print, print)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from curio_train.camera import Intrinsics, load_intrinsics
-from curio_train.capture.ground import scale_by_distance, scale_by_height, to_world
+from curio_train.capture.ground import scale_by_distance, to_world
 from curio_train.capture.structure import Structure, every_nth, recover
 from curio_train.commands import train as train_command
 from curio_train.errors import CameraError, DataError
@@ -110,17 +110,6 @@ def test_the_ground_becomes_y_0_and_the_first_camera_stands_towards_z(
     ray = world.cam_from_world[0, 2, :3]
     meets = world.centres[0] - ray * world.centres[0, 1] / ray[1]
     assert meets == pytest.approx([0, 0, 0], abs=0.02), "the origin is what the first camera looks at"
-
-
-def test_scale_by_what_stands_on_the_ground(structure: Structure) -> None:
-    """The walls are 2 m high; some points close to their upper edge are found."""
-    tall = np.percentile(to_world(structure).points[:, 1], 99)
-    world = scale_by_height(to_world(structure), 1.5)
-    assert np.linalg.norm(world.centres[0]) / np.linalg.norm(to_world(structure).centres[0]) == pytest.approx(
-        1.5 / tall, rel=0.1
-    )
-    with pytest.raises(CameraError, match="known distance"):
-        scale_by_height(to_world(structure), 0.0)
 
 
 def test_a_known_camera_is_kept(sequence: tuple[list[Path], np.ndarray]) -> None:

@@ -102,7 +102,7 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """What a user may choose about a world; each world has its own subclass in ``worlds/options.py``."""
+    """The options of a world; each world has its own subclass in ``worlds/options.py``."""
 
     default_method: ClassVar[MethodName] = "our"
     """The method unless --method is given."""

@@ -48,7 +48,7 @@ class ExportedModel:
 
     @property
     def spec(self) -> ModelSpec:
-        """What the model says about itself."""
+        """The model's specification."""
         return self._model.spec
 
     def __call__(self, images: Tensor) -> dict[str, Tensor]:

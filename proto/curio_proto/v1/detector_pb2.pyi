@@ -53,12 +53,16 @@ class RawImage(_message.Message):
     def __init__(self, format: _Optional[_Union[PixelFormat, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., stride: _Optional[int] = ..., data: _Optional[bytes] = ...) -> None: ...
 
 class Camera(_message.Message):
-    __slots__ = ("camera_matrix", "distortion")
+    __slots__ = ("camera_matrix", "distortion", "width", "height")
     CAMERA_MATRIX_FIELD_NUMBER: _ClassVar[int]
     DISTORTION_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
     camera_matrix: _containers.RepeatedScalarFieldContainer[float]
     distortion: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, camera_matrix: _Optional[_Iterable[float]] = ..., distortion: _Optional[_Iterable[float]] = ...) -> None: ...
+    width: int
+    height: int
+    def __init__(self, camera_matrix: _Optional[_Iterable[float]] = ..., distortion: _Optional[_Iterable[float]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ...) -> None: ...
 
 class Region(_message.Message):
     __slots__ = ("x", "y", "width", "height")

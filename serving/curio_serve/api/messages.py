@@ -19,7 +19,7 @@ def camera_from_message(message: CameraMessage) -> PinholeCamera:
     """Intrinsics of a request.
 
     Raises:
-        CameraError: Not nine values, or an impossible camera.
+        CameraError: Not nine values, one side of the frame's size without the other, or an impossible camera.
     """
     return _camera(message.SerializeToString())
 
@@ -31,7 +31,10 @@ def _camera(data: bytes) -> PinholeCamera:
     values = message.camera_matrix
     if len(values) != 9:
         raise CameraError(f"camera.camera_matrix has {len(values)} values; expected 9: K row after row")
-    return PinholeCamera(np.reshape(values, (3, 3)), tuple(message.distortion))
+    size = message.width, message.height
+    if any(size) and not all(size):
+        raise CameraError(f"camera.width and camera.height are {size[0]} and {size[1]}; expected both, or neither")
+    return PinholeCamera(np.reshape(values, (3, 3)), tuple(message.distortion), size if all(size) else None)
 
 
 def region_from_message(message: RegionMessage) -> Region:

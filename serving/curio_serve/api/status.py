@@ -27,12 +27,12 @@ class Caller(Protocol):
     """The client of a call; gRPC's servicer context is one."""
 
     def peer(self) -> str:
-        """Its address, as gRPC writes it."""
+        """The caller's address, as gRPC writes it."""
 
 
 @dataclass
 class CallRecord:
-    """What the log says of a call besides its method."""
+    """The fields of a call's log line, besides its method."""
 
     request_id: str = ""
     """The client's own name for the request, as far as it has been read."""
@@ -96,7 +96,7 @@ def frame_error(error: CurioError) -> FrameError:
 
 @lru_cache(256)
 def _status(name: str, reason: str, message: str, retry_s: float | None) -> grpc.Status:
-    """Cached: in a flood many calls are refused with the same text, and a refusal has to be cheap."""
+    """Build a status; cached, because a flood of calls is refused with one text and refusals have to be cheap."""
     details: list[Message] = [error_details_pb2.ErrorInfo(reason=reason, domain=DOMAIN)]
     if retry_s is not None:
         delay = Duration()

@@ -8,6 +8,7 @@ import sys
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -42,6 +43,12 @@ class DetectArguments:
     """Model folder (its latest version), version folder or .onnx file; if no such path, a server's HOST:PORT/NAME."""
     images: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="IMAGES...")]
     """Files, folders (and those below; of a BOP scene its photographs), globs, videos, or - for a list on stdin."""
+    video: str | None = None
+    """Show detections live in the browser instead: a camera's number, a video file, or a URL such as rtsp://…."""
+    host: str = "127.0.0.1"
+    """Address that --video listens on; whoever reaches it sees the frames."""
+    port: int = 8080
+    """Port that --video listens on."""
     camera: Path | None = None
     """Intrinsics: camera JSON, BOP's camera.json or scene_camera.json, OpenCV YAML. 2D worlds need none."""
     out: Path | None = None
@@ -109,21 +116,24 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.parallel import in_order
     from curio_serve.batch.progress import Progress
     from curio_serve.batch.result_file import ResultFile
-    from curio_serve.batch.sources import check_arguments, images
+    from curio_serve.batch.sources import PassedOver, check_arguments, images
     from curio_serve.models.model_check import ChildCheck
 
     _check_numbers(arguments)
-    check_arguments(arguments.images)
+    if arguments.video is None:
+        check_arguments(arguments.images)
     cv2.setNumThreads(1)  # the images are what runs in parallel
     settings = _settings(arguments)
     if os.path.exists(arguments.model):
         ChildCheck()(Path(arguments.model))
     estimator = _estimator(arguments, settings)
-    form = _format(arguments, estimator.spec)
     _check_camera(arguments, estimator)
-    model = (estimator.name, estimator.version)
+    if arguments.video is not None:
+        return _live(arguments, estimator)
+    form = _format(arguments, estimator.spec)
+    model, passed_over = (estimator.name, estimator.version), PassedOver()
     with ResultFile(arguments.out, form, model, overwrite=arguments.overwrite) as output:
-        remaining = output.unanswered(images(arguments.images))
+        remaining = output.unanswered(images(arguments.images, passed_over))
         if arguments.ray is None:
             results = in_order(partial(_answer, estimator, form), remaining, arguments.jobs)
         else:  # other nodes have another working folder
@@ -137,6 +147,8 @@ def run(arguments: DetectArguments) -> int:
             for result in results:
                 output.write(result)
                 progress.count(result)
+        for line in passed_over.lines():
+            print(f"curio-detect: {line}", file=sys.stderr)
         if output.num_images == 0:
             raise UsageError(
                 f"no images in {' '.join(arguments.images)}; looked for .jpg, .jpeg, .png and .webp in folders, "
@@ -146,7 +158,18 @@ def run(arguments: DetectArguments) -> int:
         return 1 if output.num_errors else 0
 
 
+def _live(arguments: DetectArguments, estimator: "Estimator") -> int:
+    if find_spec("viser") is None:
+        raise UsageError("--video needs the extra view: pip install 'curio-pose[view]'")
+    from curio_serve.batch.live import show_live
+
+    assert arguments.video is not None
+    return 0 if show_live(estimator, arguments.video, arguments.host, arguments.port) else 1
+
+
 def _check_numbers(arguments: DetectArguments) -> None:
+    if arguments.video is not None and (arguments.images or arguments.out or arguments.overlays or arguments.ray):
+        raise UsageError("--video shows a video and writes nothing: leave out IMAGES, --out, --overlays and --ray")
     if arguments.jobs < 1:
         raise UsageError(f"--jobs {arguments.jobs}: expected at least 1")
     if not 0 <= arguments.min_confidence <= 1:
@@ -174,7 +197,7 @@ def _settings(arguments: DetectArguments) -> "Settings":
         arguments.max_detections,
         arguments.exif_rotation,
         arguments.overlays and Path(os.path.abspath(arguments.overlays)),
-        common_folder(arguments.images),
+        common_folder(arguments.images or ["."]),
     )
 
 
@@ -210,13 +233,13 @@ def _estimator(arguments: DetectArguments, settings: "Settings") -> "Estimator":
 
 
 def _answering(arguments: DetectArguments, settings: "Settings") -> "Callable[[SourceImage], ImageLines]":
-    """What answers images in another process."""
+    """Build the function that answers images in another process."""
     estimator = _estimator(arguments, settings)
     return partial(_answer, estimator, _format(arguments, estimator.spec))
 
 
 def _answer(estimator: "Estimator", form: "ResultFormat", image: "SourceImage") -> "ImageLines":
-    """What is written of an image. One thread that made the lines of all images would keep the others waiting."""
+    """Answer an image and format its lines, both in the worker: one thread for all lines would be too slow."""
     return form.lines(estimator(image))
 
 

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
-from curio_proto.v1.detector_pb2 import RegionResult
+import numpy as np
+from curio_proto.v1.detector_pb2 import Detection, RegionResult
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_serve.batch.formats import ImageResult
@@ -37,51 +38,46 @@ _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 @dataclass(frozen=True)
 class Settings:
-    """What holds for all images of a run.
-
-    Attributes:
-        cameras: Their intrinsics; None for 2D worlds and models that allow a default.
-        min_confidence: Detections below are left out.
-        max_detections: Most confident first; None: all.
-        apply_exif_rotation: Turn pixels, and K with them.
-        overlays: Where drawings go; None: nowhere.
-        sources_root: Folder below which the images' paths are told apart.
-    """
+    """The settings that all images of a run share."""
 
     cameras: CameraFile | None = None
+    """Their intrinsics; None for 2D worlds and models that allow a default."""
     min_confidence: float = 0.0
+    """Detections below are left out."""
     max_detections: int | None = None
+    """Most confident first; None: all."""
     apply_exif_rotation: bool = False
+    """Turn pixels, and K with them."""
     overlays: Path | None = None
+    """Where drawings go; None: nowhere."""
     sources_root: Path = Path("/")
+    """Folder below which the images' paths are told apart."""
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a model saw in one image.
-
-    Attributes:
-        camera: The one that was used, of the frame as turned.
-        frame: Where the frame was decoded here in its full size.
-    """
+    """The answer of a model to one image."""
 
     width: int
     height: int
     camera: PinholeCamera | None
+    """The one that was used, of the frame as turned."""
     results: Sequence[RegionResult]
     decode_ms: float | None
     inference_ms: float
     frame: images.Frame | None = None
+    """Where the frame was decoded here in its full size."""
 
 
 class Estimator(ABC):
-    """Answers images one at a time; safe to share between threads.
+    """Answers images one at a time; safe to share between threads."""
 
-    Attributes:
-        name: Of the model.
-        version: Of the model.
-        spec: What the model says about itself.
-    """
+    name: str
+    """Of the model."""
+    version: int
+    """Of the model."""
+    spec: ModelSpec
+    """The model's specification."""
 
     def __init__(self, name: str, version: int, spec: ModelSpec, settings: Settings) -> None:
         self.name, self.version, self.spec = name, version, spec
@@ -114,6 +110,21 @@ class Estimator(ABC):
             seen.decode_ms,
             seen.inference_ms,
         )
+
+    def overlay(self, pixels: np.ndarray) -> tuple[np.ndarray, list[Detection]]:
+        """A video's frame with its detections drawn in, and the detections, most confident first.
+
+        Args:
+            pixels: uint8 RGB [height, width, 3].
+
+        Raises:
+            RequestError: The frame or its camera is not acceptable.
+            ServiceError: The server is out of reach or overloaded.
+        """
+        image = SourceImage("frame", "frame", 0, pixels)
+        seen = self._look(image, b"", self._camera(image))
+        found = [detection for result in seen.results for detection in result.detections]
+        return draw(pixels, seen.results, self.spec, seen.camera), found
 
     @abstractmethod
     def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> _Seen:

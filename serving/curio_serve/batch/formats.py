@@ -39,30 +39,27 @@ LINEMOD_OBJECT_IDS: Mapping[str, int] = {
 
 @dataclass(frozen=True)
 class ImageResult:
-    """What became of one image.
-
-    Attributes:
-        image: Its path as given.
-        model: Name of the model.
-        version: Of the model.
-        width: Of the decoded frame in pixels; None where it could not be decoded. Likewise ``height``.
-        camera_matrix: K that was used, 9 values row-major; empty without one.
-        results: What the model found; empty where ``error`` is not.
-        decode_ms: Bytes to pixels.
-        inference_ms: Pixels to detections.
-        error: Why there is no answer.
-    """
+    """The detections of one image, or its error."""
 
     image: str
+    """Its path as given."""
     model: str
+    """Name of the model."""
     version: int
+    """Of the model."""
     width: int | None = None
+    """Of the decoded frame in pixels; None where it could not be decoded. Likewise ``height``."""
     height: int | None = None
     camera_matrix: Sequence[float] = ()
+    """K that was used, 9 values row-major; empty without one."""
     results: Sequence[RegionResult] = field(default_factory=tuple)
+    """What the model found; empty where ``error`` is not."""
     decode_ms: float | None = None
+    """Bytes to pixels."""
     inference_ms: float | None = None
+    """Pixels to detections."""
     error: str = ""
+    """Why there is no answer."""
 
     @property
     def detections(self) -> list[Detection]:
@@ -76,53 +73,44 @@ class ImageResult:
 
 @dataclass(frozen=True)
 class ImageLines:
-    """What a result file gets of one image.
-
-    Attributes:
-        image: Its path as given.
-        error: Why there is no answer.
-        data: The lines, each with its newline.
-    """
+    """The lines of a result file that belong to one image."""
 
     image: str
+    """Its path as given."""
     error: str
+    """Why there is no answer."""
     data: bytes
+    """The lines, each with its newline."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """One line of an existing result file.
-
-    Attributes:
-        key: Names the image, see :meth:`ResultFormat.key`.
-        opens_image: The first line of its image.
-        model: (name, version), where the format says it.
-        is_error: The image had no answer.
-    """
+    """One line of an existing result file."""
 
     key: str
+    """Names the image, see :meth:`ResultFormat.key`."""
     opens_image: bool
+    """The first line of its image."""
     model: tuple[str, int] | None = None
+    """(name, version), where the format says it."""
     is_error: bool = False
+    """The image had no answer."""
 
 
 class ResultFormat(ABC):
-    """A way to write results down, line by line.
-
-    Attributes:
-        opening: What every file of this format begins with.
-        header: The opening that is a line of its own, or nothing.
-        has_line_for_every_image: Also for one without detections.
-        is_one_line_an_image: A complete line is then a complete image.
-    """
+    """A way to write results down, line by line."""
 
     opening: bytes
+    """What every file of this format begins with."""
     header: bytes = b""
+    """The opening that is a line of its own, or nothing."""
     has_line_for_every_image: bool = True
+    """Also for one without detections."""
     is_one_line_an_image: bool = False
+    """A complete line is then a complete image."""
 
     def lines(self, result: ImageResult) -> ImageLines:
-        """What a file gets of an image."""
+        """Format the lines of an image."""
         return ImageLines(result.image, result.error, self.encode(result))
 
     @abstractmethod
@@ -131,7 +119,7 @@ class ResultFormat(ABC):
 
     @abstractmethod
     def key(self, image: str) -> str:
-        """How lines of this format name an image."""
+        """The name of an image in lines of this format."""
 
     @abstractmethod
     def parse(self, line: bytes) -> Line:

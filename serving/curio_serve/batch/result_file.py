@@ -29,7 +29,7 @@ NamedT = TypeVar("NamedT", bound=Named)
 
 
 class ResultFile:
-    """Where results go, in the order of the images.
+    """Writes results in the order of the images, and resumes after a stop.
 
     Args:
         path: The file; None: standard output.
@@ -37,13 +37,14 @@ class ResultFile:
         model: Name and version whose results it holds.
         overwrite: Drop what is in it.
 
-    Attributes:
-        num_images: Answered in the file, those of earlier runs included.
-        num_errors: Of these, images without an answer, where the format says so.
-
     Raises:
         OutputError: The file cannot be opened for writing, or another process writes it.
     """
+
+    num_images: int
+    """Answered in the file, those of earlier runs included."""
+    num_errors: int
+    """Of these, images without an answer, where the format says so."""
 
     def __init__(
         self, path: Path | None, form: ResultFormat, model: tuple[str, int], *, overwrite: bool = False

@@ -19,11 +19,14 @@ import numpy as np
 from curio_serve.errors import ImageError, UsageError
 from curio_serve.files import read_file
 from curio_serve.imaging.image import MAX_FILE_BYTES
+from curio_serve.models.model_folder import CONFIG_FILE
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v"})
 STANDARD_INPUT = "-"
 
+_NAMED = 3  # files passed over that are named; the others are counted
+_HEIC = (".heic", ".heif")
 _NAMES_A_PASS = 1 << 16
 _BOP_SCENE_FILES = ("scene_camera.json", "scene_gt.json")
 _BOP_IMAGE_FOLDERS = ("rgb", "gray")
@@ -32,21 +35,18 @@ Pixels: TypeAlias = np.ndarray
 
 @dataclass(frozen=True)
 class SourceImage:
-    """An image that is going to be looked at.
-
-    Attributes:
-        name: Its path as given; a video's frames are ``clip.mp4#0``, ``clip.mp4#1`` and so on.
-        path: The file it comes from.
-        video_frame: Its number in a video; None for an image file.
-        pixels: uint8 RGB [height, width, 3] of a video's frame.
-        error: Why a video has no frames to give, or a folder no images.
-    """
+    """An image that is going to be looked at."""
 
     name: str
+    """Its path as given; a video's frames are ``clip.mp4#0``, ``clip.mp4#1`` and so on."""
     path: str
+    """The file it comes from."""
     video_frame: int | None = None
+    """Its number in a video; None for an image file."""
     pixels: Pixels | None = None
+    """Uint8 RGB [height, width, 3] of a video's frame."""
     error: str = ""
+    """Why a video has no frames to give, or a folder no images."""
 
     def read(self) -> bytes:
         """The bytes of an image file.
@@ -68,6 +68,35 @@ class SourceImage:
         return self.path if self.video_frame is None else os.path.join(self.path, f"{self.video_frame:06d}.jpg")
 
 
+class PassedOver:
+    """Counts what folders hold beside images, for a line at the end of a run."""
+
+    def __init__(self) -> None:
+        self._num_files, self._has_heic = 0, False
+        self._first, self._empty = list[str](), list[str]()
+
+    def file(self, name: str) -> None:
+        """Count a file that is no image."""
+        self._num_files += 1
+        self._has_heic |= name.lower().endswith(_HEIC)
+        if len(self._first) < _NAMED:
+            self._first.append(name)
+
+    def empty_folder(self, path: str) -> None:
+        """Count a folder in which no image lies, at any depth."""
+        self._empty.append(path)
+
+    def lines(self) -> Iterator[str]:
+        """The lines that tell a person what was passed over."""
+        yield from (f"{path} holds no image" for path in self._empty)
+        if self._num_files:
+            more = ", …" if self._num_files > len(self._first) else ""
+            verb = "file is no image" if self._num_files == 1 else "files are no images"
+            yield f"passed over: {self._num_files} {verb}: {', '.join(self._first)}{more}"
+            if self._has_heic:
+                yield "HEIC pictures have to be converted first, for example by heif-convert or ImageMagick"
+
+
 def check_arguments(arguments: Sequence[str]) -> None:
     """Refuse a call that names what does not exist, before any work.
 
@@ -79,22 +108,29 @@ def check_arguments(arguments: Sequence[str]) -> None:
     if arguments.count(STANDARD_INPUT) > 1:
         raise UsageError("- was given twice; standard input can be read once")
     for argument in arguments:
+        if os.path.exists(os.path.join(argument, CONFIG_FILE)):
+            raise UsageError(f"{argument} is a model and stands where images do; a call takes one model: call it twice")
         if argument != STANDARD_INPUT and not os.path.exists(argument) and not _has_match(argument):
             raise UsageError(f"{argument}: no such file or folder, and no file matches it; check the path")
 
 
-def images(arguments: Sequence[str]) -> Iterator[SourceImage]:
-    """Every image that the arguments name, in order; a folder that cannot be listed is one image with that error."""
+def images(arguments: Sequence[str], passed_over: PassedOver) -> Iterator[SourceImage]:
+    """Every image that the arguments name, in order; a folder that cannot be listed is one image with that error.
+
+    Args:
+        arguments: As on the command line.
+        passed_over: Counts what is no image.
+    """
     for argument in arguments:
         if argument == STANDARD_INPUT:
             for line in sys.stdin.buffer:
                 if path := os.fsdecode(line.rstrip(b"\r\n")):
-                    yield from _images_at(path)
+                    yield from _images_at(path, passed_over)
         elif os.path.exists(argument):
-            yield from _images_at(argument)
+            yield from _images_at(argument, passed_over)
         else:
             for path in sorted(glob.iglob(argument, recursive=True)):
-                yield from _images_at(path)
+                yield from _images_at(path, passed_over)
 
 
 def common_folder(arguments: Sequence[str]) -> Path:
@@ -114,46 +150,53 @@ def _has_match(pattern: str) -> bool:
     return glob.has_magic(pattern) and next(glob.iglob(pattern, recursive=True), None) is not None
 
 
-def _images_at(path: str) -> Iterator[SourceImage]:
+def _images_at(path: str, passed_over: PassedOver) -> Iterator[SourceImage]:
     if os.path.isdir(path):
-        yield from _images_below(path)
+        found = _images_below(path, passed_over)
+        first = next(found, None)
+        if first is None:
+            passed_over.empty_folder(path)
+        else:
+            yield first
+            yield from found
     elif PurePath(path).suffix.lower() in VIDEO_SUFFIXES:
         yield from _video_frames(path)
     else:
         yield SourceImage(path, path)
 
 
-def _images_below(folder: str) -> Iterator[SourceImage]:
+def _images_below(folder: str, passed_over: PassedOver) -> Iterator[SourceImage]:
     """Image files of a folder and its sub-folders; of a BOP scene the photographs alone, not its depths and masks."""
     is_bop_scene = any(os.path.exists(os.path.join(folder, name)) for name in _BOP_SCENE_FILES)
     try:
-        for name, is_folder in _sorted_entries(folder):
+        for name, is_folder in _sorted_entries(folder, passed_over):
             if not is_folder:
                 yield SourceImage(os.path.join(folder, name), os.path.join(folder, name))
             elif not is_bop_scene or name in _BOP_IMAGE_FOLDERS:
-                yield from _images_below(os.path.join(folder, name))
+                yield from _images_below(os.path.join(folder, name), passed_over)
     except OSError as exc:
         yield SourceImage(folder, folder, error=f"cannot be listed: {exc.strerror}")
 
 
-def _sorted_entries(folder: str) -> Iterator[tuple[str, bool]]:
+def _sorted_entries(folder: str, passed_over: PassedOver) -> Iterator[tuple[str, bool]]:
     """(name, is a folder) of images and sub-folders by name; hidden ones and links to folders are left out.
 
     Each pass over the folder keeps the next names alone, so that memory does not depend on how many there are.
     """
     last = ""
-    while batch := heapq.nsmallest(_NAMES_A_PASS, _entries_after(folder, last)):
+    while batch := heapq.nsmallest(_NAMES_A_PASS, _entries_after(folder, last, passed_over)):
         yield from batch
         last = batch[-1][0]
 
 
-def _entries_after(folder: str, last: str) -> Iterator[tuple[str, bool]]:
+def _entries_after(folder: str, last: str, passed_over: PassedOver) -> Iterator[tuple[str, bool]]:
     with os.scandir(folder) as entries:
         for entry in entries:
-            if entry.name <= last or entry.name.startswith("."):
-                continue
-            is_folder = entry.is_dir(follow_symlinks=False)
-            if is_folder or (os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES and not entry.is_dir()):
+            is_hidden, is_folder = entry.name.startswith("."), entry.is_dir(follow_symlinks=False)
+            is_image = not is_hidden and os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES
+            if not is_image and not last and not entry.is_dir():  # in the first pass alone
+                passed_over.file(entry.name)
+            if entry.name > last and ((is_folder and not is_hidden) or (is_image and not entry.is_dir())):
                 yield entry.name, is_folder
 
 

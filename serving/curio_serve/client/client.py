@@ -13,7 +13,7 @@ import time
 from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import grpc
 from curio_proto.v1 import detector_pb2 as messages
@@ -108,6 +108,7 @@ class PoseClient(_Client):
         min_confidence: float | None = None,
         max_detections: int | None = None,
         apply_exif_rotation: bool = False,
+        color: Literal["rgb", "bgr"] = "rgb",
         request_id: str = "",
         timeout_s: float | None = None,
     ) -> messages.DetectResponse:
@@ -115,13 +116,15 @@ class PoseClient(_Client):
 
         Args:
             model: Name, or ``name/version``; several for several objects in one call.
-            image: Path of a JPEG, PNG or WebP file, its bytes, or pixels uint8 RGB [height, width, 3].
+            image: Path of a JPEG, PNG or WebP file, its bytes, or pixels uint8 [height, width, 3] or grey
+                [height, width].
             camera: Camera file, :class:`~curio_serve.imaging.camera.PinholeCamera` or K [3, 3] in pixels; None for
                 models that need none.
             regions: Rectangles to search, each (x, y, width, height) in pixels; none: the whole frame.
             min_confidence: Detections below it are left out; None: the server's own threshold.
             max_detections: Largest number a region and model, the most confident; None: no limit.
             apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
+            color: Order of the channels of pixels; OpenCV reads images as ``bgr``.
             request_id: Comes back with the answer; empty: the server makes one up.
             timeout_s: Deadline of this call.
 
@@ -136,6 +139,7 @@ class PoseClient(_Client):
             min_confidence=min_confidence,
             max_detections=max_detections,
             apply_exif_rotation=apply_exif_rotation,
+            color=color,
             request_id=request_id,
         )
         return self._call(self._stub.Detect, request, timeout_s)
@@ -164,7 +168,7 @@ class PoseClient(_Client):
             call.cancel()  # the caller may have stopped listening early
 
     def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
-        """What the server has loaded."""
+        """The models that the server has loaded."""
         return list(self._call(self._stub.ListModels, messages.ListModelsRequest(), timeout_s).models)
 
     def get_model(self, model: str, *, timeout_s: float | None = None) -> messages.GetModelResponse:
@@ -230,7 +234,7 @@ class AsyncPoseClient(_Client):
             call.cancel()
 
     async def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
-        """What the server has loaded."""
+        """The models that the server has loaded."""
         return list((await self._call(self._stub.ListModels, messages.ListModelsRequest(), timeout_s)).models)
 
     async def get_model(self, model: str, *, timeout_s: float | None = None) -> messages.GetModelResponse:

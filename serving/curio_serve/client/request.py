@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from curio_proto.v1 import detector_pb2 as messages
@@ -13,11 +13,13 @@ from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.camera_files import read_camera_file
 from curio_serve.imaging.image import MAX_FILE_BYTES
+from curio_serve.imaging.image_header import read_header
 from curio_serve.imaging.view import Region
 
 ImageLike: TypeAlias = str | Path | bytes | np.ndarray
 CameraLike: TypeAlias = str | Path | PinholeCamera | np.ndarray | Sequence[Sequence[float]] | None
 RegionLike: TypeAlias = Region | Sequence[float]
+_COLORS = {"rgb": messages.PIXEL_FORMAT_RGB8, "bgr": messages.PIXEL_FORMAT_BGR8}
 _VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
 
@@ -30,39 +32,43 @@ def detect_request(
     min_confidence: float | None = None,
     max_detections: int | None = None,
     apply_exif_rotation: bool = False,
+    color: Literal["rgb", "bgr"] = "rgb",
     request_id: str = "",
 ) -> messages.DetectRequest:
     """The message for one frame.
 
     Args:
         model: Name, or ``name/version``; several for several objects in one call.
-        image: Path of a JPEG, PNG or WebP file, its bytes, or pixels uint8 RGB [height, width, 3] or grey
-            [height, width].
+        image: Path of a JPEG, PNG or WebP file, its bytes, or pixels uint8 [height, width, 3] or grey [height, width].
         camera: Camera file, camera, or K [3, 3] in pixels.
         regions: Each (x, y, width, height) in pixels.
         min_confidence: None: the server's own threshold.
         max_detections: None: no limit.
         apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
+        color: Order of the channels of pixels; OpenCV reads images as ``bgr``.
         request_id: Comes back with the answer; empty: the server makes one up.
 
     Raises:
         ArgumentError: A value is of the wrong shape or kind.
         ImageError: The file cannot be read, or the array is no image.
-        CameraError: The camera file cannot be read, or the matrix is no K.
+        CameraError: The camera file cannot be read or belongs to images of another size, or the matrix is no K.
     """
     request = messages.DetectRequest(
         request_id=request_id,
         models=[selector(name) for name in ([model] if isinstance(model, str) else model)],
-        camera=_camera(camera, image),
         regions=[_region(region) for region in regions],
         min_confidence=min_confidence,
         max_detections=max_detections,
         apply_exif_rotation=apply_exif_rotation,
     )
     if isinstance(image, np.ndarray):
-        request.raw.CopyFrom(_raw(image))
+        request.raw.CopyFrom(_raw(image, color))
+        size: tuple[int, int] | None = (request.raw.width, request.raw.height)
     else:
         request.encoded = image if isinstance(image, bytes) else _read(image)
+        size = _stored_size(request.encoded)
+    if camera is not None:
+        request.camera.CopyFrom(_camera(camera, image, size))
     return request
 
 
@@ -78,13 +84,15 @@ def selector(model: str) -> messages.ModelSelector:
     return messages.ModelSelector(name=name, version=int(version or 0))
 
 
-def _raw(pixels: np.ndarray) -> messages.RawImage:
+def _raw(pixels: np.ndarray, color: str) -> messages.RawImage:
     if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)):
         raise ImageError(
             f"pixels are {pixels.dtype} {list(pixels.shape)}; expected uint8 [height, width, 3] RGB or "
             "[height, width] grey"
         )
-    kind = messages.PIXEL_FORMAT_RGB8 if pixels.ndim == 3 else messages.PIXEL_FORMAT_GRAY8
+    if color not in _COLORS:
+        raise ArgumentError(f"color {color!r}: expected {' or '.join(_COLORS)}")
+    kind = _COLORS[color] if pixels.ndim == 3 else messages.PIXEL_FORMAT_GRAY8
     return messages.RawImage(format=kind, width=pixels.shape[1], height=pixels.shape[0], data=pixels.tobytes())
 
 
@@ -95,14 +103,28 @@ def _read(path: str | Path) -> bytes:
         raise ImageError(f"{path} cannot be read: {exc.strerror}") from exc
 
 
-def _camera(camera: CameraLike, image: ImageLike) -> messages.Camera | None:
-    if camera is None:
+def _stored_size(encoded: bytes) -> tuple[int, int] | None:
+    """Width and height before EXIF's rotation; None for what the server will refuse."""
+    try:
+        header = read_header(encoded)
+    except ImageError:
         return None
+    return header.width, header.height
+
+
+def _camera(
+    camera: str | Path | PinholeCamera | np.ndarray | Sequence[Sequence[float]],
+    image: ImageLike,
+    size: tuple[int, int] | None,
+) -> messages.Camera:
     if isinstance(camera, str | Path):
         found = read_camera_file(camera).camera_for(image if isinstance(image, str | Path) else "")
     else:
         found = camera if isinstance(camera, PinholeCamera) else PinholeCamera(_matrix(camera))
-    return messages.Camera(camera_matrix=found.matrix.ravel(), distortion=found.distortion)
+    if size is not None and found.size is not None:
+        found.check_frame(*size)
+    width, height = found.size or (0, 0)
+    return messages.Camera(camera_matrix=found.matrix.ravel(), distortion=found.distortion, width=width, height=height)
 
 
 def _matrix(values: Any) -> np.ndarray:

@@ -1,9 +1,11 @@
-"""Reads camera files: our JSON, BOP's camera.json and scene_camera.json, OpenCV's YAML.
+"""Reads camera files: our JSON, BOP's camera.json and scene_camera.json, OpenCV's YAML, ROS's camera_info.
 
 ours              {"camera_matrix": [[fx,0,cx],[0,fy,cy],[0,0,1]], "width": w, "height": h, "distortion": [...]}
 camera.json       {"fx":, "fy":, "cx":, "cy":, "width":, "height":, ...}
 scene_camera.json {"0": {"cam_K": [9 values], ...}, "1": ...}: K of each image, by the number in its file's name
 OpenCV YAML       camera_matrix, distortion_coefficients, image_width, image_height (as written by its calibration)
+ROS YAML          the same names (as written by camera_calibration), or a CameraInfo message: k, d, width, height
+ROS JSON          a CameraInfo message: k, d, width, height (ROS 1: K, D)
 """
 
 import json
@@ -21,6 +23,7 @@ from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 
 MAX_BYTES = 64 << 20
+_ROS_MODELS = ("", "plumb_bob", "rational_polynomial")  # OpenCV's own lenses
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ def read_camera_file(path: str | Path) -> CameraFile:
         raise CameraError(f"camera file {path} cannot be read: {exc}") from exc
     try:
         if path.suffix.lower() in (".yml", ".yaml"):
-            return CameraFile(path, _from_opencv(text), {})
+            return CameraFile(path, _from_yaml(text), {})
         return _from_json(path, json.loads(text))
     except json.JSONDecodeError as exc:
         raise CameraError(f"camera file {path} is not JSON: {exc}; OpenCV files need the suffix .yml or .yaml") from exc
@@ -83,6 +86,8 @@ def _from_json(path: Path, content: Any) -> CameraFile:
         size = _size(content.get("width"), content.get("height"))
         distortion = _distortion(content.get("distortion"))
         return CameraFile(path, PinholeCamera(_matrix(content["camera_matrix"]), distortion, size), {})
+    if isinstance(content, dict) and (names := content.keys() & {"k", "K"}):
+        return CameraFile(path, _from_camera_info(content, names.pop()), {})
     if isinstance(content, dict) and {"fx", "fy", "cx", "cy"} <= content.keys():
         fx, fy, cx, cy = (float(content[name]) for name in ("fx", "fy", "cx", "cy"))
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -116,15 +121,52 @@ def _size(width: Any, height: Any) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _from_opencv(text: str) -> PinholeCamera:
+def _from_camera_info(content: Mapping[str, Any], name: str) -> PinholeCamera:
+    """The camera of a ROS CameraInfo message, whose matrix is called ``k`` or ``K``.
+
+    Raises:
+        CameraError: It has the lenses of another model than plumb_bob or rational_polynomial.
+    """
+    distortion = content.get("d" if name == "k" else "D") or []
+    model = content.get("distortion_model", "")
+    if model not in _ROS_MODELS and any(distortion):
+        raise CameraError(f"distortion_model is {model!r}; expected one of {', '.join(filter(None, _ROS_MODELS))}")
+    size = _size(content.get("width"), content.get("height"))
+    return PinholeCamera(_matrix(content[name]), _distortion(distortion), size)
+
+
+def _from_yaml(text: str) -> PinholeCamera:
+    if not text.startswith("%YAML"):  # OpenCV's reader wants its head, one document, and lists that are indented
+        text = "%YAML:1.0\n---\n" + re.sub("^- ", "  - ", text.split("\n---")[0], flags=re.MULTILINE)
     storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     try:
-        matrix = storage.getNode("camera_matrix").mat()
+        for name in ("k", "K"):
+            if not storage.getNode(name).empty():
+                wanted = (name, "d", "D", "distortion_model", "width", "height")
+                return _from_camera_info({key: _plain(storage.getNode(key)) for key in wanted}, name)
+        matrix = _yaml_matrix(storage.getNode("camera_matrix"))
         if matrix is None:
-            raise CameraError("no matrix camera_matrix; expected a file of OpenCV's calibration")
-        distortion = storage.getNode("distortion_coefficients").mat()
+            raise CameraError("no matrix camera_matrix; expected a file of OpenCV's or ROS's calibration")
+        distortion = _yaml_matrix(storage.getNode("distortion_coefficients"))
         width, height = storage.getNode("image_width"), storage.getNode("image_height")
         size = None if width.empty() or height.empty() else _size(width.real(), height.real())
     finally:
         storage.release()
-    return PinholeCamera(matrix, () if distortion is None else tuple(map(float, distortion.ravel())), size)
+    return PinholeCamera(_matrix(matrix), () if distortion is None else tuple(map(float, distortion.ravel())), size)
+
+
+def _yaml_matrix(node: cv2.FileNode) -> np.ndarray | None:
+    """A matrix as OpenCV marks it, or as ROS writes it: a map with a list ``data``."""
+    if node.isMap() and not (data := node.getNode("data")).empty() and node.getNode("dt").empty():
+        return np.array(_plain(data), float)
+    matrix: np.ndarray | None = node.mat()
+    return matrix
+
+
+def _plain(node: cv2.FileNode) -> Any:
+    """A node as list, number, text or None."""
+    if node.empty():
+        return None
+    if node.isSeq():
+        return [node.at(i).real() for i in range(node.size())]
+    return node.string() if node.isString() else node.real()

@@ -25,7 +25,7 @@ _HUFFMAN_BITS = {0xC0: 2, 0xC1: 2, 0xC2: 1}
 
 @dataclass(frozen=True)
 class Header:
-    """What the head of an image file declares."""
+    """The properties that the header of an image file declares."""
 
     format: ImageFormat
     """Container."""

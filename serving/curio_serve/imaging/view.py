@@ -66,7 +66,7 @@ class CanonicalCamera:
 
     @cached_property
     def focal_lengths(self) -> tuple[float, float]:
-        """Of K*, pixels: x and y."""
+        """Focal lengths (x, y) of K*, pixels."""
         matrix = np.asarray(self.matrix)
         return float(matrix[0, 0]), float(matrix[1, 1])
 
@@ -115,7 +115,7 @@ class Crop(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _CanonicalWarp:
-    """How pixels of a camera's frames become a model's input."""
+    """The map from pixels of a camera's frames to a model's input."""
 
     canonical_from_cam: Array
     """Rotation [3, 3]."""

@@ -43,7 +43,7 @@ _DERIVED = {"rotation", "rotation_6d"}
 
 @dataclass(frozen=True)
 class Runtime:
-    """How networks are run."""
+    """The settings that networks run with."""
 
     providers: tuple[str, ...] = ("CPUExecutionProvider",)
     """onnxruntime's execution providers in order of preference."""
@@ -65,16 +65,20 @@ class Slot:
 
 
 class Model:
-    """An exported network, ready to run; safe to share between threads.
+    """An exported network, ready to run; safe to share between threads."""
 
-    Attributes:
-        name: The name that clients use.
-        version: Of the model folder; 0 for a file outside one.
-        spec: As stored in the file.
-        camera: The canonical camera, of which its input is an image.
-        slots: One for each row of the per-object outputs.
-        sha256: Of the file, hexadecimal.
-    """
+    name: str
+    """The name that clients use."""
+    version: int
+    """Of the model folder; 0 for a file outside one."""
+    spec: ModelSpec
+    """As stored in the file."""
+    camera: CanonicalCamera
+    """The canonical camera, of which its input is an image."""
+    slots: Sequence[Slot]
+    """One for each row of the per-object outputs."""
+    sha256: str
+    """Of the file, hexadecimal."""
 
     def __init__(
         self,

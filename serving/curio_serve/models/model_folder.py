@@ -20,6 +20,7 @@ from google.protobuf import text_format
 from curio_serve.errors import InternalError, ModelError
 from curio_serve.models.model import DEFAULT_RUNTIME, INPUT, Model, Runtime, load
 
+CONFIG_FILE = "config.pbtxt"
 MODEL_FILE = "model.onnx"
 GOLDEN_FILE = "golden.npz"
 _GOLDEN_TOLERANCE = 1e-3  # metres, image widths, entries of matrices; float16 weights on another processor stay below
@@ -113,7 +114,7 @@ def _check_sum(folder: Path, file: str, sha256: str) -> None:
 
 def _check_config(folder: Path, model: Model) -> None:
     """Compare config.pbtxt, if the folder has one, with the graph."""
-    path = folder / "config.pbtxt"
+    path = folder / CONFIG_FILE
     if not path.is_file():
         return
     try:

@@ -20,7 +20,7 @@ _FOLDER = 0  # in place of a version: the model's folder itself
 
 @dataclass(frozen=True)
 class Change:
-    """What happened to one version when the folder was scanned."""
+    """The fate of one version when the folder was scanned."""
 
     name: str
     """Of the model."""

@@ -20,21 +20,18 @@ _LARGEST_UNCERTAINTY = 0.01  # of the focal length, one standard deviation
 
 @dataclass(frozen=True)
 class Board:
-    """What was photographed.
-
-    Attributes:
-        columns: Squares along the longer side.
-        rows: Squares along the other.
-        square_m: Side of a square.
-        marker_m: Side of a ChArUco marker; None: a plain chessboard.
-        dictionary: OpenCV's name of the markers' dictionary.
-    """
+    """The calibration board that the photographs show."""
 
     columns: int
+    """Squares along the longer side."""
     rows: int
+    """Squares along the other."""
     square_m: float
+    """Side of a square."""
     marker_m: float | None = None
+    """Side of a ChArUco marker; None: a plain chessboard."""
     dictionary: str = "DICT_4X4_50"
+    """OpenCV's name of the markers' dictionary."""
 
     def __post_init__(self) -> None:
         """Refuse boards that cannot be.
@@ -86,21 +83,18 @@ class Board:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera, and how well it is known.
-
-    Attributes:
-        camera: K and distortion.
-        error_px: Root mean square distance of corners from where the camera should see them.
-        focal_uncertainty: Standard deviation of the focal length, as a fraction of it.
-        num_views: Photographs in which the board was found.
-        unused: Photographs in which it was not.
-    """
+    """A camera, and how well it is known."""
 
     camera: Intrinsics
+    """K and distortion."""
     error_px: float
+    """Root mean square distance of corners from where the camera should see them."""
     focal_uncertainty: float
+    """Standard deviation of the focal length, as a fraction of it."""
     num_views: int
+    """Photographs in which the board was found."""
     unused: tuple[Path, ...]
+    """Photographs in which it was not."""
 
 
 def calibrate(folder: Path, board: Board) -> Calibration:

@@ -76,7 +76,7 @@ def scaled(structure: Structure, factor: float) -> Structure:
 
 
 def scale_by_distance(structure: Structure, first: int, second: int, distance_m: float) -> Structure:
-    """In metres, by the distance of two cameras.
+    """Scale a structure to metres by the known distance of two cameras.
 
     Raises:
         CameraError: The two stood at one place, or the distance is none.
@@ -88,24 +88,3 @@ def scale_by_distance(structure: Structure, first: int, second: int, distance_m:
             f"cameras {first} and {second} are to be {distance_m} m apart, found {found:.3g} of {span:.3g}"
         )
     return scaled(structure, distance_m / found)
-
-
-def scale_by_height(structure: Structure, height_m: float) -> Structure:
-    """In metres, by the height of the one object that stands on the ground, as its mesh has it.
-
-    Args:
-        structure: In the world's frame.
-        height_m: Of the mesh along the axis that is up.
-
-    Raises:
-        CameraError: Nothing stands on the ground, or the height is none.
-    """
-    heights = structure.points[:, 1]
-    distance = float(np.linalg.norm(structure.centres[0]))
-    standing = heights[heights > 2 * _OFF_PLANE * distance]
-    if not height_m > 0 or len(standing) < 20:
-        raise CameraError(
-            f"found {len(standing)} points above the ground to be {height_m} m high at most; expected an object with "
-            "texture, or give a known distance instead"
-        )
-    return scaled(structure, height_m / float(np.percentile(standing, 99)))

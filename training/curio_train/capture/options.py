@@ -8,35 +8,32 @@ import tyro
 
 @dataclass(frozen=True)
 class CalibrateCommand:
-    """Find out a camera from photographs of a board, or of any still scene with texture.
-
-    Attributes:
-        images: Folder of photographs, taken with one camera at one zoom.
-        calibrate: This command.
-        board: Squares of a chessboard or ChArUco board along and across. Without, photographs of a still scene are
-            matched with each other (structure from motion), and the first has to look down on a table or floor.
-        square_mm: Side of a square.
-        marker_mm: Side of a ChArUco marker; a plain chessboard has none.
-        dictionary: OpenCV's name of the markers' dictionary.
-        camera: The camera, where it is known and only its places are wanted.
-        every: Take each so many-th photograph of a sequence.
-        distance_m: Distance of the first and the last camera, for poses in metres.
-        objects: For poses in metres, too: folder with a model or run for each LineMOD object that the scene shows.
-        data: Their data folder.
-        camera_out: The camera file to write.
-        views_out: File for where each photograph was taken: cam_from_world, y up, origin on the ground.
-    """
+    """Find out a camera from photographs of a board, or of any still scene with texture."""
 
     images: Path
+    """Folder of photographs, taken with one camera at one zoom."""
     calibrate: tyro.conf.FlagCreatePairsOff[bool] = False
+    """This command."""
     board: tuple[int, int] | None = None
+    """Squares of a chessboard or ChArUco board along and across. Without, photographs of a still scene are matched with
+    each other (structure from motion), and the first has to look down on a table or floor."""
     square_mm: float = 30.0
+    """Side of a square."""
     marker_mm: float | None = None
+    """Side of a ChArUco marker; a plain chessboard has none."""
     dictionary: str = "DICT_4X4_50"
+    """OpenCV's name of the markers' dictionary."""
     camera: Path | None = None
+    """The camera, where it is known and only its places are wanted."""
     every: int = 1
+    """Take each so many-th photograph of a sequence."""
     distance_m: float | None = None
+    """Distance of the first and the last camera, for poses in metres."""
     objects: Path | None = None
+    """For poses in metres, too: folder with a model or run for each LineMOD object that the scene shows."""
     data: Path | None = None
+    """Their data folder."""
     camera_out: Path = Path("camera.json")
+    """The camera file to write."""
     views_out: Path | None = None
+    """File for where each photograph was taken: cam_from_world, y up, origin on the ground."""

@@ -22,25 +22,22 @@ _ALL_PAIRS = 30  # so many photographs are compared pair by pair, longer sequenc
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Cameras and points in a frame of arbitrary place and scale.
-
-    Attributes:
-        photographs: Those that were placed, in the order given.
-        cam_from_world: [n, 4, 4], rigid.
-        camera: Of all photographs.
-        points: [m, 3], world frame.
-        error_px: Mean distance of points from where they are seen.
-    """
+    """Cameras and points in a frame of arbitrary place and scale."""
 
     photographs: tuple[Path, ...]
+    """Those that were placed, in the order given."""
     cam_from_world: np.ndarray
+    """[n, 4, 4], rigid."""
     camera: Intrinsics
+    """Of all photographs."""
     points: np.ndarray
+    """[m, 3], world frame."""
     error_px: float
+    """Mean distance of points from where they are seen."""
 
     @property
     def centres(self) -> np.ndarray:
-        """Where the cameras stood, [n, 3], world frame."""
+        """Positions of the cameras, [n, 3], world frame."""
         rotations, shifts = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
         return -np.einsum("nji,nj->ni", rotations, shifts)
 
@@ -153,7 +150,7 @@ def _checked(photographs: Sequence[Path], found: Any, known: Intrinsics | None) 
 
 
 def _intrinsics(camera: Any, where: str) -> Intrinsics:
-    """Of a SIMPLE_RADIAL camera: one focal length, the centre, and k1."""
+    """Intrinsics of a SIMPLE_RADIAL camera: one focal length, the centre, and k1."""
     matrix = np.array(camera.calibration_matrix())
     matrix[:2, 2] -= 0.5
     k1 = float(camera.params[3])

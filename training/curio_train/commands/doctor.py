@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import tyro
 from rich.console import Console
 
+from curio_train.commands.field_help import parsed
 from curio_train.commands.running import CACHE, answer
 from curio_train.errors import UsageError
 
@@ -38,7 +38,7 @@ class DoctorCommand:
 
 def doctor(arguments: Sequence[str] | None = None) -> None:
     """``curio-doctor …``: exit status 1 where something will not work."""
-    command = tyro.cli(DoctorCommand, args=arguments, prog="curio-doctor")
+    command = parsed(DoctorCommand, arguments, "curio-doctor")
     sys.exit(answer(lambda _: _examine(command)))
 
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from curio_train.commands.field_help import parsed
 from curio_train.commands.running import CACHE, answer, warn
 
 
@@ -38,7 +38,7 @@ class EvaluateCommand:
 
 def evaluate(arguments: Sequence[str] | None = None) -> None:
     """``curio-eval RUN_OR_MODEL …``; exit status as of :func:`~curio_train.commands.train.train`."""
-    command = tyro.cli(EvaluateCommand, args=arguments, prog="curio-eval")
+    command = parsed(EvaluateCommand, arguments, "curio-eval")
     sys.exit(answer(lambda _: _evaluate(command)))
 
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from curio_train.commands.field_help import parsed
 from curio_train.commands.running import answer
 
 
@@ -29,7 +29,7 @@ class ExportCommand:
 
 def export(arguments: Sequence[str] | None = None) -> None:
     """``curio-export RUN …``; exit status as of :func:`~curio_train.commands.train.train`."""
-    command = tyro.cli(ExportCommand, args=arguments, prog="curio-export")
+    command = parsed(ExportCommand, arguments, "curio-export")
     sys.exit(answer(lambda _: _export(command)))
 
 

@@ -3,9 +3,25 @@
 tyro shows such strings as they stand in the source, line breaks included; in an ``Attributes:`` block it joins lines.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
 
+import tyro
 from docstring_parser import parse_from_object
+
+C = TypeVar("C")
+
+
+def parsed(command: type[C], arguments: Sequence[str] | None, prog: str) -> C:
+    """A command line as a dataclass.
+
+    Args:
+        command: Its fields are the arguments.
+        arguments: None: those of this process.
+        prog: Name of the command, for its help.
+    """
+    join_help_lines([command])
+    return tyro.cli(command, args=arguments, prog=prog)
 
 
 def join_help_lines(kinds: Iterable[type]) -> None:

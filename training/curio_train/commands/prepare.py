@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from curio_train.config import NetworkConfig, RunConfig
+from curio_train.errors import UsageError
 from curio_train.worlds.options import CaptureOptions, LinemodOptions
 
 
@@ -21,11 +22,15 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
         tell: Told of what was found out.
 
     Raises:
+        UsageError: Pseudo-labels are asked for, and there are no photographs.
         DataError: A download failed, or files of one's own are certain not to work.
     """
     options = config.world
-    if isinstance(options, LinemodOptions) and options.photos is None:
-        config = replace(config, recipe=replace(config.recipe, self_training=0.0))  # so that the model says so
+    if config.recipe.self_training and getattr(options, "photos", None) is None:
+        raise UsageError(
+            f"--self-training {config.recipe.self_training}: found no photographs to learn from; expected --photos, "
+            "which linemod and capture have"
+        )
     if isinstance(options, LinemodOptions) and options.data is None and options.download:
         from curio_train.data.download import download_linemod
 
@@ -66,7 +71,7 @@ def _refuse_unreadable(options: LinemodOptions) -> None:
 
 
 def _with_paint(options: CaptureOptions, tell: Callable[[str], None]) -> CaptureOptions:
-    """Off the plane an unpainted part is drawn in the colour that photographs over a background image show."""
+    """In free space, find an unpainted part's colour in photographs over a background image, and set it."""
     from curio_train.camera import load_intrinsics
     from curio_train.data.part_color import find_color, is_unpainted
     from curio_train.meshes.meshes import load_mesh

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from curio_train.commands.field_help import parsed
 from curio_train.commands.running import answer
 
 
@@ -42,7 +42,7 @@ class RenderCommand:
 
 def render(arguments: Sequence[str] | None = None) -> None:
     """``curio-render SCENES --out DIR …``; exit status as of :func:`~curio_train.commands.train.train`."""
-    command = tyro.cli(RenderCommand, args=arguments, prog="curio-render")
+    command = parsed(RenderCommand, arguments, "curio-render")
     sys.exit(answer(lambda _: _render(command)))
 
 

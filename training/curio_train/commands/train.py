@@ -5,7 +5,7 @@ import dataclasses
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_type_hints
 
@@ -13,7 +13,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes
 
 from curio_train.capture.options import CalibrateCommand
-from curio_train.commands.field_help import join_help_lines
+from curio_train.commands.field_help import join_help_lines, parsed
 from curio_train.commands.project_file import with_project
 from curio_train.commands.running import CACHE, answer, tell, warn
 from curio_train.config import NetworkConfig, Preset, Recipe, RunConfig, WorldOptions, preset_recipe
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Session:
-    """Where and how this process trains; may differ between the sessions of one run."""
+    """Where and how this process trains. Sessions of one run may differ in it."""
 
     out: Path | None = None
     """Folder of the new run; runs/WORLD-METHOD-SEED unless given."""
@@ -55,9 +55,9 @@ def train(arguments: Sequence[str] | None = None) -> None:
     """``curio-train WORLD …``: exit status 0 done, 1 failed, 2 wrong call, 128 + signal when interrupted."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     if given[:1] == ["capture"] and "--calibrate" in given:
-        calibration = tyro.cli(CalibrateCommand, args=given[1:], prog="curio-train capture")
+        calibration = parsed(CalibrateCommand, given[1:], "curio-train capture")
         sys.exit(answer(lambda _: _calibrate(calibration)))
-    sys.exit(answer(lambda interruption: _train(_parse(given), interruption)))
+    sys.exit(answer(lambda interruption: _train(parse(given), interruption)))
 
 
 def _calibrate(command: CalibrateCommand) -> int:
@@ -72,12 +72,13 @@ def _calibrate(command: CalibrateCommand) -> int:
     return 0
 
 
-def _parse(arguments: list[str]) -> TrainCommand:
-    """The call as typed; what it leaves out comes from the preset, or from the run it resumes."""
+def parse(arguments: list[str]) -> TrainCommand:
+    """A call as typed; what it leaves out comes from the preset, or from the run it resumes."""
     arguments = with_project(arguments, _path_flags())
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", nargs="?", default="laptop")
     first.add_argument("--resume", nargs="?", type=Path)
+    first.add_argument("--photos", nargs="?")
     seen, _ = first.parse_known_args(arguments)
 
     preset: Preset = "paper" if seen.preset == "paper" else "laptop"  # an unknown preset is tyro's to refuse
@@ -85,6 +86,8 @@ def _parse(arguments: list[str]) -> TrainCommand:
         name: RunConfig(_unset(kind), method=kind.default_method, recipe=preset_recipe(preset, kind))
         for name, kind in WORLDS.items()
     }
+    if seen.photos is None:  # then --self-training is an error, and a default that is no error must be 0
+        defaults["linemod"] = replace(linemod := defaults["linemod"], recipe=replace(linemod.recipe, self_training=0.0))
     stored = load_config(seen.resume) if seen.resume else None
     if stored is not None:
         defaults[world_name(stored)] = stored
@@ -92,7 +95,7 @@ def _parse(arguments: list[str]) -> TrainCommand:
         {name: TrainCommand(config) for name, config in defaults.items()},
         {name: (kind.__doc__ or "").partition("\n\n")[0] for name, kind in WORLDS.items()},
     )
-    join_help_lines([RunConfig, Recipe, NetworkConfig])
+    join_help_lines([RunConfig, Recipe, NetworkConfig, *WORLDS.values()])
     command: TrainCommand = tyro.cli(
         commands,
         args=arguments,

@@ -9,9 +9,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import Positional, arg
 
+from curio_train.commands.field_help import parsed
 from curio_train.commands.running import CACHE, answer, tell
 from curio_train.errors import UsageError
 
@@ -43,7 +43,7 @@ class ViewCommand:
 
 def view(arguments: Sequence[str] | None = None) -> None:
     """``curio-view WHAT …``; exit status as of :func:`~curio_train.commands.train.train`."""
-    command = tyro.cli(ViewCommand, args=arguments, prog="curio-view")
+    command = parsed(ViewCommand, arguments, "curio-view")
     sys.exit(answer(lambda _: _view(command)))
 
 

@@ -19,7 +19,7 @@ _VALUES_AT_ONCE = 2**17  # half a megabyte: what lies between two operations sta
 
 @dataclass(frozen=True)
 class AugmentationStrength:
-    """How much pictures are augmented: each by amounts drawn evenly from these ranges."""
+    """Ranges of the augmentation; each picture draws its own amounts from them, uniformly."""
 
     occluded: float
     """Fraction of the images with something in front."""
@@ -87,7 +87,7 @@ KNOWN_SCENE = AugmentationStrength(
 
 
 class _Amounts(NamedTuple):
-    """What is drawn for each image; the first axis of each is the batch's."""
+    """The amounts drawn for each image; the first axis of each is the batch's."""
 
     light: Tensor  # [batch, 1, height, width], a logarithm
     exponent: Tensor  # [batch, 1, 1, 1]
@@ -162,7 +162,7 @@ def _smooth(size: int, cells: int) -> Float[Tensor, "size cells"]:
 
 
 def _gaussian(images: Tensor) -> Tensor:
-    """Nearly a Gaussian of one pixel: binomial weights 1, 4, 6, 4, 1 along both axes."""
+    """Approximates a Gaussian blur of one pixel by binomial weights 1, 4, 6, 4, 1 along both axes."""
     # Four sums of neighbours an axis: several times faster on a CPU than a grouped convolution.
     wide = F.pad(images, (2, 2, 2, 2), mode="replicate")
     for axis in (-2, -1) * 4:
@@ -196,7 +196,7 @@ def _occlude(images: Tensor, random: np.random.Generator, fraction: float) -> Te
 
 
 def _rectangles(count: int, height: int, width: int, random: np.random.Generator) -> Bool[Tensor, "count height width"]:
-    """Where rectangles of any place, size and direction lie."""
+    """Masks of rectangles of random position, size and direction."""
     angle = random.uniform(0, np.pi, (count, 1, 1))
     center_x, center_y = random.uniform(-1, 1, (2, count, 1, 1))
     half = random.uniform(0.05, LARGEST_OCCLUDER, (2, count, 1, 1)).astype(np.float32)

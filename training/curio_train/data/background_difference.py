@@ -43,5 +43,5 @@ def compare(
 
 
 def _median(images: Tensor) -> Float[Tensor, "num 1 1"]:
-    """Of each image."""
+    """The median of each image."""
     return images.flatten(1).median(dim=1).values[:, None, None]

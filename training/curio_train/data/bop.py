@@ -93,7 +93,7 @@ class Annotation:
 
 @dataclass(frozen=True)
 class Target:
-    """What a BOP submission must answer: so many instances of an object in an image."""
+    """One target of a BOP submission: a number of instances of an object in an image."""
 
     scene_id: int
     image_id: int
@@ -103,7 +103,7 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class ModelInfo:
-    """What ``models_info.json`` says of an object."""
+    """The entry of an object in ``models_info.json``."""
 
     diameter_m: float
     """Largest distance of two model points."""

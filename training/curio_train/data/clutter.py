@@ -66,7 +66,7 @@ def _color(random: np.random.Generator) -> np.ndarray:
 
 
 def _pattern(shape: tuple[int, ...], size: float, random: np.random.Generator) -> np.ndarray:
-    """How much of a leaf's first colour each pixel has, float32 [height, width]."""
+    """Fraction of a leaf's first colour in each pixel, float32 [height, width]."""
     kind = random.choice(list(_FRACTIONS), p=list(_FRACTIONS.values()))
     if kind == "plain" or size < 8:
         return np.ones(shape, np.float32)

@@ -139,7 +139,7 @@ def _unpack(archive: Path, name: str, folder: Path) -> None:
 
 
 def _inside(member: zipfile.ZipInfo, archive: str) -> PurePosixPath:
-    """Where a member belongs in the data folder.
+    """The path of an archive's member in the data folder.
 
     Raises:
         DataError: Somewhere else, or it is a link.

@@ -41,7 +41,7 @@ class FoundColor:
 
 
 def is_unpainted(mesh: Mesh) -> bool:
-    """Its file says no colour."""
+    """Whether the mesh file has no colours."""
     return mesh.texture is None and mesh.vertex_colors_srgb is None
 
 

@@ -24,7 +24,7 @@ from curio_train.worlds.options import CaptureOptions
 
 @dataclass(frozen=True)
 class Subjects:
-    """What is to be looked at, in any combination; what belongs together is compared."""
+    """The files to examine, in any combination; files that belong together are compared."""
 
     mesh: Path | None = None
     """A mesh file."""

@@ -25,6 +25,6 @@ class Finding:
     """A short name of the kind of fault, the same in every version; empty where all is well."""
 
     def __str__(self) -> str:
-        """In one line, without subject and state."""
+        """The finding in one line, without subject and state."""
         sure = "" if self.state == "good" or self.sure == "certain" else f" ({self.sure})"
         return f"{self.text}{sure}{self.remedy and f'. {self.remedy}'}"

@@ -129,7 +129,7 @@ def _training_time() -> Finding:
 
 
 def _durations(speed: float) -> str:
-    """What the laptop preset's budgets take, and the worlds that have them."""
+    """Durations of the laptop preset's budgets, with the worlds that have them."""
     worlds: dict[int, list[str]] = {}
     for name, kind in WORLDS.items():
         worlds.setdefault(preset_recipe("laptop", kind).budget_images, []).append(name)

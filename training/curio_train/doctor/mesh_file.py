@@ -78,7 +78,7 @@ def _colours(mesh: Mesh) -> Iterator[Finding]:
 
 
 def _symmetries(found: Symmetries) -> Finding:
-    """Not a fault: equal views cannot be told apart, and are scored as equal."""
+    """Reports symmetries, which are no fault: views that look equal are scored as equal."""
     parts = [f"{len(found.discrete)} discrete"] * bool(found.discrete)
     for axis, _ in found.continuous:
         parts.append("any turn about (" + ", ".join(f"{value:.2f}" for value in axis) + ")")
@@ -96,7 +96,7 @@ _SMALL_PART, _FAR_OUT = 0.02, 1.5  # a stray part has few of the faces, and lets
 
 
 def examine_surface(mesh: Mesh) -> Iterator[Finding]:
-    """What is wrong with the triangles."""
+    """Finds faults of the mesh's triangles."""
     shape = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
     shape.merge_vertices(merge_tex=True, merge_norm=True)  # a seam of the texture is no hole
     yield from _useless_faces(shape)

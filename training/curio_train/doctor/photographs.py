@@ -40,7 +40,7 @@ def examine_photographs(folder: Path, camera: Intrinsics | None) -> tuple[list[P
 
 
 def named(photographs: Sequence[Photograph]) -> str:
-    """How many, and the first of them."""
+    """Their number, and the names of the first ones."""
     more = f" and {len(photographs) - 1} more" if len(photographs) > 1 else ""
     return f"{photographs[0].path.name}{more}"
 
@@ -80,7 +80,7 @@ def _turned(photographs: Sequence[Photograph]) -> Iterator[Finding]:
 
 
 def _other_camera(photographs: Sequence[Photograph], camera: Intrinsics | None) -> Iterator[Finding]:
-    """What photographs say about the camera file given beside them."""
+    """Finds photographs that contradict the camera file given beside them."""
     if camera is None:
         return
     (width, height), _ = Counter((photo.width, photo.height) for photo in photographs).most_common(1)[0]

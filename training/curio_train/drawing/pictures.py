@@ -30,7 +30,7 @@ LIGHT = (-0.25, -0.45, -0.5)
 
 @dataclass(frozen=True, eq=False)
 class SceneContext:
-    """What a scene itself does not say."""
+    """Meshes, light and ground: everything needed to draw a scene that its code does not hold."""
 
     meshes: Mapping[str, Mesh]
     """By the object's name; the one named "" stands for every object without its own."""
@@ -47,7 +47,7 @@ class SceneContext:
 
     @classmethod
     def of_world(cls, world: MeshWorld) -> "SceneContext":
-        """Those of a generated world."""
+        """The context of a generated world's scenes."""
         setup = world.setup
         cam_from_world = setup.cam_from_world
         return cls(
@@ -73,7 +73,7 @@ class SceneContext:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How a scene is to be drawn."""
+    """Settings of a drawing."""
 
     height: int | None = None
     """Of the picture, pixels; None: the scene's own."""
@@ -135,7 +135,7 @@ def _with_light(scene: Scene, around: SceneContext) -> SceneContext:
 
 
 def _photograph(scene: Scene) -> np.ndarray:
-    """Of the scene's size, [height, width, 3] in [0, 1]."""
+    """The scene's photograph, resized to the scene: [height, width, 3] in [0, 1]."""
     if scene.photograph is None:
         raise DataError(f"{scene.name} is a scene code, which has no photograph; leave out --over-photograph")
     pixels = read_photograph(scene.photograph)

@@ -120,7 +120,7 @@ def overlap(silhouette: Tensor, differing: Tensor) -> Float[Tensor, " num"]:
 
 
 def differing(photographs: Tensor, background_image: Tensor) -> Bool[Tensor, "num height width"]:
-    """Where photographs clearly differ from the empty scene, shadows on it and speckles left out.
+    """Masks of pixels where photographs clearly differ from the empty scene, without shadows and speckles.
 
     Args:
         photographs: [num, 3, height, width], sRGB in [0, 1].

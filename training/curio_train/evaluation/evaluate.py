@@ -148,7 +148,7 @@ def score(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, floa
 
 
 def calibration(world: World, predicted: SceneCode, true: SceneCode, on_empty: SceneCode) -> dict[str, float]:
-    """What the confidence of one object is worth.
+    """Scores the confidence of one object.
 
     Once as the probability that ADD(-S) is below a tenth of the diameter, once as a sign that the object is there.
     """
@@ -190,7 +190,7 @@ def _origin(path: Path, subject: Subject) -> dict[str, Any]:
 
 
 def _keep(run: Path, result: dict[str, Any]) -> None:
-    """In the run folder, for the card of a model exported from it."""
+    """Keep the result in the run folder, for the card of a model exported from it."""
     file = run / EVALUATION_FILE
     draft = file.with_name(file.name + ".tmp")
     try:

@@ -39,7 +39,7 @@ _DRAWN_AT_ONCE = 8  # frames of a camera are larger than images of a plane
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """How far re-renderings are from photographs."""
+    """Metrics that compare re-renderings with photographs, and a verdict in words."""
 
     metrics: Mapping[str, float]
     """Means ``own_view_inside`` and ``own_view_overlap`` (without a background image ``own_view_explained``).
@@ -164,7 +164,7 @@ def _drawn(world: TabletopWorld, view: int, code: SceneCode) -> Tensor:
 
 
 def _errors(view: PhotographSet, images: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Of re-renderings, and of the background image in place of them."""
+    """Errors of re-renderings, and of the background image in place of them."""
     photographs, background_image = view.photographs.float() / 255, view.background_image.float() / 255
     of_both = []
     for shown in (images, background_image.expand_as(photographs)):

@@ -46,7 +46,7 @@ _MSPD_THRESHOLDS = [5.0 * step for step in range(1, 11)]  # pixels in an image 6
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What was found in a frame."""
+    """The pose estimate of one frame."""
 
     frame: Frame
     """The frame."""
@@ -177,7 +177,7 @@ def _recall_visible(seen: Pairs, points: np.ndarray, info: ModelInfo) -> dict[st
 
 
 def _row(estimate: Estimate, target: Annotation, points: np.ndarray, info: ModelInfo) -> dict[str, Any]:
-    """What became of one target; ADD(-S) as a share of the diameter."""
+    """The scores of one target; ADD(-S) as a fraction of the diameter."""
     found, true = [estimate.pose], [target.pose]
     return {
         "scene_id": target.scene_id,

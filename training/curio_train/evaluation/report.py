@@ -119,7 +119,7 @@ def _judged(judgement: Judgement) -> str:
 
 
 def _facts(subject: Subject, made: list[RunSession]) -> dict[str, str]:
-    """What was done, when, where and with what."""
+    """Facts of the run: command, date, machine, budget."""
     minutes = subject.training_seconds / 60
     rate = subject.images_seen / max(subject.training_seconds, 1e-9)
     versions = {name: importlib.metadata.version(name) for name in _LIBRARIES}

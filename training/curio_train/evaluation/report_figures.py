@@ -57,7 +57,7 @@ def curves(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def histograms(errors: Mapping[str, Tensor]) -> str:
-    """How each error is distributed; the dashed line is the median."""
+    """Histograms of the errors; dashed lines are medians."""
     figure, panels = _panels(len(errors))
     for panel, (name, values) in zip(panels, errors.items(), strict=True):
         found = values.detach().double().flatten().cpu().numpy()
@@ -82,7 +82,7 @@ def _panels(count: int) -> tuple[Figure, list[Any]]:
 
 
 def _uri(figure: Figure) -> str:
-    """As PNG; a figure of its own class needs no window and no global state."""
+    """Encode a figure as a PNG data URI; matplotlib's Figure class needs no window and no global state."""
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=_DPI)
     return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode()

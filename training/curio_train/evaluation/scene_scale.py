@@ -31,7 +31,7 @@ _SAME_CAMERA = 0.01  # of the focal length, and of it for the centre
 def scale_by_objects(
     structure: Structure, models: Path, data: Path | None, tell: Callable[[str], None]
 ) -> tuple[Structure, str]:
-    """In metres, by what trained networks read in the photographs.
+    """Scale a structure to metres by the poses that trained networks predict in the photographs.
 
     Args:
         structure: Of any scale.

@@ -27,14 +27,14 @@ _SUPERVISION = {
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a version comes from."""
+    """The origin of a version: its run, configuration, sessions and progress."""
 
     run: Path
     """The run folder."""
     config: RunConfig
     """What was learned and how."""
-    session: RunSession
-    """The first session of training."""
+    sessions: Sequence[RunSession]
+    """The sessions of training, oldest first."""
     progress: TrainingProgress
     """How far it came."""
     weights: str
@@ -59,7 +59,7 @@ def card(
         _table(("", ""), _origin(version, spec, made)),
         _table(("output", "shape", "unit", "frame"), _outputs(spec, shapes)),
         _table(("object", "diameter", "mesh SHA-256", "source and licence of the mesh"), _objects(spec, objects)),
-        _metrics(evaluation) if evaluation else "Not evaluated when it was exported.\n",
+        _metrics(evaluation) if evaluation else "curio-eval had not scored it when it was exported.\n",
     ]
     if evaluation and "real" in evaluation:
         parts.append(_real_frames(evaluation))
@@ -81,18 +81,24 @@ def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[s
     yield "world", spec.world
     yield "method", f"{made.config.method}, preset {made.config.preset}, seed {made.config.seed}"
     yield "supervision", "; ".join(supervision)
-    yield "training", f"`{portable(made.session.command)}`"
-    yield "commit", made.session.commit or "not from a git checkout"
-    before, progress = made.config.init, made.progress
-    since = f", {progress.images:,} of them since it was {before.name}" if before else ""
-    yield "images seen", f"{progress.all_images:,}{since}"
-    since = f", {progress.seconds / 60:.1f} of them since it was {before.name}" if before else ""
-    yield "training time", f"{progress.all_seconds / 60:.1f} minutes{since}"
-    yield "machine", made.session.machine
+    first, progress = made.sessions[0], made.progress
+    yield "training", "; then ".join(f"`{portable(session.command)}`" for session in made.sessions)
+    yield "commit", first.commit or "not from a git checkout"
+    yield "images seen", _sum(progress.images_before, progress.images, "{:,}")
+    yield "training time", _sum(progress.seconds_before / 60, progress.seconds / 60, "{:.1f}") + " minutes"
+    yield "machine", first.machine
     yield "input", f"`image`, uint8 RGB [batch, {spec.camera.height}, {spec.camera.width}, 3]"
     yield "weights", made.weights
     yield "to train it further", f"`curio-train {spec.world} --init models/{spec.name}/{version}`, other flags as above"
     yield "torch to onnxruntime", f"differ by at most {spec.parity_max_abs_error:.2g} in any output"
+
+
+def _sum(before: float, here: float, form: str) -> str:
+    """Text of a total and, if the run began with another network, of its two parts."""
+    total = form.format(before + here)
+    return (
+        f"{total} ({form.format(before)} of the network it began with, {form.format(here)} here)" if before else total
+    )
 
 
 def portable(command: str) -> str:
@@ -132,7 +138,7 @@ def _metrics(evaluation: Mapping[str, Any]) -> str:
 
 
 def _real_frames(evaluation: Mapping[str, Any]) -> str:
-    """Of the frames of a data set, whose labels are for scoring alone."""
+    """Table of the scores on real frames of a data set, whose labels only score."""
     real, refined = evaluation["real"], evaluation.get("refined", {}).get("real", {}).get("metrics", {})
     rows = [
         (name, f"{value:.4g}", f"{refined[name]:.4g}" if name in refined else "–")

@@ -42,9 +42,12 @@ class ModelFolder:
 
         Raises:
             UsageError: The name cannot be a model's, or something else has the folder's place.
+            ExportError: There is a file in the place of the folder of models.
         """
         if not is_model_name(name):
             raise UsageError(f"--name {name!r}: expected letters, digits, _, - and ., at most 64, no leading dot")
+        if out.exists() and not out.is_dir():
+            raise ExportError(f"cannot write {out / name}: {out} is no folder; name another folder: --out")
         folder = ModelFolder(out / name)
         if folder.path.exists() and not folder.versions():
             raise UsageError(

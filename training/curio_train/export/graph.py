@@ -35,17 +35,19 @@ from curio_train.worlds.base import ObjectKind, World
 LARGEST_PARITY_ERROR = 1e-4
 """Largest absolute difference between torch and onnxruntime that an export may have, in any output."""
 
-_NUM_CHECK_IMAGES = 8  # of either kind
+NUM_JITTERED = 12
+"""Rounds of jitter in the check of numerical stability; it misses a tie once in 2 to the power of this."""
+
+_NUM_CHECK_IMAGES = 4  # of either kind
 _CHECK_SEED = (20_210,)
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
-_NUM_JITTERED = 16  # a tie is missed once in 2 to the power of this
 _LEAST_STABLE = 0.25  # of the check images
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What became of an export."""
+    """The result of an export."""
 
     path: Path
     """The version's folder."""
@@ -58,7 +60,7 @@ class Exported:
 
 
 class Graph(nn.Module):
-    """What is traced: pixels as a camera gives them in, physical quantities out."""
+    """The module that is traced: it takes a camera's pixels and returns physical quantities."""
 
     def __init__(self, network: nn.Module, world: World) -> None:
         super().__init__()
@@ -70,11 +72,11 @@ class Graph(nn.Module):
         return tuple(self.outputs(image).values())
 
     def outputs(self, image: Tensor) -> dict[str, Tensor]:
-        """Of uint8 images [batch, height, width, 3], by name."""
+        """Outputs by name, for uint8 images [batch, height, width, 3]."""
         return self.read(image.permute(0, 3, 1, 2).float() / 255)
 
     def read(self, pixels: Tensor) -> dict[str, Tensor]:
-        """Of pixels [batch, 3, height, width] in [0, 1]."""
+        """Outputs by name, for pixels [batch, 3, height, width] in [0, 1]."""
         return self._world.outputs.from_code(self.network(pixels))
 
 
@@ -106,27 +108,27 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
     config = triton_config(target.path.name, tuple(images.shape[1:]), shapes)
     target.refuse_other_tensors(config)
+    known = numerically_stable(deployed if half else trained, images)
 
     model = to_onnx(deployed, world.camera.width, world.camera.height, list(expected))
     if half:
         store_half(model)
     spec = model_spec(world, target.path.name)
     spec.recipe = json.dumps(to_portable(folder.config))
-    first = run_sessions(run)[0]
+    sessions = run_sessions(run)
     spec.commit, spec.images_seen, spec.training_seconds = (
-        first.commit,
+        sessions[0].commit,
         state.progress.all_images,
         state.progress.all_seconds,
     )
     put_spec(model, spec)
 
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
-    known = numerically_stable(deployed if half else trained, images)
     answers, found = ({name: v[known] for name, v in of.items()} for of in (expected if half else learned, found))
     spec.parity_max_abs_error = refuse_disparity(answers, found)
     put_spec(model, spec)
     version = target.next_version()
-    made = Provenance(run, folder.config, first, state.progress, _weights(half, rounding_error))
+    made = Provenance(run, folder.config, sessions, state.progress, _weights(half, rounding_error))
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),
@@ -207,7 +209,7 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
     pixels = images.permute(0, 3, 1, 2).float() / 255
     known = torch.ones(len(images), dtype=torch.bool)
     with _jittered_layers(graph.network, generator):
-        for _ in range(_NUM_JITTERED):
+        for _ in range(NUM_JITTERED):
             jittered = graph.read(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
             for name, values in answers.items():
                 known &= (values - jittered[name]).abs().flatten(1).amax(dim=1) <= LARGEST_PARITY_ERROR
@@ -221,7 +223,7 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
 
 @contextmanager
 def _jittered_layers(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
-    """Within this, every layer is off by about as much as rounding in some other order can make it."""
+    """Within the block every layer's output is jittered by about as much as another order of rounding changes it."""
 
     def off(_layer: nn.Module, _given: object, said: Tensor) -> Tensor:
         return said * (1 + _LAYER_JITTER * torch.randn(said.shape, generator=generator))
@@ -263,7 +265,7 @@ def refuse_disparity(expected: dict[str, Tensor], found: dict[str, Tensor]) -> f
 
 
 def model_spec(world: World, name: str) -> ModelSpec:
-    """What a model of this world says about itself, but for where it comes from."""
+    """The specification of a world's model, without its origin."""
     camera = world.camera
     matrix: Sequence[float] = [] if camera.matrix is None else np.asarray(camera.matrix, float).ravel().tolist()
     return ModelSpec(

@@ -54,7 +54,7 @@ def to_onnx(network: nn.Module, width: int, height: int, outputs: Sequence[str])
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the exporter's remarks about packages that are not needed, and its own deprecations."""
+    """Silence the exporter's remarks about packages that are not needed, and its deprecation warnings."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

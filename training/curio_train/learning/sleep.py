@@ -113,7 +113,7 @@ def _augmented(world: World, images: Tensor, seed: tuple[int, ...]) -> Tensor:
 
 
 def sleep_codes(world: World, raw: SceneCode, noise: float, drawn: float, seed: tuple[int, ...]) -> dict[str, Tensor]:
-    """As many scene codes to render as there are predictions.
+    """Draw scene codes to render, as many as there are predictions.
 
     Args:
         world: Declares the range and draws from it.
@@ -142,5 +142,5 @@ def sleep_codes(world: World, raw: SceneCode, noise: float, drawn: float, seed: 
 
 
 def _like(values: np.ndarray, tensor: Tensor) -> Tensor:
-    """On the device of ``tensor``, with trailing dimensions to broadcast over."""
+    """Move values to the device of ``tensor`` and add trailing dimensions for broadcasting."""
     return torch.from_numpy(values).to(tensor).view(*values.shape, *(1,) * (tensor.dim() - values.ndim))

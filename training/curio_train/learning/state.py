@@ -78,7 +78,7 @@ class Learner(Generic[N]):
 
 @dataclass
 class TrainingProgress:
-    """How far a run has come; ``course.json`` of a checkpoint."""
+    """The progress of a run; ``course.json`` of a checkpoint."""
 
     step: int = 0
     """Steps done. Every random draw is a function of the seed and this number: there is no other random state."""
@@ -175,5 +175,5 @@ class TrainState:
 
 
 def under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Those whose names begin with ``prefix``, without it."""
+    """The tensors whose names begin with ``prefix``; the returned names are without it."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -34,7 +34,7 @@ _PROBE_ANGLES_DEG = (19.0, 47.0, 73.0, 101.0, 137.0, 163.0)  # multiples of no 3
 
 @dataclass(frozen=True)
 class Symmetries:
-    """What leaves the shape as it is, beside doing nothing."""
+    """The rotations that map the shape onto itself, without the identity."""
 
     discrete: tuple[np.ndarray, ...]
     """Each [4, 4], object frame, metres."""
@@ -146,7 +146,7 @@ class _Surface:
         return []
 
     def clear_ones(self, turns: list[np.ndarray]) -> list[np.ndarray]:
-        """Those that miss by about as much as the best: whatever noise a surface has, all its symmetries share it."""
+        """The rotations that miss by about as much as the best: noise affects all symmetries of a surface alike."""
         misses = np.array([self._misses(turn[:3, :3], self._turned)[0] for turn in turns])
         limit = max(_NOISE, _SHARED_NOISE * misses.min(initial=np.inf))
         return [turn for turn, miss in zip(turns, misses, strict=True) if miss <= limit]

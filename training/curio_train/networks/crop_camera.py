@@ -81,7 +81,7 @@ def crop_camera_at(
 def sampling_grid(
     crop: CropCamera, matrix: Float[Tensor, "batch 3 3"], size: int, frame_width: int, frame_height: int
 ) -> Float[Tensor, "batch {size} {size} 2"]:
-    """Where ``grid_sample(frame, grid, align_corners=False)`` must look for each pixel of the crop.
+    """The grid with which ``grid_sample(frame, grid, align_corners=False)`` makes the crop.
 
     ``align_corners=False`` puts -1 and 1 at the image's borders, which lie half a pixel outside the pixel centres. The
     inverse homography K Rᵀ K_crop⁻¹ is written out: no solver then enters an exported graph.

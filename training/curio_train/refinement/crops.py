@@ -134,7 +134,7 @@ class Crops:
         return residual.sum((1, 2, 3)) / self.mask.sum((1, 2, 3)).clamp(min=1)
 
     def inlier_pixels(self, residual: Float[Tensor, "batch 1 side side"]) -> Float[Tensor, " batch"]:
-        """By how much the residual is smaller than that of the background alone, in pixels."""
+        """Sum over pixels of how much smaller the residual is than that of the background alone."""
         return (self.residual(self.backgrounds) - residual).clamp(min=0).sum((1, 2, 3))
 
 

@@ -202,7 +202,7 @@ def _clusters(
 
 
 def _covariance(scene: _StaticScene, predictions: _Predictions, diameter_m: float) -> Float[np.ndarray, "n 3 3"]:
-    """Of each predicted position in the scene: it is more accurate across the view than in depth."""
+    """Covariance of each predicted position in the scene: positions are more accurate across the view than in depth."""
     rotation = _rows(scene.cam_from_world, predictions.frame).inverse().rotation
     rays_m = _rotated(rotation, predictions.cam_from_obj.translation_m)
     distance_m = np.linalg.norm(rays_m, axis=1)
@@ -226,7 +226,7 @@ def _angles_deg(one: np.ndarray, other: np.ndarray, symmetries: np.ndarray) -> t
 
 
 def _mean(poses: Pose[np.ndarray], covariance: np.ndarray, symmetries: np.ndarray) -> Pose[np.ndarray]:
-    """Of a batch of poses, positions weighted by their inverse covariance."""
+    """Mean of a batch of poses; positions are weighted by their inverse covariance."""
     _, symmetry = _angles_deg(poses.rotation, poses.rotation[0], symmetries)
     rotation = Rotation.from_matrix(poses.rotation @ symmetries[symmetry]).mean().as_matrix()
     weight = np.linalg.inv(covariance)

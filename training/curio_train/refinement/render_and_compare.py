@@ -45,7 +45,7 @@ MIN_INLIER_RATIO = 0.3
 
 
 class _Round(NamedTuple):
-    """How a round sees the crops."""
+    """Blur and background margin of one round."""
 
     times_blurred: int
     """How often crops and renderings are blurred."""
@@ -100,7 +100,7 @@ class RenderAndCompare:
 
     @classmethod
     def in_world(cls, world: World) -> "RenderAndCompare":
-        """For the object and the camera of a world.
+        """Build the refiner for a world's object and camera.
 
         Raises:
             UsageError: The world does not have one object before a pinhole camera.

@@ -25,7 +25,7 @@ def enclosing_polytope(vertices: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ImageBounds:
-    """What part of its image each instance can touch."""
+    """Bounds of each instance in its image."""
 
     low: np.ndarray
     """Float32 [instances, 8], smallest value of a·x + b·y over the object for each (a, b) in ``DIRECTIONS``; pixels."""

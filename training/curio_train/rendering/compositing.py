@@ -34,7 +34,7 @@ class Occlusion:
         dr.eval(self.entry_of_group, self.table)
 
     def weight(self, instances: Instances, location: ImageLocation, depth_m: Any) -> Any:
-        """What a hit contributes to its sample: its confidence times what the nearer hits let through.
+        """Weight of a hit in its sample: its confidence times the transmittance of the nearer hits.
 
         Written without a sort: every slot is asked whether it is nearer (equal depths: the earlier slot), so the
         program does not depend on the data.

@@ -154,7 +154,7 @@ class OutlineSampler:
         return dr.select(index > 0, dr.gather(self.mi.Float64, total, index - 1, index > 0), 0)
 
     def _count_below(self, below: Any, count: int) -> Any:
-        """How many entries of an ascending array of ``count`` satisfy ``below(index)``."""
+        """Number of entries of an ascending array of length ``count`` that satisfy ``below(index)``."""
         dr, size = self.dr, self.dr.opaque(self.mi.UInt32, count)
         return self.mi.UInt32(dr.binary_search(0, _SEARCH_END, lambda i: (i < size) & below(dr.minimum(i, size - 1))))
 

@@ -24,7 +24,7 @@ class Ground:
     def image(
         self, ambient: float, light: Float[Tensor, "batch 3"], shadow: Float[Tensor, "batch 1 height width"]
     ) -> Float[Tensor, "batch 3 height width"]:
-        """What is seen of it, in sRGB: albedo · (ambient + max(0, n·l)) where no shadow falls.
+        """Image of the ground in sRGB: albedo · (ambient + max(0, n·l)) where no shadow falls.
 
         Args:
             ambient: Radiance from everywhere; it knows no shadows.

@@ -61,7 +61,7 @@ class Instances:
         return self.mi.Ray3f(self.origin(instance), self.turned(instance, self.direction(instance, x, y)))
 
     def toward(self, instance: Any, point: Any) -> Any:
-        """From a point to the camera, scene frame."""
+        """Direction from a point to the camera, scene frame."""
         return self.origin(instance) - point
 
     def to_camera(self, instance: Any, point: Any) -> Any:

@@ -19,7 +19,7 @@ LocationsOfRays = Callable[[Any], tuple[ImageLocation, Any]]
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """What all parts of all batches share."""
+    """Renderer settings that hold for every batch: image size, samples, ambient light, ground."""
 
     mi: ModuleType
     """Mitsuba."""
@@ -62,7 +62,7 @@ class View:
 
     @property
     def num_images(self) -> int:
-        """In this part."""
+        """Number of images in this part of the batch."""
         return self.images[1] - self.images[0]
 
 
@@ -118,7 +118,7 @@ class Launch:
         return blockers
 
     def contributions(self, instances: Instances, hits: Hits) -> tuple[ImageLocation, list[Any]]:
-        """What each hit adds to the colour of its sample: weight · (color − background), one array a channel."""
+        """Contribution of each hit to the colour of its sample, weight · (color − background), one array a channel."""
         location, _ = hits.at(hits.lane)
         lit = hits.blockers.lit(instances, location) if hits.blockers else 1.0
         colors = self.view.query.colors(self.set.tracer, instances, location, hits.record, lit)
@@ -136,7 +136,7 @@ class Launch:
         return [self.dr.gather(self.mi.Float, flat, i) for i in self.planes(pixel)]
 
     def planes(self, pixel: Any) -> list[Any]:
-        """Where a pixel's channels are in a flat [b, c, h, w] array."""
+        """Indices of a pixel's channels in a flat [b, c, h, w] array."""
         area, channels = self.set.width * self.set.height, self.view.query.channels
         first = pixel + (pixel // area) * ((channels - 1) * area)
         return [first + channel * area for channel in range(channels)]

@@ -114,7 +114,7 @@ class Appearance:
 
     @staticmethod
     def of_values(mi: ModuleType, dr: ModuleType, scene: Any, values: list[Any]) -> "Appearance":
-        """From one array for each of the :data:`APPEARANCE_SIZE` values, in the order of :func:`finishes`."""
+        """Build from :data:`APPEARANCE_SIZE` arrays, in the order of :func:`random_appearances`."""
         ambient, gloss, sharpness, shadow, grain, bumps, *waves = values[3:]
         each = [(mi.Vector3f(*waves[first : first + 3]), waves[first + 3]) for first in range(0, 4 * NUM_WAVES, 4)]
         fill = mi.Vector3f(*values[:3])
@@ -131,7 +131,7 @@ class Appearance:
         return dr.exp(self.grain * height), mi.Normal3f(dr.normalize(normal - self.bumps * slope))
 
     def radiance(self, ambient: float, lit: Any, surface: Any, normal: Any, light: Any) -> tuple[Any, Any]:
-        """What falls on the surface: from everywhere, from the light and from the second one; and the lit share."""
+        """Irradiance of the surface by ambient light, by the light and by the second light; and the lit fraction."""
         mi, dr = self.mi, self.dr
         with dr.suspend_grad():
             side = dr.select(dr.dot(surface.n, light) < 0, -1.0, 1.0)

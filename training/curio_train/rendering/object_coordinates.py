@@ -17,12 +17,12 @@ _LEAST_SEEN = 0.5  # of a patch's area
 
 
 class ObjectCoordinateMap:
-    """Renders the surface of a mesh in its own coordinates.
+    """Renders the surface of a mesh in its own coordinates."""
 
-    Attributes:
-        center_m: Middle of the mesh's box, [3].
-        half_extent_m: Half of its longest side: what a coordinate of 1 means.
-    """
+    center_m: np.ndarray
+    """Middle of the mesh's box, [3]."""
+    half_extent_m: float
+    """Half of its longest side: what a coordinate of 1 means."""
 
     def __init__(self, mesh: Mesh, side: int) -> None:
         """Build for images of ``side`` x ``side`` patches."""

@@ -23,7 +23,7 @@ NUM_CORNERS = 80  # simple polytopes of 42 sides have 2 · 42 − 4
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a kind of object lies in the static scene: ``scene = (object − center) / radius + offset``.
+    """Position of a kind of object in the static scene: ``scene = (object − center) / radius + offset``.
 
     ``corners_m`` [n, 3] are those of a polytope around it, object frame, repeated to the same number for every kind.
     """
@@ -36,7 +36,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class StaticScene:
-    """What the renderer traces."""
+    """The static scene that the renderer traces: every kind of object once, side by side."""
 
     scene: Any
     """The ``mitsuba.Scene``."""

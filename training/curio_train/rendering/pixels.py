@@ -95,7 +95,7 @@ class PixelSamples:
         return touched
 
     def at(self, lane: Any) -> tuple[ImageLocation, Any]:
-        """Where a ray passes, and whether that is inside the image (sizes may be odd)."""
+        """Image position of a ray, and whether it is inside the image (sizes may be odd)."""
         mi, dr, spp, (width, height) = self.mi, self.dr, self.samples_per_pixel, self.size
         entry = lane // spp
         tile = entry // TILE_AREA

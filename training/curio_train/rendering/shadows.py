@@ -27,7 +27,7 @@ _FAR = 1e6  # where parallel light comes from, in radii of the objects
 
 
 def fallen(corners_m: np.ndarray, light: np.ndarray, ground: Ground) -> np.ndarray:
-    """Where points [instances, n, 3] throw their shadows on the ground, camera frame; NaN without light from above.
+    """Shadows of points [instances, n, 3] on the ground, camera frame; NaN without light from above.
 
     Args:
         corners_m: Camera frame.
@@ -50,7 +50,7 @@ class ShadowRows(Instances):
     """The ground's normal in the camera frame, and the camera's height above it, 4 opaque floats."""
 
     def ray(self, instance: Any, x: Any, y: Any) -> Any:
-        """From the ground's point that is seen at pixel (x, y) towards the light; nowhere above the horizon."""
+        """Ray to the light from the ground point seen at pixel (x, y); pixels above the horizon have none."""
         dr, (*up, height) = self.dr, self.plane
         seen = self.mi.Vector3f(*self.direction(instance, x, y))
         fall = -(up[0] * seen.x + up[1] * seen.y + up[2] * seen.z)

@@ -35,7 +35,7 @@ class Adjacency:
 
     @property
     def crease(self) -> np.ndarray:
-        """Where the surface folds, bool [e]."""
+        """Whether the surface folds at each edge, bool [e]."""
         return self.paired & (self.cosine < np.cos(np.radians(CREASE_DEG)))
 
     @property

@@ -71,7 +71,7 @@ class LayerTracer:
         ]
 
     def _surface(self, ray: Any, hit: Any) -> tuple[Any, Any]:
-        """Where rays hit, and the BSDF there; a single shape is asked itself, which saves looking up whose it is."""
+        """Hit points and their BSDF; a single shape is queried directly, which saves a lookup."""
         flags = self.mi.RayFlags.Minimal | self.mi.RayFlags.ShadingFrame | self.mi.RayFlags.UV
         if self.only_shape is not None:
             return self.only_shape.compute_surface_interaction(ray, hit, flags), self.only_shape.bsdf()
@@ -80,7 +80,7 @@ class LayerTracer:
 
 
 class RayQuery(ABC):
-    """What rays through pixels look for, and what they show of it."""
+    """Traces rays through pixels against instances and shades the hits."""
 
     channels: int
     """Of the image."""
@@ -97,7 +97,7 @@ class RayQuery(ABC):
     def colors(
         self, tracer: LayerTracer, instances: Instances, location: ImageLocation, hit: Any, lit: Any
     ) -> list[Any]:
-        """What hits look like, one array a channel; ``lit`` is the fraction of the light that reaches them."""
+        """Colours of hits, one array a channel; ``lit`` is the fraction of the light that reaches them."""
 
 
 class Objects(RayQuery):

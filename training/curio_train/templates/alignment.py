@@ -113,7 +113,7 @@ def _by_pose(by_point: Float[Tensor, "batch points 3"], arm: Float[Tensor, "batc
 
 
 def _solve(hessian: Float[Tensor, "batch 6 6"], gradient: Float[Tensor, "batch 6"]) -> Float[Tensor, "batch 6"]:
-    """Of the damped system, by Gauss–Jordan elimination written out: a positive matrix needs no pivots."""
+    """Solve the damped system by Gauss–Jordan elimination, written out: a positive matrix needs no pivots."""
     identity = torch.eye(6, dtype=hessian.dtype, device=hessian.device)
     diagonal = (hessian * identity).sum(dim=2)
     damped = hessian + identity * (_DAMPING * diagonal + _RIDGE * (1 + diagonal.mean(dim=1, keepdim=True)))[:, None]

@@ -118,7 +118,7 @@ def _fill_localiser(
 
 
 def _standardise(localiser: Localiser, descriptors: Tensor) -> None:
-    """On background each template then scores 0 in the mean, with a standard deviation of 1."""
+    """Scale and shift all scores so that each template's have mean 0 and standard deviation 1 on background."""
     localiser.offsets.zero_()
     scores = [torch.stack(of_image) for of_image in zip(*(localiser.scores(d[None]) for d in descriptors), strict=True)]
     for number, of_depth in enumerate(scores):  # [images, 1, templates, cells]

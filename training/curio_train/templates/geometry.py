@@ -28,7 +28,7 @@ _GOLDEN_ANGLE = np.pi * (1 + 5**0.5)
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What the sizes of a template network follow from."""
+    """Frame, camera and object, from which the sizes of a template network follow."""
 
     matrix: np.ndarray
     """K of the frames, [3, 3]."""
@@ -50,7 +50,7 @@ class Geometry:
 
     @property
     def focal_px(self) -> float:
-        """Of the frames."""
+        """Focal length of the frames, pixels."""
         return float(self.matrix[0, 0])
 
     @property

@@ -87,7 +87,7 @@ class Localiser(nn.Module):
     def scores(
         self, descriptors: Float[Tensor, "batch size rows columns"]
     ) -> list[Float[Tensor, "batch templates cells"]]:
-        """Of every template centred on every cell, a list entry a distance."""
+        """Scores of every template centred on every cell, a list entry a distance."""
         found = []
         for number in range(self._num):
             filters = self.filters(number).float()
@@ -96,6 +96,6 @@ class Localiser(nn.Module):
         return found
 
     def filters(self, number: int) -> Tensor:
-        """Of one distance, [RANK, DESCRIPTOR_SIZE, side, side]."""
+        """Filters of one distance, [RANK, DESCRIPTOR_SIZE, side, side]."""
         filters: Tensor = getattr(self, f"filters_{number}")
         return filters

@@ -67,8 +67,6 @@ class TemplateNetwork(nn.Module):
     """All templates."""
     geometry: Geometry
     """Of frames and object."""
-    depth_factor: Tensor
-    """Predicted distances are multiplied by it; calibrated on renderings."""
     rightness: Tensor
     """Weights [2] and offset of the pose-correct logit; calibrated on renderings."""
     presence: Tensor
@@ -86,7 +84,6 @@ class TemplateNetwork(nn.Module):
         super().__init__()
         self.trunk, self.localiser, self.bank = Trunk(), Localiser(geometry), Bank()
         self.geometry, self._steps = geometry, steps
-        self.register_buffer("depth_factor", torch.ones(()))
         self.register_buffer("rightness", torch.tensor([1.0, 0.0, 0.0]))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]))
         self.register_buffer("_matrix", torch.from_numpy(geometry.matrix).float()[None], persistent=False)
@@ -108,7 +105,7 @@ class TemplateNetwork(nn.Module):
             torch.stack([10 * last.score, -100 * spread], dim=1), torch.stack([10 * last.score, last.place], dim=1)
         )
         return {
-            TRANSLATION: (last.position_m * self.depth_factor)[:, None],
+            TRANSLATION: last.position_m[:, None],
             ROTATION_6D: rotation_6d_from_matrix(last.rotation)[:, None],
             LIGHT: self._lamp.expand(images.shape[0], 3),
         }, evidence
@@ -187,7 +184,7 @@ class TemplateNetwork(nn.Module):
         return Poses(*self._in_frame(Aligned(turn, placed, total), back), total, best.place), spread
 
     def _best(self, poses: Poses, num_images: int) -> Poses:
-        """Of the hypotheses of each image the one with the highest score."""
+        """The hypothesis of each image that has the highest score."""
         by_image = poses.score.unflatten(0, (num_images, -1))
         row = torch.arange(num_images, device=by_image.device) * by_image.shape[1] + by_image.argmax(dim=1)
         return Poses(*(of_all[row] for of_all in poses))
@@ -195,7 +192,7 @@ class TemplateNetwork(nn.Module):
     def _crops(
         self, images: Tensor, positions_m: Float[Tensor, "batch num 3"], side: int
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What cameras turned towards places see: crops, cam_from_crop, distances and focal lengths, a row a place."""
+        """Crops of cameras that look at positions; cam_from_crop, distances and focal lengths, a row a position."""
         place = positions_m.flatten(0, 1)
         depth = place.square().sum(dim=1).sqrt().clamp(min=self.geometry.near_m / 2)
         focal_px = FILL * CROP_PX * depth / self.geometry.diameter_m
@@ -226,5 +223,5 @@ def _shifts() -> Float[Tensor, "shifts 2"]:
 
 
 def _probability(evidence: Float[Tensor, "batch 2"], weights: Float[Tensor, " 3"]) -> Float[Tensor, " batch"]:
-    """Of the weighed sum as a logit; the offset is last."""
+    """Sigmoid of the weighted sum of calibration features; the last weight is the offset."""
     return torch.sigmoid(evidence @ weights[:-1] + weights[-1])

@@ -95,7 +95,7 @@ def _convolution(inputs: int, outputs: int, kernel: int, stride: int, groups: in
 
 
 def _packaged() -> Path:
-    """Where the package keeps its checkpoint; the package itself is not run."""
+    """Path of the package's checkpoint; the package's code is not run."""
     found = importlib.util.find_spec(PACKAGE)
     if found is None or found.origin is None:
         raise CheckpointError(

@@ -55,7 +55,7 @@ class Page:
 
 @dataclass(frozen=True)
 class Opening:
-    """What to open; see :func:`open_pages`."""
+    """The call of ``curio-view``; see :func:`open_pages`."""
 
     path: str
     """A result file, a photograph or a folder of them, a run folder, or the name of a generated world."""

@@ -30,7 +30,7 @@ SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 
 @dataclass(frozen=True)
 class ObjectKind:
-    """What an exported model knows of a kind of object."""
+    """The properties of a kind of object that an exported model holds."""
 
     name: str
     """For people and clients."""
@@ -51,7 +51,7 @@ class ObjectKind:
 
     @property
     def info(self) -> ModelInfo:
-        """What pose metrics need to know."""
+        """Diameter and symmetries, for pose metrics."""
         return ModelInfo(self.diameter_m, tuple(self.symmetries), tuple(self.symmetry_axes))
 
 

@@ -75,8 +75,8 @@ class LinemodOptions(WorldOptions):
     """Folder of photographs for backgrounds; without it clutter is rendered."""
     photos: Path | None = None
     """Folder of unlabelled frames of the data set's camera. Towards the end of training the two-stage detector learns
-    from them, with the poses that it estimates there itself (--self-training). Frames of one scene from several
-    viewpoints, in the order of their names, correct each other."""
+    from them, with the poses that it estimates there itself (--self-training, which is 0 without them). Frames of one
+    scene from several viewpoints, in the order of their names, correct each other."""
     views: Path | None = None
     """File with the camera poses of --photos, in metres, as capture --calibrate --views-out writes it. Without it they
     are recovered from the photographs, and their scale from the estimated object poses."""
@@ -195,7 +195,7 @@ class CaptureOptions(WorldOptions):
             )
 
     def _given_flags(self, names: tuple[str, ...]) -> str:
-        """Those flags whose value is not the default."""
+        """The flags of these fields whose values are not the defaults."""
         given = [name for name in names if getattr(self, name) != getattr(CaptureOptions, name)]
         return ", ".join(f"--{name.replace('_', '-')}" for name in given)
 

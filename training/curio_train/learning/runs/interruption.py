@@ -45,7 +45,7 @@ class Interruption:
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Within it the first signal only sets :attr:`signum`; a second one raises."""
+        """Within the block the first signal only sets :attr:`signum`; a second one raises."""
         self._deferred = True
         try:
             yield

@@ -28,7 +28,7 @@ OVERSAMPLING = 2  # a crop is sampled at so many points a pixel and side, then a
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """How a frame is cropped."""
+    """Cameras of frame and crops, and the size of the object in a crop."""
 
     matrix: np.ndarray
     """K of the frames, [3, 3]."""
@@ -156,7 +156,7 @@ def _probability(features: Float[Tensor, "batch num"], weights: Float[Tensor, " 
 
 
 def _visibility(coordinates: Float[Tensor, "rows 4 side side"]) -> Float[Tensor, " rows"]:
-    """How clearly a crop shows the object: mean visibility logit of the patches where it is highest.
+    """Visibility of the object in a crop: mean logit of the patches where it is highest.
 
     The confidence that the pose is correct cannot say this: it is as low for poses that are hard to estimate as for
     crops without the object.

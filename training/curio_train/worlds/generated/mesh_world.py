@@ -116,7 +116,7 @@ class MeshWorld(World):
 
     @property
     def radii_m(self) -> list[float]:
-        """Of each slot, see :class:`MeshKind`."""
+        """Radius of each slot's object, see :class:`MeshKind`."""
         return [kind.radius_m for kind in self.kinds for _ in range(kind.num_slots)]
 
     def render(self, code: SceneCode, backgrounds: Tensor | None = None) -> Tensor:

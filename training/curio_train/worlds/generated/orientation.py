@@ -47,7 +47,7 @@ class Yaw(Orientation):
     field = YAW_FIELD
 
     def rotation(self, code: SceneCode) -> Float[Tensor, "batch slots 3 3"]:
-        """By the angle of (i, j)."""
+        """Rotation about y by the angle of (i, j)."""
         return matrix_from_yaw(code[YAW].float())
 
     def entries(self, rotation: Float[Tensor, "batch slots 3 3"]) -> dict[str, Tensor]:
@@ -68,7 +68,7 @@ class FoldedYaw(Orientation):
         self._fraction = torch.where(folds > 0, 1 / folds.clamp(min=1), 0.0)
 
     def rotation(self, code: SceneCode) -> Float[Tensor, "batch slots 3 3"]:
-        """By the n-th part of the angle of (i, j)."""
+        """Rotation about y by the n-th part of the angle of (i, j)."""
         folded = matrix_from_yaw(code[YAW].float())
         angle = _angle(folded) * self._fraction.to(folded)
         return matrix_from_yaw(torch.stack([angle.cos(), angle.sin()], dim=-1))
@@ -85,7 +85,7 @@ class FreeRotation(Orientation):
     field = ROTATION_FIELD
 
     def rotation(self, code: SceneCode) -> Float[Tensor, "batch slots 3 3"]:
-        """From the 6D rotation."""
+        """Rotation matrix of the 6D rotation."""
         return matrix_from_rotation_6d(code[ROTATION_6D].float())
 
     def entries(self, rotation: Float[Tensor, "batch slots 3 3"]) -> dict[str, Tensor]:
@@ -94,5 +94,5 @@ class FreeRotation(Orientation):
 
 
 def _angle(rotation: Tensor) -> Tensor:
-    """Of rotations about y, radians."""
+    """Angles of rotations about y, radians."""
     return torch.atan2(rotation[..., 0, 2], rotation[..., 0, 0])

@@ -24,7 +24,7 @@ class WorldFrameOutputs(CameraFrameOutputs):
 
     @property
     def fields(self) -> tuple[Field, ...]:
-        """In the camera frame, with 6D rotations in place of yaws and the light as a vector."""
+        """Output fields: in the camera frame, with 6D rotations in place of yaws, and the light as a vector."""
         sun = float(np.linalg.norm(self._setup.sun))
         position = self._layout[TRANSLATION]
         corners = self._setup.cam_from_world.apply(

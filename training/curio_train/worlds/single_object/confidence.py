@@ -12,7 +12,10 @@ from curio_train.networks.two_stage.network import CalibrationFeatures, TwoStage
 from curio_train.scene_code import poses
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
-_NUM_FRAMES, _BATCH_SIZE = 300, 25
+NUM_FRAMES = 300
+"""Frames with the object that calibrate the confidence, and as many without; a multiple of 25."""
+
+_BATCH_SIZE = 25
 _NUM_POINTS = 500  # about so many vertices for ADD
 
 
@@ -32,7 +35,7 @@ def calibrate(network: TwoStageNetwork, world: SingleObjectWorld, cache: Path) -
     vertices = world.object.mesh.vertices_m
     points = vertices[:: max(1, len(vertices) // _NUM_POINTS)]
     network.eval()
-    steps = _NUM_FRAMES // _BATCH_SIZE
+    steps = NUM_FRAMES // _BATCH_SIZE
     with_object: list[CalibrationFeatures] = []
     without: list[CalibrationFeatures] = []
     correct: list[bool] = []
@@ -46,7 +49,7 @@ def calibrate(network: TwoStageNetwork, world: SingleObjectWorld, cache: Path) -
         empty = source.backgrounds(steps + step, _BATCH_SIZE)
         without.append(network.uncalibrated(empty.clamp(0, 1))[1])
     network.rightness.copy_(_fit([features.pose_correct for features in with_object], correct))
-    present = [True] * _NUM_FRAMES + [False] * _NUM_FRAMES
+    present = [True] * NUM_FRAMES + [False] * NUM_FRAMES
     network.presence.copy_(_fit([features.presence for features in (*with_object, *without)], present))
 
 

@@ -124,7 +124,7 @@ class SingleObjectWorld(World):
 
     @property
     def augmentation(self) -> AugmentationStrength:
-        """How strongly its images are augmented."""
+        """Strength of the augmentation of its images."""
         return KNOWN_SCENE if self.object.known_scene else UNKNOWN_SCENE
 
     @property
@@ -202,7 +202,7 @@ class RenderedStream(ImageSource):
         return Batch(images, backgrounds, code if self._with_code else None, given)
 
     def backgrounds(self, step: int, size: int) -> Tensor:
-        """Without rendering the images."""
+        """The backgrounds of one step's batch, without rendering the images."""
         camera = self._world.camera
         return self._backgrounds.draw(size, camera.width, camera.height, (*self._seed, step))
 

@@ -14,7 +14,7 @@ from curio_train.worlds.generated.scene_setup import SceneSetup
 
 
 class FileFrameOutputs(WorldFrameOutputs):
-    """As of other worlds on the ground, for objects whose scene codes use other object frames than their files."""
+    """Outputs of worlds on the ground whose scene codes use other object frames than the mesh files."""
 
     def __init__(
         self, layout: Layout, setup: SceneSetup, orientation: Orientation, own_from_file: Pose[Tensor]
@@ -32,7 +32,7 @@ class FileFrameOutputs(WorldFrameOutputs):
 
     @property
     def fields(self) -> tuple[Field, ...]:
-        """With a 6D rotation, even if the scene code of round parts has none."""
+        """Output fields: with a 6D rotation, even if the scene code of round parts has none."""
         position, *others = super().fields
         rotation = replace(ROTATION_FIELD, frame="camera")
         return (position, rotation, *(field for field in others if field.name != ROTATION_6D))

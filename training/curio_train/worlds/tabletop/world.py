@@ -138,7 +138,7 @@ class TabletopWorld(MeshWorld):
         )
 
     def _drawn_from(self, photographs: TabletopPhotographs) -> dict[str, Any]:
-        """What the draws depend on beside fields, meshes and setup."""
+        """Values that the draws depend on besides fields, meshes and setup."""
         arrays = (photographs.own.background_image.numpy(), photographs.occupied)
         return {
             "plate": [hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest() for array in arrays],
