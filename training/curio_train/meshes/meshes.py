@@ -143,7 +143,11 @@ def _parse(path: Path, content: bytes) -> Any:
 def _check(path: Path, loaded: Any) -> None:
     vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
     if len(faces) == 0:
-        raise MeshError(f"{path}: found {len(vertices)} vertices and no faces; a surface is needed, not a point cloud")
+        kind = path.suffix.lstrip(".").upper()
+        raise MeshError(
+            f"{path}: found {len(vertices)} vertices and no faces in this {kind} file; a surface is needed, not a "
+            "point cloud; is the file complete?"
+        )
     num_broken = int((~np.isfinite(vertices).all(axis=1)).sum())
     if num_broken:
         raise MeshError(f"{path}: {num_broken} of {len(vertices)} vertices are NaN or infinite; repair the mesh")
