@@ -72,7 +72,7 @@ def _as_data_errors(failure: str) -> Iterator[None]:
         if status in (401, 403, 404):
             raise DataError(f"{failure}: the hub answers {status}; does HF_ENDPOINT name a hub? {_OFFLINE}") from exc
         raise DataError(f"{failure}: {_first_line(exc)}; {again}, {_OFFLINE}") from exc
-    # RuntimeError: encrypted; NotImplementedError, one of those: packed by a method that zipfile does not know.
+    # RuntimeError: it is encrypted, or packed by a method that zipfile does not know.
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as exc:
         raise DataError(f"{failure}: the archive is damaged as published ({exc}); {_OFFLINE}") from exc
     except OSError as exc:
