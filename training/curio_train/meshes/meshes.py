@@ -145,7 +145,11 @@ def _check(path: Path, loaded: Any) -> None:
     if path.suffix.lower() == ".stl" and len(faces) == 0:  # trimesh takes a binary file that is cut off for text
         raise MeshError(f"{path}: not a readable STL mesh (it holds no triangle); is the file complete?")
     if len(faces) == 0:
-        raise MeshError(f"{path}: found {len(vertices)} vertices and no faces; a surface is needed, not a point cloud")
+        kind = path.suffix.lstrip(".").upper()
+        raise MeshError(
+            f"{path}: found {len(vertices)} vertices and no faces in this {kind} file; a surface is needed, not a "
+            "point cloud; is the file complete?"
+        )
     num_broken = int((~np.isfinite(vertices).all(axis=1)).sum())
     if num_broken:
         raise MeshError(f"{path}: {num_broken} of {len(vertices)} vertices are NaN or infinite; repair the mesh")
