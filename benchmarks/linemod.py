@@ -18,6 +18,7 @@ from curio_train.evaluation.candidates import Candidate, candidates
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.real_frames import evaluate_real_frames
 from curio_train.evaluation.subject import load_subject
+from curio_train.refinement.render_and_compare import with_refinement
 from paper.linemod_markdown import markdown
 from paper.linemod_sheet import write_sheet
 from paper.linemod_table import REFINED, is_current, load_table, make_row

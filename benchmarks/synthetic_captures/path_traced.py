@@ -135,7 +135,7 @@ class PathTracedScene:
 
     def _lamp(self, side_m: float) -> dict[str, Any]:
         """A square lamp to one side above the table, a fifth of its side wide."""
-        look = self._mitsuba.ScalarTransform4f().measure(
+        look = self._mitsuba.ScalarTransform4f().look_at(
             origin=[-0.35 * side_m, 0.6 * side_m, 0.25 * side_m], target=[0, 0, 0], up=[0, 0, 1]
         )
         radiance = {"type": "area", "radiance": {"type": "rgb", "value": list(_LAMP_RADIANCE)}}

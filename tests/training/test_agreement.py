@@ -128,9 +128,7 @@ def test_the_worst_come_first_with_their_figures(folder: Path) -> None:
     code = truth(world)
     code[TRANSLATION][3, 0, 0] += 0.15
     found = judged(world, code)
-    photographs = world.photographs(NUM)
-    assert photographs is not None
-    assert torch.equal(found.columns["photograph"][0], photographs[3])
+    assert torch.equal(found.columns["photograph"][0], world.photographs.judged(NUM)[3])
     assert "overlap 0.0" in found.captions[0]
     assert found.summary["num_photographs"] == NUM
     assert found.summary["metrics"]["own_view_agreeing"] == 0.8

@@ -40,7 +40,7 @@ def test_where_things_ever_were_is_told_from_noise_and_exposure() -> None:
     random = np.random.default_rng(0)
     plate = random.integers(100, 140, (3, 64, 64)).astype(np.uint8)
     photographs = [(plate * random.uniform(0.95, 1.05)).clip(0, 255).astype(np.uint8) for _ in range(20)]
-    with pytest.raises(DataError, match="nothing but the background image"):
+    with pytest.raises(DataError, match="nothing but the background"):
         changed_pixels(photographs, [plate] * 20)
     for number, photograph in enumerate(photographs):
         photograph[:, 20:30, 2 * number : 2 * number + 8] = 20
@@ -56,7 +56,7 @@ def test_where_things_ever_were_is_told_from_noise_and_exposure() -> None:
         (None, "cannot be read"),
         ("{", "not JSON"),
         ("[1]", "expected an object"),
-        ("{}", r"says nothing of background image\.png"),
+        ("{}", r"has no pose of plate\.png"),
         (json.dumps({"plate.png": {"cam_from_world": [[1, 2], [3, 4]]}}), r"shape \(2, 2\)"),
         (json.dumps({"plate.png": {"cam_from_world": "here"}}), "no matrix"),
         (json.dumps({"plate.png": {"cam_from_world": np.diag([2, 2, 2, 1]).tolist()}}), "not rigid"),
@@ -68,4 +68,4 @@ def test_camera_places_that_do_not_do(tmp_path: Path, content: str | None, expec
     if content is not None:
         file.write_text(content)
     with pytest.raises(CameraError, match=expected):
-        CameraPoseFile.read(file).cam_from_world(tmp_path / "plate.png")
+        CameraPoseFile.read(file).pose_above_plane(tmp_path / "plate.png")

@@ -2,6 +2,7 @@
 
 import base64
 import html
+import itertools
 import json
 import re
 import shutil
@@ -59,7 +60,7 @@ def test_a_browser_shows_pictures_and_figures_without_a_server(tmp_path: Path, w
     assert min(min(size) for size in sizes.values()) > 100
     for kind in ("metrics", "untrained"):
         assert f"{result[kind]['scene_error']:.4g}</td>" in done.stdout
-    assert all(text in done.stdout for text in ("images/s", "config.json", "torch 2", " cores"))
+    assert all(text in done.stdout for text in ("images/s", "config.json", "torch 2", " cores", 'class="command"'))
 
 
 @pytest.mark.parametrize("options", [CirclesOptions(), LightOptions()])
@@ -89,6 +90,20 @@ def test_samples_are_input_prediction_and_novel_view(tmp_path: Path, write_run: 
     assert all(mask.sum() > 6 * 50 for mask in red)
     assert not np.array_equal(red[0], red[1])
     assert height > width
+
+
+def test_stages_of_training_are_shown(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    flags = ["--batch-size", "4", "--micro-batch-size", "4", "--images", "8", "--out", str(run)]
+    with pytest.raises(SystemExit) as done:
+        train_command.train(["circles", "--method", "noncur", *flags])
+    assert done.value.code == 0
+    stages = [int(path.stem) for path in sorted((run / "stages").iterdir())]
+    assert stages
+    assert all(later >= 2 * earlier for earlier, later in itertools.pairwise(stages))
+    page = (run / REPORT_FILE).read_text()
+    assert page.count('class="stage"') == len(stages)
+    assert f"after {stages[-1]} images" in page
 
 
 def test_what_stops_a_report_is_said(tmp_path: Path, write_run: WriteRun) -> None:

@@ -104,7 +104,7 @@ def browser() -> Iterator[Any]:
 def opened(browser: Any, url: str) -> Any:
     page = browser.new_page(viewport={"width": WINDOW[0], "height": WINDOW[1]})
     page.goto(url)
-    page.get_by_text("image loss").wait_for(timeout=60_000)
+    page.get_by_text("image loss").wait_for(timeout=180_000)
     return page
 
 
@@ -160,7 +160,7 @@ def test_drag_fit_save_and_reload(files: Path, view: Callable[..., Command], bro
     until(lambda: loss(page) != before and re_rendering(page) != seen)
     other.close()  # a browser that leaves in the middle
     page.get_by_role("button", name="fit this object").click()
-    page.get_by_text("fit: done").wait_for(timeout=120_000)
+    page.get_by_text("fit: done").wait_for(timeout=300_000)
     until(lambda: loss(page) < before / 2)
     page.get_by_role("button", name="save the code").click()
     page.get_by_text("saved to").wait_for()
@@ -170,7 +170,7 @@ def test_drag_fit_save_and_reload(files: Path, view: Callable[..., Command], bro
     turned = Rotation.from_matrix(np.array(found["rotation"]).T @ TRUE.rotation).magnitude()
     assert np.degrees(turned) < 2
     page.reload()
-    page.get_by_text("image loss").wait_for(timeout=60_000)
+    page.get_by_text("image loss").wait_for(timeout=180_000)
     until(lambda: loss(page) < before / 2)
 
 

@@ -26,14 +26,17 @@ def end(run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None]) 
     Raises:
         ExportError: No model could be made. The run is whole.
     """
-    from curio_train.evaluation.report import report_training
+    from curio_train.evaluation.report import REPORT_FILE, report_training
 
     try:
         report_training(run, cache)
     except CurioError as exc:
         warn(str(exc))
     if not isinstance(config.world, CaptureOptions):
-        return f"to serve it: curio-export {run} --out models/, then curio-serve models/"
+        return (
+            f"to see what it learned: {run / REPORT_FILE}\n"
+            f"to serve it: curio-export {run} --out models/, then curio-serve models/"
+        )
     return _exported(run, config.world.camera)
 
 

@@ -21,7 +21,7 @@ from curio_train.evaluation.subject import Subject, load_subject
 from curio_train.evaluation.tables import label
 from curio_train.learning.runs.checkpoint import CONFIG_FILE
 from curio_train.learning.runs.configuration import world_name
-from curio_train.learning.runs.progress import read_history
+from curio_train.learning.runs.progress import read_history, stage_pictures
 from curio_train.learning.runs.provenance import RunSession, run_sessions
 from curio_train.metrics.images import dssim
 from curio_train.worlds.base import Split, novel_view
@@ -100,6 +100,7 @@ def _page(
         title=f"{world_name(config)}, {config.method}, seed {config.seed}",
         facts=_facts(subject, made),
         run_sessions=made,
+        stages=[(f"{images:,}", figures.uri(path.read_bytes())) for images, path in stage_pictures(run)],
         split=split,
         num_images=evaluation["num_images"] if evaluation else len(batch.images),
         samples=figures.samples([column[:_NUM_SAMPLES] for column in columns]),

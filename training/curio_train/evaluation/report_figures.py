@@ -85,4 +85,9 @@ def _uri(figure: Figure) -> str:
     """Encode a figure as a PNG data URI; matplotlib's Figure class needs no window and no global state."""
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=_DPI)
-    return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode()
+    return uri(png.getvalue())
+
+
+def uri(png: bytes) -> str:
+    """The data URI of a PNG file."""
+    return "data:image/png;base64," + base64.b64encode(png).decode()

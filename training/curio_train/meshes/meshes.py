@@ -142,6 +142,8 @@ def _parse(path: Path, content: bytes) -> Any:
 
 def _check(path: Path, loaded: Any) -> None:
     vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+    if path.suffix.lower() == ".stl" and len(faces) == 0:  # trimesh takes a binary file that is cut off for text
+        raise MeshError(f"{path}: not a readable STL mesh (it holds no triangle); is the file complete?")
     if len(faces) == 0:
         kind = path.suffix.lstrip(".").upper()
         raise MeshError(

@@ -5,6 +5,7 @@
     RUN/history.jsonl     one line every few steps: step, images, seconds, and each loss averaged since the line before
         tensorboard/      the same curves, and input | re-rendering pairs
         samples.png       the latest pairs: inputs above, re-renderings below
+        stages/IMAGES.png the same at stages of training: after so many images, each stage twice as long as before
 """
 
 import json
@@ -25,7 +26,7 @@ from torch.utils.tensorboard import SummaryWriter
 from curio_train.errors import CheckpointError
 from curio_train.learning.state import TrainingProgress
 
-_HISTORY = "history.jsonl"
+_HISTORY, _STAGES = "history.jsonl", "stages"
 _STEPS_A_LINE = 20  # of history and curves
 _SECONDS_A_LINE = 10  # of the log where stderr is no terminal
 _BAR_WIDTH = 16
@@ -73,7 +74,11 @@ class Reporter:
         sheet = torch.cat([torch.cat(list(images.cpu()), dim=2) for images in pairs], dim=1).clamp(0, 1)
         pixels = (sheet * 255).round().byte().permute(1, 2, 0).numpy()
         _, png = cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
+        last = max((images for images, _ in stage_pictures(self._run)), default=0)
         with _writing_into(self._run):
+            if self._progress.images >= 2 * last:
+                (self._run / _STAGES).mkdir(exist_ok=True)
+                (self._run / _STAGES / f"{self._progress.images:09d}.png").write_bytes(png.tobytes())
             self._curves.add_image("input above, re-rendering below", sheet, self._progress.step)
             (self._run / "samples.png").write_bytes(png.tobytes())
 
@@ -133,6 +138,11 @@ def _writing_into(run: Path) -> Iterator[None]:
         raise CheckpointError(
             f"cannot write into {run}: {exc.strerror}; make room, then continue with --resume {run}"
         ) from exc
+
+
+def stage_pictures(run: Path) -> list[tuple[int, Path]]:
+    """Pictures of the stages of training, each with the images seen by then, earliest first."""
+    return [(int(path.stem), path) for path in sorted((run / _STAGES).glob("[0-9]*.png"))]
 
 
 def read_history(run: Path) -> list[dict[str, Any]]:
