@@ -92,7 +92,7 @@ def test_a_folder_that_may_not_be_listed_is_an_error_of_its_own(
         return scandir(folder)
 
     monkeypatch.setattr(os, "scandir", refuse)
-    found = list(images([str(tmp_path)]))
+    found = list(images([str(tmp_path)], PassedOver()))
     assert [image.name for image in found] == [f"{tmp_path}/a/0.png", f"{tmp_path}/b", f"{tmp_path}/c/0.png"]
     with pytest.raises(ImageError, match="cannot be listed: Permission denied"):
         found[1].read()
@@ -103,7 +103,9 @@ def test_pipes_devices_and_endless_files_are_errors_of_these_images(tmp_path: Pa
     (tmp_path / "b.png").symlink_to("/dev/zero")
     with (tmp_path / "c.png").open("wb") as sparse:
         sparse.truncate(20 << 30)
-    for image, text in zip(images([str(tmp_path)]), ["not a regular", "not a regular", "at most"], strict=True):
+    for image, text in zip(
+        images([str(tmp_path)], PassedOver()), ["not a regular", "not a regular", "at most"], strict=True
+    ):
         with pytest.raises(ImageError, match=text):
             image.read()
 
