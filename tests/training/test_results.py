@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from curio_train.commands.train import _parse
+from curio_train.commands.train import parse
 from curio_train.errors import DataError
 from curio_train.learning.runs.configuration import to_json
 from curio_train.worlds.options import CaptureOptions
@@ -187,7 +187,7 @@ def test_the_sweep_varies_one_thing_at_a_time(tmp_path: Path, monkeypatch: pytes
     sweep = benchmark_module("curiosity", monkeypatch)
     runs = sweep.plan(sweep.Settings(world="circles", reading="whole", images=640, runs=tmp_path))
     assert len({run.folder for run in runs}) == len(runs) == len(sweep.VARIANTS)
-    configs = {run.name: to_json(_parse(["circles", "--images", str(run.images), *run.flags]).config) for run in runs}
+    configs = {run.name: to_json(parse(["circles", "--images", str(run.images), *run.flags]).config) for run in runs}
     plain = flat(configs["noncur"])
     changes = {
         name: {key for key, value in flat(config).items() if value != plain[key]}
@@ -213,7 +213,7 @@ def test_the_benchmark_asks_for_worlds_that_there_are(monkeypatch: pytest.Monkey
     runs = benchmark.plan(benchmark.Settings())
     assert {(scene, method) for scene, rows in PAPER.items() for method in rows} <= runs.keys()
     for (scene, method), run in runs.items():
-        command = _parse([run.world, "--images", str(run.images), *run.flags])
+        command = parse([run.world, "--images", str(run.images), *run.flags])
         world = command.config.world
         assert isinstance(world, CaptureOptions)
         assert (world.lying, len(world.count_ranges)) == (scene == "bunny", len(world.mesh))

@@ -14,7 +14,7 @@ import torch
 from jinja2 import Environment, PackageLoader, TemplateError
 from torch import Tensor
 
-from curio_train.errors import DataError, ReportError
+from curio_train.errors import CheckpointError, DataError, ReportError
 from curio_train.evaluation import report_figures as figures
 from curio_train.evaluation.photographed import Judgement, judge
 from curio_train.evaluation.subject import Subject, load_subject
@@ -69,7 +69,7 @@ def write_report(
         draft = run / (REPORT_FILE + ".tmp")
         draft.write_text(html, encoding="utf-8")
         draft.replace(run / REPORT_FILE)
-    except DataError as exc:
+    except (DataError, CheckpointError) as exc:
         raise ReportError(f"{run / REPORT_FILE} could not be written ({exc}); the run itself is whole") from exc
     except (OSError, LookupError, RuntimeError, TemplateError, TypeError, ValueError, MemoryError) as exc:
         raise ReportError(
