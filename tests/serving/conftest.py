@@ -288,3 +288,12 @@ def frames(tmp_path: Path, spot_image: Callable[..., np.ndarray]) -> Path:
         pixels = spot_image(320, 240, 100 + 20 * number, 120, 12, 12, (255, 128, 0))
         cv2.imwrite(str(folder / f"{number:06d}.png"), pixels[..., ::-1])
     return folder
+
+
+@pytest.fixture
+def camera(tmp_path: Path) -> Path:
+    """A camera file for frames of 320x240 pixels."""
+    path = tmp_path / "camera.json"
+    matrix = [[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]]
+    path.write_text(json.dumps({"camera_matrix": matrix, "width": 320, "height": 240}))
+    return path

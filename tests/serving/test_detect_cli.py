@@ -15,9 +15,6 @@ from curio_serve.batch.detect_cli import DetectArguments, run
 from curio_serve.errors import CurioError, ModelError, UsageError
 from onnx import helper, numpy_helper
 
-SIZE = (320, 240)
-K = [[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]]
-
 
 def command(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-c", "from curio_serve.batch.detect_cli import main; main()", *map(str, arguments)]
@@ -30,13 +27,6 @@ def detect(model: Path, *sources: Path | str, **flags: Any) -> int:
 
 def read(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
-
-
-@pytest.fixture
-def camera(tmp_path: Path) -> Path:
-    path = tmp_path / "camera.json"
-    path.write_text(json.dumps({"camera_matrix": K, "width": SIZE[0], "height": SIZE[1]}))
-    return path
 
 
 def test_a_folder_a_version_and_a_file_are_the_same_model(models_dir: Path, frames: Path, tmp_path: Path) -> None:

@@ -30,13 +30,6 @@ def read(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-@pytest.fixture
-def camera(tmp_path: Path) -> Path:
-    path = tmp_path / "camera.json"
-    path.write_text(json.dumps({"camera_matrix": K, "width": SIZE[0], "height": SIZE[1]}))
-    return path
-
-
 def test_a_folder_gives_a_line_an_image_in_order(detect: Callable[..., int], frames: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.jsonl"
     assert detect("flat", frames, out=out, jobs=3) == 0

@@ -1,6 +1,6 @@
 """Run folders for what comes after training, and a two-stage network at a brick."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -83,3 +83,12 @@ def brick() -> Object:
 def brick_world(brick: Object) -> TwoStageWorld:
     """The two stages at it."""
     return TwoStageWorld("linemod", brick)
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Torch computes in one thread: sums over several have no fixed order."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

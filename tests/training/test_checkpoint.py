@@ -23,6 +23,8 @@ from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions, LinemodOptions
 from torch import Tensor
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 CONFIG = RunConfig(
     CirclesOptions(),
     method="wake_sleep_critic",
@@ -38,15 +40,6 @@ CONFIG = RunConfig(
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Sums over several threads have no fixed order."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def train(path: Path, cache: Path, config: RunConfig = CONFIG, *, resume: bool = False) -> None:

@@ -6,7 +6,6 @@ import resource
 import shutil
 import signal
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -33,14 +32,7 @@ CONFIG = RunConfig(
 Fault = Literal["kill", "full disk"]
 _FAULT_STATUS = 3
 
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Sums over several threads have no fixed order."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def _train(path: Path, cache: Path, num_images: int, *, resume: bool = True) -> None:

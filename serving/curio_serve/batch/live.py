@@ -1,6 +1,5 @@
 """Detects in a camera's or a video's frames as they come, and shows them in the browser (viser)."""
 
-import socket
 import sys
 import threading
 import time
@@ -15,6 +14,7 @@ from curio_proto.v1.detector_pb2 import Detection
 
 from curio_serve.batch.estimators import Estimator
 from curio_serve.errors import RequestError, UsageError
+from curio_serve.ports import port_fault
 
 _RECENT = 30  # frames that the rates are means of
 
@@ -95,7 +95,8 @@ def show_live(estimator: Estimator, source: str, host: str, port: int) -> int:
         UsageError: The source cannot be opened, or the address cannot be listened on.
         ServiceError: The server that detects is out of reach.
     """
-    _check_free(host, port)
+    if fault := port_fault(host, port):
+        raise UsageError(fault)
     with LatestFrame(source) as frames:
         page = viser.ViserServer(host=host, port=port, label="curio-detect", verbose=False)
         page.gui.configure_theme(show_share_button=False)
@@ -130,12 +131,3 @@ def _rates(times: deque[float], spent_ms: float, frames: LatestFrame) -> str:
 def _line(detection: Detection) -> str:
     x, y, z = (1000 * value for value in detection.translation_m)
     return f"* {detection.object}: confidence {detection.confidence:.2f}, at {x:.0f}, {y:.0f}, {z:.0f} mm"
-
-
-def _check_free(host: str, port: int) -> None:
-    """Viser takes another port without a word where this one is taken."""
-    try:
-        with socket.create_server((host, port)):
-            pass
-    except (OSError, OverflowError) as exc:
-        raise UsageError(f"cannot listen on {host}:{port} ({exc}); choose another --port or --host") from exc

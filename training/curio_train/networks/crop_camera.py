@@ -7,10 +7,13 @@ metres.
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.geometry import rotation_between
+
+_OVERSAMPLING = 2  # samples a pixel of a crop, across and down: near objects do not alias
 
 
 def project(points: Float[Tensor, "*#batch n 3"], matrix: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "... n 2"]:
@@ -92,3 +95,33 @@ def sampling_grid(
     depth = frame[..., 2:].clamp(min=1e-6)
     border = frame.new_tensor([frame_width, frame_height])
     return ((2 * frame[..., :2] / depth + 1) / border - 1).unflatten(1, (size, size))
+
+
+def cut_crops(
+    images: Float[Tensor, "images 3 height width"],
+    matrix: Float[Tensor, "3 3"],
+    position_m: Float[Tensor, "images num 3"],
+    focal_px: Float[Tensor, "images*num"],
+    side: int,
+) -> tuple[Float[Tensor, "images*num 3 {side} {side}"], Float[Tensor, "images*num 3 3"]]:
+    """Crops by virtual cameras that look at positions, each pixel the mean of four samples.
+
+    Args:
+        images: Of one camera.
+        matrix: Its K.
+        position_m: Of the crops' middles, camera frame.
+        focal_px: Of the crops, pixels; those of one image after the other.
+        side: Of the crops, pixels.
+
+    Returns:
+        The crops, and crop_from_cam.
+    """
+    num, fine_side = position_m.shape[1], _OVERSAMPLING * side
+    matrices = matrix.expand(focal_px.shape[0], 3, 3)
+    camera = crop_camera_at(position_m.flatten(0, 1), _OVERSAMPLING * focal_px, fine_side, matrices)
+    grid = sampling_grid(camera, matrices, fine_side, images.shape[3], images.shape[2])
+    # The crops of an image in one tall grid: no image is copied.
+    tall = grid.view(-1, num * fine_side, fine_side, 2)
+    fine = F.grid_sample(images, tall, padding_mode="border", align_corners=False)
+    crops = fine.unflatten(2, (num, fine_side)).transpose(1, 2).flatten(0, 1)
+    return F.avg_pool2d(crops, _OVERSAMPLING), camera.rotation

@@ -5,43 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
-from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
-from curio_train.networks.two_stage.network import OVERSAMPLING
 from curio_train.refinement.inpainting import blurred
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 
 _RESIDUAL_SCALE = 0.09  # difference of sRGB colours at which the gradient is strongest
-
-
-def crop_frames(
-    frames: Tensor,
-    matrix: Float[Tensor, "3 3"],
-    position_m: Float[Tensor, "batch 3"],
-    focal_px: Float[Tensor, " batch"],
-    side: int,
-) -> tuple[Float[Tensor, "batch 3 side side"], Float[Tensor, "batch 3 3"]]:
-    """Crops by virtual cameras that look at positions.
-
-    Args:
-        frames: uint8 sRGB [batch, 3, height, width].
-        matrix: K of the frames.
-        position_m: Camera frame; the middles of the crops.
-        focal_px: Of the crops, pixels.
-        side: Of the crops, pixels.
-
-    Returns:
-        Images in [0, 1], and crop_from_cam.
-    """
-    matrices, fine_side = matrix.expand(len(position_m), 3, 3), OVERSAMPLING * side
-    camera = crop_camera_at(position_m, OVERSAMPLING * focal_px, fine_side, matrices)
-    grid = sampling_grid(camera, matrices, fine_side, frames.shape[3], frames.shape[2])
-    fine = F.grid_sample(frames.float() / 255, grid, padding_mode="border", align_corners=False)
-    return F.avg_pool2d(fine, OVERSAMPLING), camera.rotation
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from torch import Tensor
 from curio_train.data.photographs import CameraPoses, read_frames
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.metrics.poses import symmetry_poses
-from curio_train.refinement.crops import crop_frames
+from curio_train.networks.crop_camera import cut_crops
 from curio_train.refinement.multi_view import Estimates, consensus_poses
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, index
@@ -116,7 +116,9 @@ class PseudoLabels:
         localised_m = self._stage.perturbed(position_m, random)
         assumed_depth_m = localised_m.norm(dim=1)
         focal_px = FILL * CROP_PX * assumed_depth_m / self._stage.object.kind.diameter_m
-        crops, crop_from_cam = crop_frames(self._frames[chosen], self._matrix, localised_m, focal_px, CROP_PX)
+        crops, crop_from_cam = cut_crops(
+            self._frames[chosen].float() / 255, self._matrix, localised_m[:, None], focal_px, CROP_PX
+        )
         rotation = crop_from_cam @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
         in_crop, code[LIGHT] = ((crop_from_cam @ vector[..., None])[..., 0] for vector in (position_m, code[LIGHT]))
         gain = torch.from_numpy(random.uniform(*_GAINS, (count, 1, 1, 1))).float()

@@ -25,7 +25,8 @@ from torch import Tensor
 from curio_train.errors import UsageError
 from curio_train.geometry import rotation_angle_deg
 from curio_train.meshes.meshes import Mesh
-from curio_train.refinement.crops import Crops, PoseAndLight, PoseUpdate, crop_frames
+from curio_train.networks.crop_camera import cut_crops
+from curio_train.refinement.crops import Crops, PoseAndLight, PoseUpdate
 from curio_train.refinement.inpainting import blurred, dilated, inpainted
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, LIGHT, ROTATION_6D, TRANSLATION, SceneCode, index
@@ -196,7 +197,7 @@ class RenderAndCompare:
         """The crops around estimates, and the inpainted backgrounds."""
         position_m = code[TRANSLATION][:, 0]
         focal_px = FILL * CROP_PX * position_m.norm(dim=1) / self.diameter_m
-        found, crop_from_cam = crop_frames(images, self._matrix, position_m, focal_px, CROP_PX)
+        found, crop_from_cam = cut_crops(images.float() / 255, self._matrix, position_m[:, None], focal_px, CROP_PX)
         matrices = crop_matrices(focal_px.numpy(), CROP_PX)
         crops = Crops(found, found, found.new_zeros(len(found), 1, 1, 1), crop_from_cam, matrices, code.get(COLOR))
         silhouette, _ = self._silhouette(crops, crops.from_code(code))

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_between
-from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
+from curio_train.networks.crop_camera import cut_crops
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.templates.alignment import Aligned, align, with_gradient
 from curio_train.templates.bank import Bank
@@ -27,7 +27,6 @@ LAMP = (0.0, -0.7, -0.7)
 """The light that templates are drawn under and that is answered: it is not read from images."""
 
 _MARGIN_PX = 16  # of crops in which templates are shifted, to each side
-_OVERSAMPLING = 2
 _ALIKE_COS = 0.94  # 20 degrees between the rotations of hypotheses at one place
 _ONE_PLACE = 0.5  # diameters
 _SHARPNESS = 20.0  # of the neighbours' weights, a unit of score
@@ -196,14 +195,8 @@ class TemplateNetwork(nn.Module):
         place = positions_m.flatten(0, 1)
         depth = place.square().sum(dim=1).sqrt().clamp(min=self.geometry.near_m / 2)
         focal_px = FILL * CROP_PX * depth / self.geometry.diameter_m
-        matrix, fine_side = self._matrix.expand(place.shape[0], 3, 3), _OVERSAMPLING * side
-        camera = crop_camera_at(place, _OVERSAMPLING * focal_px, fine_side, matrix)
-        grid = sampling_grid(camera, matrix, fine_side, images.shape[3], images.shape[2])
-        # The crops of an image in one tall grid: no frame is copied.
-        tall = grid.view(-1, positions_m.shape[1] * fine_side, fine_side, 2)
-        fine = F.grid_sample(images, tall, padding_mode="border", align_corners=False)
-        crops = fine.unflatten(2, (positions_m.shape[1], fine_side)).transpose(1, 2).flatten(0, 1)
-        return F.avg_pool2d(crops, _OVERSAMPLING), camera.rotation.transpose(1, 2), depth, focal_px
+        crops, crop_from_cam = cut_crops(images, self._matrix[0], positions_m, focal_px, side)
+        return crops, crop_from_cam.transpose(1, 2), depth, focal_px
 
     def _in_crop(self, rotation: Tensor, back: Tensor, depth: Tensor) -> Aligned:
         zero = torch.zeros_like(depth)

@@ -1,6 +1,5 @@
 """The page of ``curio-view``: a scene in 3D beside its photograph, its re-rendering and their difference."""
 
-import socket
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -9,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import viser
+from curio_serve.ports import port_fault
 
 from curio_train.drawing.scenes import Placed, Scene
 from curio_train.errors import CurioError, UsageError
@@ -46,7 +46,8 @@ class Viewer:
         Raises:
             UsageError: The address cannot be listened on.
         """
-        _check_free(host, port)
+        if fault := port_fault(host, port):
+            raise UsageError(fault)
         self._pages, self._out, self._reload = list(pages), out, reload
         self._number, self._selected = 0, 0
         self._lock = threading.RLock()
@@ -194,12 +195,3 @@ class Viewer:
             if count % _STEPS_SHOWN == 0:
                 self._draw()
         self._panel.message(f"fit: done, robust residual {first:.3f} → {step.loss:.3f}")
-
-
-def _check_free(host: str, port: int) -> None:
-    """Viser takes another port without a word where this one is taken."""
-    try:
-        with socket.create_server((host, port)):
-            pass
-    except (OSError, OverflowError) as exc:
-        raise UsageError(f"cannot listen on {host}:{port} ({exc}); choose another --port or --host") from exc

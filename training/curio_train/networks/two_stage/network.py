@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.networks.base import StageNetwork
-from curio_train.networks.crop_camera import crop_camera_at, sampling_grid
+from curio_train.networks.crop_camera import cut_crops
 from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import TOP_LOG_WEIGHTS, TOP_PROPOSALS
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
@@ -22,8 +22,6 @@ SCALES, _MIDDLE = (1 / 1.18, 1.0, 1.18), 1
 """The crops of the refinement pass assume the object at these multiples of its estimated distance."""
 
 _UNCALIBRATED = 20.0  # presence logit: the confidence is the crop-pose stage's own until it is calibrated
-
-OVERSAMPLING = 2  # a crop is sampled at so many points a pixel and side, then averaged: no aliasing of near objects
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,18 +104,12 @@ class TwoStageNetwork(nn.Module):
         """
         optics, centre = self._optics, centres.flatten(0, 1)
         depth = centre.norm(dim=1, keepdim=True).clamp(min=optics.near_m)  # along the crop camera's axis
-        matrix = self._matrix.expand(centre.shape[0], 3, 3)
-        side = OVERSAMPLING * optics.crop_px
-        crop_camera = crop_camera_at(centre, optics.fill * side * depth[:, 0] / optics.diameter_m, side, matrix)
-        grid = sampling_grid(crop_camera, matrix, side, images.shape[3], images.shape[2])
-        # The crops of an image in one tall grid: no frame is copied.
-        tall = grid.view(-1, centres.shape[1] * side, side, 2)
-        fine = F.grid_sample(images, tall, padding_mode="border", align_corners=False)
-        crops = fine.unflatten(2, (centres.shape[1], side)).transpose(1, 2).flatten(0, 1)
-        code = self.second(F.avg_pool2d(crops, OVERSAMPLING))
+        focal_px = optics.fill * optics.crop_px * depth[:, 0] / optics.diameter_m
+        crops, crop_from_cam = cut_crops(images, self._matrix[0], centres, focal_px, optics.crop_px)
+        code = self.second(crops)
         relative = code[TRANSLATION][:, 0]
         position = torch.cat([relative[:, :2] * optics.diameter_m, relative[:, 2:] * depth], dim=-1)
-        cam_from_crop = crop_camera.rotation.transpose(1, 2)
+        cam_from_crop = crop_from_cam.transpose(1, 2)
         rotation = cam_from_crop @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
         return {name: code[name] for name in (COLOR,) if name in code} | {
             _VISIBILITY: _visibility(code[OBJECT_COORDINATES]),
