@@ -20,8 +20,9 @@ class RenderCommand:
     """Lines of curio-detect, or of {"world": NAME, "code": {FIELD: numbers}}; or one such JSON object."""
     out: Path
     """Folder for the files, one a scene."""
-    format: Literal["png", "glb"] = "png"
-    """png: a picture. glb: objects, light and camera in three dimensions, for Blender and other 3D applications."""
+    format: Literal["png", "glb", "usd", "rrd"] = "png"
+    """png: a picture. glb, usd: objects, light and camera in three dimensions, for Blender and other 3D applications.
+    rrd: one Rerun recording of all scenes, with photographs, boxes and confidence over time."""
     mesh: tuple[str, ...] = ()
     """Mesh file of the objects, or NAME=FILE for each kind of them; a code's world brings its own."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None

@@ -1,6 +1,7 @@
 """A file of scenes to a folder of pictures, or of files for 3D applications."""
 
-from collections.abc import Iterator, Sequence
+import importlib.util
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,9 @@ from curio_train.drawing.scenes import Scene, mesh_world, read_scenes
 from curio_train.errors import DataError, UsageError
 from curio_train.meshes.meshes import Unit, load_mesh
 
-Format = Literal["png", "glb"]
+Format = Literal["png", "glb", "usd", "rrd"]
+_PACKAGES = {"usd": "pxr", "rrd": "rerun"}
+_EXTRAS = {"usd": "usd", "rrd": "rerun"}
 
 
 def draw(
@@ -25,7 +28,7 @@ def draw(
     options: RenderOptions,
     form: Format = "png",
 ) -> Iterator[Path]:
-    """Draw every scene of a file and yield the paths as they are written.
+    """Draw every scene of a file and yield the paths as they are written, one a scene, or one recording of all.
 
     Args:
         scenes: See :func:`~curio_train.drawing.scenes.read_scenes`.
@@ -34,24 +37,54 @@ def draw(
         mesh_unit: Of their coordinates; the file's own unless given.
         world: Generated world that brings meshes, light and ground; a code names its own.
         options: How to draw pictures.
-        form: ``png``: pictures. ``glb``: objects, light and camera in three dimensions.
+        form: ``png``: pictures. ``glb`` and ``usd``: objects, light and camera in three dimensions. ``rrd``: one Rerun
+            recording, with photographs, cameras, boxes and confidence over time.
 
     Raises:
-        UsageError: Both meshes and a world, or neither where one is needed.
+        UsageError: Both meshes and a world, or neither where one is needed; or the format's extra is not installed.
         DataError: The file of scenes, a photograph or the folder.
         MeshError: A mesh.
         RendererError: No usable libLLVM.
     """
     if meshes and world:
         raise UsageError("--mesh and --world exclude each other: a world brings its own meshes")
+    if form in _PACKAGES and importlib.util.find_spec(_PACKAGES[form]) is None:
+        raise UsageError(f"--format {form} needs the extra {_EXTRAS[form]}: pip install 'curio-pose[{_EXTRAS[form]}]'")
     given = SceneContext.of_world(mesh_world(world)) if world else scene_context(meshes, mesh_unit)
+    drawn = _with_context(scenes, given)
+    if form == "rrd":
+        yield _recorded(out / f"{scenes.stem}.rrd", drawn)
+        return
+    for scene, around in drawn:
+        path = out / f"{scene.name}.{form}"
+        _write(path, _content(scene, around, options, form))
+        yield path
+
+
+def _with_context(scenes: Path, given: SceneContext | None) -> Iterator[tuple[Scene, SceneContext]]:
     for scene in scenes_of(scenes):
         around = SceneContext.of_world(mesh_world(scene.world)) if scene.world else given
         if around is None:
             raise UsageError(f"{scenes}: detections don't say what the objects look like; add --mesh FILE or --world")
-        path = out / f"{scene.name}.{form}"
-        _write(path, to_glb(scene, around) if form == "glb" else _png(picture(scene, around, options)))
-        yield path
+        yield scene, around
+
+
+def _content(scene: Scene, around: SceneContext, options: RenderOptions, form: Format) -> bytes:
+    if form == "png":
+        return _png(picture(scene, around, options))
+    if form == "glb":
+        return to_glb(scene, around)
+    from curio_train.drawing.usd import to_usd  # of an extra
+
+    return to_usd(scene, around)
+
+
+def _recorded(path: Path, scenes: Iterable[tuple[Scene, SceneContext]]) -> Path:
+    from curio_train.drawing.recording import write_recording  # of an extra
+
+    _make_folder(path.parent)
+    write_recording(path, scenes)
+    return path
 
 
 def scenes_of(file: Path) -> Iterator[Scene]:
@@ -87,8 +120,15 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def _write(path: Path, content: bytes) -> None:
+    _make_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
     except OSError as exc:
         raise DataError(f"{path}: the file cannot be written ({exc.strerror}); choose another --out") from exc
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise DataError(f"{folder}: the folder cannot be made ({exc.strerror}); choose another --out") from exc

@@ -12,20 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import trimesh
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
-from curio_train.color import linear_from_srgb
-from curio_train.drawing.pictures import LIGHT, SceneContext
+from curio_train.drawing.axes import GL_FROM_CV, embed, light_of, linear, pose_matrix, root_from_camera, towards_light
+from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Placed, Scene
 from curio_train.errors import DataError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import Mesh
 
-_GLTF_FROM_CV = np.diag([1.0, -1.0, -1.0])
-_Y = np.array([0.0, 1.0, 0.0])
 _LUX = math.pi  # of a directional light of strength 1: the irradiance of a surface that faces it
 _CAMERA, _SUN = "camera", "light"
 _EXTRAS = "curio"
@@ -40,15 +36,14 @@ def to_glb(scene: Scene, context: SceneContext) -> bytes:
         DataError: An object has no mesh.
     """
     out = trimesh.Scene(base_frame="world")
-    root = _root_from_camera(context)
+    root = root_from_camera(context)
     for number, item in enumerate(scene.objects):
-        matrix = root @ _matrix(item.pose)
+        matrix = root @ pose_matrix(item.pose)
         extras = {"object": item.kind, "color": list(item.color_srgb), "confidence": item.confidence}
         name = f"{number:02d}-{item.kind}"
         geometry = _geometry(context.mesh(item.kind), item)
         out.add_geometry(geometry, geom_name=name, node_name=name, transform=matrix, metadata={_EXTRAS: extras})
-    light = scene.light if scene.light is not None else context.light
-    light = np.array(LIGHT) if light is None else light
+    light = light_of(scene, context)
 
     def add_camera_and_light(tree: dict[str, Any]) -> None:
         _add_camera(tree, scene, root, context.ambient)
@@ -69,7 +64,7 @@ def from_glb(path: Path) -> Scene:
     camera = nodes.pop(_CAMERA, None)
     if camera is None:
         raise DataError(f"{path}: found no camera written by curio; expected a file of curio-render --format glb")
-    cam_from_root = np.linalg.inv(_node_matrix(camera) @ _embed(_GLTF_FROM_CV))
+    cam_from_root = np.linalg.inv(_node_matrix(camera) @ embed(GL_FROM_CV))
     sun = nodes.pop(_SUN)
     strength = tree["extensions"]["KHR_lights_punctual"]["lights"][0]["intensity"] / _LUX
     about = camera["extras"][_EXTRAS]
@@ -85,39 +80,9 @@ def from_glb(path: Path) -> Scene:
     )
 
 
-def _root_from_camera(context: SceneContext) -> np.ndarray:
-    """Rotation of the camera's axes to glTF's with the scene's up direction along +y, [4, 4]."""
-    up = _GLTF_FROM_CV @ np.asarray(context.up, dtype=np.float64)
-    return _embed(_rotation_onto(up, _Y) @ _GLTF_FROM_CV)
-
-
-def _rotation_onto(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """A rotation [3, 3] that turns one direction into another."""
-    rotation, _ = Rotation.align_vectors(target[None], source[None])
-    matrix: np.ndarray = rotation.as_matrix()
-    return matrix
-
-
-def _linear(srgb: object) -> np.ndarray:
-    values: np.ndarray = linear_from_srgb(torch.as_tensor(np.array(srgb, dtype=np.float64))).numpy()
-    return values
-
-
-def _embed(rotation: np.ndarray) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    return matrix
-
-
-def _matrix(pose: Pose) -> np.ndarray:
-    matrix = _embed(pose.rotation)
-    matrix[:3, 3] = pose.translation_m
-    return matrix
-
-
 def _geometry(mesh: Mesh, item: Placed) -> Any:
     """The mesh in its own colours times the object's, as transparent as the object is uncertain."""
-    factor = [*_linear(item.color_srgb), item.confidence]
+    factor = [*linear(item.color_srgb), item.confidence]
     material = trimesh.visual.material.PBRMaterial(
         baseColorFactor=factor,
         baseColorTexture=None if mesh.texture is None else Image.fromarray(mesh.texture),
@@ -130,7 +95,7 @@ def _geometry(mesh: Mesh, item: Placed) -> Any:
         out.visual = trimesh.visual.TextureVisuals(uv=mesh.uv, material=material)
         return out
     # glTF multiplies a vertex's colour in linear light.
-    albedo = _linear(mesh.vertex_colors_srgb) * factor[:3]
+    albedo = linear(mesh.vertex_colors_srgb) * factor[:3]
     alpha = np.full((len(albedo), 1), item.confidence)
     out.visual = trimesh.visual.ColorVisuals(
         out, vertex_colors=np.rint(255 * np.hstack([albedo, alpha])).astype(np.uint8)
@@ -155,14 +120,12 @@ def _add_camera(tree: dict[str, Any], scene: Scene, root: np.ndarray, ambient: f
         "world": scene.world,
     }
     # A glTF camera looks along −z with y up, the scene's along +z with y down.
-    _add_node(tree, _CAMERA, root @ _embed(_GLTF_FROM_CV), {"camera": 0, "extras": {_EXTRAS: about}})
+    _add_node(tree, _CAMERA, root @ embed(GL_FROM_CV), {"camera": 0, "extras": {_EXTRAS: about}})
 
 
 def _add_light(tree: dict[str, Any], light: np.ndarray) -> None:
     """A directional light, which shines along −z of its node; ``light`` points towards it, in glTF's frame."""
-    strength = float(np.linalg.norm(light))
-    towards = light / strength if strength else _Y
-    matrix = _embed(_rotation_onto(np.array([0.0, 0.0, 1.0]), towards))
+    matrix, strength = towards_light(light)
     lights = [{"type": "directional", "intensity": strength * _LUX}]
     tree.setdefault("extensions", {})["KHR_lights_punctual"] = {"lights": lights}
     tree.setdefault("extensionsUsed", []).append("KHR_lights_punctual")

@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from curio_train.errors import UsageError
+from curio_train.meshes.inset import inset
+from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.templates.bank import NUM_POINTS, RANK, Bank
 from curio_train.templates.drawing import LOOKS, CropEasel, Easel
@@ -33,7 +35,8 @@ from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _NUM_FRAMES, _NUM_CROPS = 24, 256  # of backgrounds
 _SEED = 20_211
-_BATCH = 64
+_BATCH = 64  # of drawings
+_FEATURES_BATCH = 8  # of pictures: larger feature maps are allocated anew each time, which takes five times as long
 _PAD_CELLS = 2  # around localising templates, so that no kernel sees the picture's border
 _INSIDE = 0.98  # of the pixels around a surface point show the object
 
@@ -81,15 +84,16 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> Non
     geometry = network.geometry
     backgrounds = world.backgrounds(cache).split(True)
     frames = backgrounds.draw(_NUM_FRAMES, geometry.width, geometry.height, (_SEED, 0))
-    _fill_localiser(network.localiser, network.trunk, geometry, world, frames)
+    mesh = inset(world.object.mesh, world.object.scan_excess_m)
+    _fill_localiser(network.localiser, network.trunk, geometry, mesh, frames)
     width_m = geometry.width / geometry.focal_px  # of a frame at a distance of 1 m
     least, largest = (geometry.diameter_m / FILL / (width_m * depth) for depth in (geometry.far_m, geometry.near_m))
     crops = backgrounds.of_crops(least, largest).draw(_NUM_CROPS, CROP_PX, CROP_PX, (_SEED, 1))
-    _fill_bank(network.bank, network.trunk, geometry, world, crops)
+    _fill_bank(network.bank, network.trunk, geometry, mesh, crops)
 
 
 def _fill_localiser(
-    localiser: Localiser, trunk: Trunk, geometry: Geometry, world: SingleObjectWorld, frames: Tensor
+    localiser: Localiser, trunk: Trunk, geometry: Geometry, mesh: Mesh, frames: Tensor
 ) -> None:
     """Templates over grey at every distance, whitened by the backgrounds, then their scores there."""
     background = torch.cat([trunk(F.avg_pool2d(frame[None], FRAME_STRIDE))[1] for frame in frames])
@@ -99,10 +103,10 @@ def _fill_localiser(
     for depth in geometry.depths_m:
         cells = geometry.kernel_cells(depth)
         side = (cells + 2 * _PAD_CELLS - 1) * COARSE_STRIDE + 1
-        easel = Easel(world.object.mesh, depth, geometry.focal_px / FRAME_STRIDE, side)
+        easel = Easel(mesh, depth, geometry.focal_px / FRAME_STRIDE, side)
         drawn = [easel.draw(some) for some in rotations.split(_BATCH)]
         kernel = slice(_PAD_CELLS, _PAD_CELLS + cells)
-        seen = torch.cat([trunk(some.over(0, torch.tensor(0.5)))[1] for some in drawn])
+        seen = torch.cat([_features(trunk, some.over(0, torch.tensor(0.5)))[1] for some in drawn])
         alpha = torch.cat([some.alpha for some in drawn])
         features.append(seen[:, :, kernel, kernel])
         masks.append(alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE][:, :, kernel, kernel])
@@ -127,32 +131,37 @@ def _standardise(localiser: Localiser, descriptors: Tensor) -> None:
         localiser.offsets[number] = -mean / spread.clamp(min=1e-6)
 
 
-def _fill_bank(bank: Bank, trunk: Trunk, geometry: Geometry, world: SingleObjectWorld, crops: Tensor) -> None:
+def _fill_bank(bank: Bank, trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> None:
     """Descriptors averaged over lamps and backgrounds: what changes with either counts less."""
     depth, random = geometry.typical_m, np.random.default_rng(_SEED)
     focal_px = FILL * CROP_PX * depth / geometry.diameter_m
-    easel = CropEasel(world.object.mesh, depth, geometry.focal_px, focal_px, CROP_PX)
+    easel = CropEasel(mesh, depth, geometry.focal_px, focal_px, CROP_PX)
     fine, coarse, alphas = [], [], []  # features of every look, batch after batch
     for rotations in bank.rotations.split(_BATCH):
         drawn = easel.draw(rotations)
         behind = [crops[torch.from_numpy(random.integers(0, len(crops), len(rotations)))] for _ in LOOKS]
-        seen = [trunk(drawn.over(n, behind[n], exposure)) for n, (_, exposure) in enumerate(LOOKS)]
+        seen = [_features(trunk, drawn.over(n, behind[n], exposure)) for n, (_, exposure) in enumerate(LOOKS)]
         fine.append(torch.stack([one for one, _ in seen]))
         coarse.append(torch.stack([one for _, one in seen]))
         alphas.append(drawn.alpha)
-    background = [trunk(some) for some in crops.split(_BATCH)]
+    fine_background, coarse_background = _features(trunk, crops)
     alpha, of_coarse = torch.cat(alphas), torch.cat(coarse, dim=1)
     covered = alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE]
-    bank.coarse.compress(bank.coarse.whiten(torch.cat([one for _, one in background])), of_coarse[0], covered)
+    bank.coarse.compress(bank.coarse.whiten(coarse_background), of_coarse[0], covered)
     filters, weights = _low_rank(_mean_cosine(_sum(bank.coarse(look) for look in of_coarse), covered), RANK)
     bank.filters.copy_(filters)
     bank.weights.copy_(weights)
     inside = _inside(alpha)
     of_object = torch.cat([some[0] for some in fine]).movedim(1, 0)[:, inside].mean(dim=1)
-    bank.fine.mean.copy_((torch.cat([one for one, _ in background]).mean(dim=(0, 2, 3)) + of_object) / 2)
+    bank.fine.mean.copy_((fine_background.mean(dim=(0, 2, 3)) + of_object) / 2)
     described = torch.cat([F.normalize(_sum(bank.fine(look) for look in some), dim=1) for some in fine])
-    points = _surface_points(world, bank.rotations, depth, focal_px)
+    points = _surface_points(mesh, bank.rotations, depth, focal_px)
     _store_points(bank, inside, described, points / geometry.diameter_m)
+
+
+def _features(trunk: Trunk, pictures: Tensor) -> tuple[Tensor, Tensor]:
+    fine, coarse = zip(*(trunk(some) for some in pictures.split(_FEATURES_BATCH)), strict=True)
+    return torch.cat(fine), torch.cat(coarse)
 
 
 def _sum(of_looks: Iterable[Tensor]) -> Tensor:
@@ -166,10 +175,10 @@ def _inside(alpha: Float[Tensor, "templates 1 side side"]) -> Bool[Tensor, "temp
 
 
 def _surface_points(
-    world: SingleObjectWorld, rotations: Tensor, depth_m: float, focal_px: float
+    mesh: Mesh, rotations: Tensor, depth_m: float, focal_px: float
 ) -> Float[Tensor, "templates 3 cells cells"]:
     """The point of the object, metres, that the centre of each cell of stride 4 sees."""
-    surface = ObjectCoordinateMap(world.object.mesh, CROP_PX)
+    surface = ObjectCoordinateMap(mesh, CROP_PX)
     middle = (CROP_PX - 1) / 2
     matrix = np.array([[focal_px, 0, middle], [0, focal_px, middle], [0, 0, 1]])
     position = torch.tensor([0.0, 0.0, depth_m])

@@ -31,6 +31,8 @@ from curio_train.worlds.single_object.world import Object, SingleObjectWorld, po
 
 SIDE_PX = 128
 NEAR_M, FAR_M = 0.5, 1.5
+SCAN_EXCESS_M = 1e-3
+"""By which the data set's scanned meshes are too thick on every side (docs/experiments/real_photographs.md)."""
 
 _log = logging.getLogger(__name__)
 
@@ -125,7 +127,7 @@ def build(options: LinemodOptions) -> SingleObjectWorld:
         others = [dataset.mesh(other) for other in dataset.classes if other != name]
         return ClutterBackgrounds.cached(cache, others)
 
-    object_ = Object(kind, mesh, dataset.camera, NEAR_M, FAR_M, backgrounds)
+    object_ = Object(kind, mesh, dataset.camera, NEAR_M, FAR_M, backgrounds, scan_excess_m=SCAN_EXCESS_M)
     if not options.gaze:
         layout = pose_layout(position_field(object_), confidence=False)
         return SingleObjectWorld("linemod", object_, squeezed(dataset.camera, SIDE_PX), layout)

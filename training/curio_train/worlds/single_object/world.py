@@ -73,6 +73,8 @@ class Object:
     """Prior of these base colours."""
     known_scene: bool = False
     """Its background and the light there are known."""
+    scan_excess_m: float = 0.0
+    """How far the mesh's surface lies outside the real one: depth fusion makes scanned objects too thick."""
 
 
 class SingleObjectWorld(World):
