@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from curio_train.metrics.calibration import auroc, calibration_error, fit_calibration
+from curio_train.metrics.calibration import auroc, calibration_error, fit_calibration, reliability_bins
 
 
 def test_a_confidence_that_is_right_as_often_as_it_says_has_no_error() -> None:
@@ -63,3 +63,10 @@ def test_calibration_stays_finite_where_all_is_right() -> None:
     weights = fit_calibration([[0.0], [0.4], [13.0]], [True] * 3)
     assert np.isfinite(weights).all()
     assert weights[0] > 0
+
+
+def test_reliability_counts_every_prediction_once() -> None:
+    bins = reliability_bins([0.0, 0.05, 0.51, 0.59, 1.0], [False, True, True, True, True])
+    assert [(b["from"], b["to"], b["count"]) for b in bins] == [(0.0, 0.1, 2), (0.5, 0.6, 2), (0.9, 1.0, 1)]
+    assert [b["correct"] for b in bins] == [0.5, 1.0, 1.0]
+    assert [b["confidence"] for b in bins] == pytest.approx([0.025, 0.55, 1.0])

@@ -19,11 +19,13 @@ from curio_train.config import WorldOptions
 from curio_train.errors import ReportError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.report import REPORT_FILE, report_training
+from curio_train.evaluation.report_figures import reliability
+from curio_train.metrics.calibration import reliability_bins
 from curio_train.worlds.options import CirclesOptions, LightOptions
 
 WriteRun = Callable[..., Path]
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-PICTURE = re.compile(r'<img id="(\w+)"[^>]* src="data:image/png;base64,([^"]+)"')
+PICTURE = re.compile(r'<img id="([\w-]+)"[^>]* src="data:image/png;base64,([^"]+)"')
 SIZES = """<script>
 onload = () => { document.body.dataset.sizes = JSON.stringify(
     Object.fromEntries([...document.images].map(image => [image.id, [image.naturalWidth, image.naturalHeight]]))) }
@@ -104,6 +106,25 @@ def test_stages_of_training_are_shown(tmp_path: Path) -> None:
     page = (run / REPORT_FILE).read_text()
     assert page.count('class="stage"') == len(stages)
     assert f"after {stages[-1]} images" in page
+
+
+def test_the_error_is_shown_over_time(tmp_path: Path, write_run: WriteRun) -> None:
+    run = write_run(tmp_path / "run")
+    rows = [{"step": n, "images": n, "seconds": 60.0 * n, "image_dssim": 0.2 / n} for n in range(1, 4)]
+    for noted, shown in ((1, False), (3, True)):  # one point is no curve
+        (run / "history.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows[:noted]))
+        report_training(run, tmp_path)
+        assert ("error-over-time" in pictures((run / REPORT_FILE).read_text())) == shown
+
+
+def test_reliability_is_drawn_bin_by_bin() -> None:
+    bins = reliability_bins([0.05, 0.95, 0.95, 0.95, 0.95], [False, True, True, True, False])
+    png = base64.b64decode(reliability({"renderings": bins}).split(",")[1])
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    blue = (picture[..., 0] > 200) & (picture[..., 2] < 100)  # OpenCV's order is BGR
+    rows, columns = np.nonzero(blue)
+    assert np.ptp(columns) < 0.12 * picture.shape[1]  # one bar, of the tenth bin
+    assert np.ptp(rows) > 0.4 * picture.shape[0]  # three quarters high
 
 
 def test_what_stops_a_report_is_said(tmp_path: Path, write_run: WriteRun) -> None:

@@ -19,7 +19,7 @@ from curio_train.export.card import EVALUATION_FILE
 from curio_train.learning.runs.configuration import CONFIG_FILE, world_name
 from curio_train.learning.runs.initial import uses_synthetic_labels
 from curio_train.learning.runs.provenance import machine
-from curio_train.metrics.calibration import auroc, calibration_error
+from curio_train.metrics.calibration import auroc, calibration_error, reliability_bins
 from curio_train.metrics.poses import ADD_THRESHOLD
 from curio_train.refinement.render_and_compare import with_refinement
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
@@ -70,7 +70,8 @@ def evaluate(
             either.
 
     Returns:
-        What was evaluated, ``metrics`` by name, the same of the network before its first step as ``untrained``, and
+        What was evaluated, ``metrics`` by name, the same of the network before its first step as ``untrained``,
+        ``reliability`` of the confidence where one object has one, and
         ``real`` where real frames were scored, ``photographs`` where there are some to judge by, and
         ``refined`` with ``metrics`` and ``real`` of refined poses. A run folder gets it as well, and a report.
 
@@ -90,6 +91,8 @@ def evaluate(
     result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images)}
     progress("the network")
     predicted, result["metrics"] = _scored(subject.world, subject.predict, held_out)
+    if held_out.empty is not None:
+        result["reliability"] = reliability_bins(*_confidences(subject.world, predicted, held_out.code))
     progress("the same network untrained")
     _, result["untrained"] = _scored(subject.world, subject.untrained(), held_out)
     if data is not None:
@@ -152,13 +155,18 @@ def calibration(world: World, predicted: SceneCode, true: SceneCode, on_empty: S
 
     Once as the probability that ADD(-S) is below a tenth of the diameter, once as a sign that the object is there.
     """
+    confidences, correct = _confidences(world, predicted, true)
+    return {
+        "confidence_ece": calibration_error(confidences, correct),
+        "present_auroc": auroc(confidences, on_empty[CONFIDENCE].flatten().tolist()),
+    }
+
+
+def _confidences(world: World, predicted: SceneCode, true: SceneCode) -> tuple[list[float], list[bool]]:
+    """Confidence of each pose, and whether its ADD(-S) is below a tenth of the diameter."""
     assert isinstance(world, SingleObjectWorld)
     errors = add_errors(poses(predicted), poses(true), world.object.mesh.vertices_m, world.objects[0].info)
-    confidences, without = (code[CONFIDENCE].flatten().tolist() for code in (predicted, on_empty))
-    return {
-        "confidence_ece": calibration_error(confidences, [error < ADD_THRESHOLD for error in errors]),
-        "present_auroc": auroc(confidences, without),
-    }
+    return predicted[CONFIDENCE].flatten().tolist(), [error < ADD_THRESHOLD for error in errors]
 
 
 def _scored(world: World, predict: Predict, held_out: HeldOut) -> tuple[SceneCode, dict[str, float]]:

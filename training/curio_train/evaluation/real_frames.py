@@ -23,6 +23,7 @@ from curio_train.errors import DataError, UsageError
 from curio_train.evaluation.scores import add_errors, pose_scores, rotation_errors_deg
 from curio_train.evaluation.subject import Subject
 from curio_train.geometry import Pose
+from curio_train.metrics.calibration import reliability_bins
 from curio_train.metrics.poses import (
     ADD_THRESHOLD,
     bootstrap_interval,
@@ -86,6 +87,8 @@ def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None,
     points = dataset.evaluation_mesh(kind.name).vertices_m
     info = kind.info
     seen = [pair for pair in pairs if (pair[1].visible_fraction or 0) >= VISIBLE]
+    rows = [_row(e, target, points, info) for e, target in pairs]
+    correct = [row["add_diameters"] < ADD_THRESHOLD for row in rows]
     return {
         "dataset": data.resolve().name,
         "split": SPLIT,
@@ -94,7 +97,8 @@ def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None,
         "num_targets_visible_80": len(seen),
         "metrics": _metrics(pairs, points, info) | _recall_visible(seen, points, info),
         "by_visibility": _by_visibility(pairs, points, info),
-        "targets": [_row(e, target, points, info) for e, target in pairs],
+        "reliability": reliability_bins([estimate.confidence for estimate, _ in pairs], correct),
+        "targets": rows,
     }
 
 

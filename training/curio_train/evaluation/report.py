@@ -95,6 +95,7 @@ def _page(
     columns = (batch.images, rendered, novel_view(world, code).clamp(0, 1))
     shown = errors or {"image_dssim": dssim(rendered, batch.images)}
     made, judgement = run_sessions(run), judge(world, subject.predict)
+    history = read_history(run)
     pages = Environment(loader=PackageLoader("curio_train.evaluation", ""), autoescape=True)
     return pages.get_template("report.html.jinja").render(
         title=f"{world_name(config)}, {config.method}, seed {config.seed}",
@@ -106,7 +107,9 @@ def _page(
         samples=figures.samples([column[:_NUM_SAMPLES] for column in columns]),
         judgement=judgement,
         judged=None if judgement is None else _judged(judgement),
-        curves=figures.curves(read_history(run)),
+        curves=figures.curves(history),
+        error_over_time=figures.error_over_time(history),
+        reliability=_reliability(evaluation or {}),
         histograms=figures.histograms({label(name): values for name, values in shown.items()}),
         scores=_scores(evaluation or {}),
         configuration=(run / CONFIG_FILE).read_text(encoding="utf-8"),
@@ -133,6 +136,13 @@ def _facts(subject: Subject, made: list[RunSession]) -> dict[str, str]:
         "system": f"{platform.system()} {platform.release()}, Python {platform.python_version()}",
         "libraries": ", ".join(f"{name} {number}" for name, number in versions.items()),
     }
+
+
+def _reliability(evaluation: Mapping[str, Any]) -> str | None:
+    """The reliability diagrams of whatever was scored; None if its poses have no confidence."""
+    found = {"renderings": evaluation, "real frames": evaluation.get("real", {})}
+    bins = {name: scored["reliability"] for name, scored in found.items() if "reliability" in scored}
+    return figures.reliability(bins) if bins else None
 
 
 def _scores(evaluation: Mapping[str, Any]) -> list[tuple[str, str, str]]:

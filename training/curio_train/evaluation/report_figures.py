@@ -9,10 +9,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from curio_train.learning.runs.progress import IMAGE_ERROR
+
 _DPI = 90
 _PANELS_A_ROW = 3
 HEADINGS = ("input", "prediction", "novel view")
-_NOT_LOSSES = ("step", "images", "seconds")
+_NOT_LOSSES = ("step", "images", "seconds", IMAGE_ERROR)
 
 
 def samples(columns: Sequence[Tensor], headings: Sequence[str] = HEADINGS, captions: Sequence[str] = ()) -> str:
@@ -53,6 +55,38 @@ def curves(rows: Sequence[Mapping[str, Any]]) -> str:
     if not names:
         panels[0].text(0.5, 0.5, "too few steps for a curve", ha="center", va="center")
         panels[0].set_axis_off()
+    return _uri(figure)
+
+
+def error_over_time(rows: Sequence[Mapping[str, Any]]) -> str | None:
+    """The image error of re-renderings over the minutes of training; None if fewer than two were noted.
+
+    Args:
+        rows: Of ``history.jsonl``.
+    """
+    noted = [(row["seconds"] / 60, row[IMAGE_ERROR]) for row in rows if IMAGE_ERROR in row]
+    if len(noted) < 2:
+        return None
+    figure, (panel,) = _panels(1)
+    panel.plot(*np.array(noted).T, color="#ea4335", linewidth=1.2, marker=".")
+    panel.set(xlabel="minutes of training", ylabel="image error (DSSIM)", ylim=(0, None), xlim=(0, None))
+    return _uri(figure)
+
+
+def reliability(sets: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
+    """How often poses of each confidence are correct: on the diagonal, confidence is a probability.
+
+    Args:
+        sets: Bins of :func:`~curio_train.metrics.calibration.reliability_bins` by what was scored.
+    """
+    figure, panels = _panels(len(sets))
+    for panel, (name, bins) in zip(panels, sets.items(), strict=True):
+        panel.plot([0, 1], [0, 1], color="black", linestyle="--", linewidth=1)
+        width = [bin_["to"] - bin_["from"] for bin_ in bins]
+        panel.bar([b["from"] for b in bins], [b["correct"] for b in bins], width, align="edge", color="#4285f4")
+        for bin_ in bins:
+            panel.text((bin_["from"] + bin_["to"]) / 2, 0.01, bin_["count"], ha="center", va="bottom", fontsize=7)
+        panel.set(title=name, xlabel="confidence", ylabel="fraction correct", xlim=(0, 1), ylim=(0, 1))
     return _uri(figure)
 
 

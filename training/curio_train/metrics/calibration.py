@@ -21,12 +21,37 @@ def calibration_error(confidences: Sequence[float], correct: Sequence[bool]) -> 
     Raises:
         ValueError: There are no predictions.
     """
-    found, hits = np.asarray(confidences, dtype=np.float64), np.asarray(correct, dtype=np.float64)
-    if len(found) == 0:
+    if len(confidences) == 0:
         raise ValueError("calibration of no confidences: there must be at least one")
+    gaps = [
+        bin_["count"] * abs(bin_["confidence"] - bin_["correct"]) for bin_ in reliability_bins(confidences, correct)
+    ]
+    return float(sum(gaps) / len(confidences))
+
+
+def reliability_bins(confidences: Sequence[float], correct: Sequence[bool]) -> list[dict[str, float]]:
+    """The ten equal bins of confidence that are not empty, lowest first.
+
+    Args:
+        confidences: In [0, 1].
+        correct: Whether each prediction was.
+
+    Returns:
+        Of each bin its borders ``from`` and ``to``, the ``count`` of predictions in it, their mean ``confidence``, and
+        the fraction ``correct``.
+    """
+    found, hits = np.asarray(confidences, dtype=np.float64), np.asarray(correct, dtype=np.float64)
     bins = np.minimum((found * NUM_BINS).astype(int), NUM_BINS - 1)
-    gaps = [abs((found - hits)[bins == number].sum()) for number in range(NUM_BINS)]
-    return float(sum(gaps) / len(found))
+    return [
+        {
+            "from": number / NUM_BINS,
+            "to": (number + 1) / NUM_BINS,
+            "count": int((bins == number).sum()),
+            "confidence": float(found[bins == number].mean()),
+            "correct": float(hits[bins == number].mean()),
+        }
+        for number in np.unique(bins).tolist()
+    ]
 
 
 def fit_calibration(features: ArrayLike, correct: Sequence[bool]) -> list[float]:

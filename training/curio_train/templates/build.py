@@ -1,6 +1,7 @@
 """A template network made from a mesh: templates drawn, described and compressed; nothing is trained."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,13 @@ def template_network(world: World) -> TemplateNetwork:
     )
 
 
+def without_scan_excess(world: TwoStageWorld) -> TwoStageWorld:
+    """The world with its object as thick as the real one."""
+    object_ = world.object
+    thinner = replace(object_, mesh=inset(object_.mesh, object_.scan_excess_m), scan_excess_m=0.0)
+    return TwoStageWorld(world.name, thinner, world.photographs)
+
+
 @torch.no_grad()
 def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> None:
     """Draw and store all templates.
@@ -84,7 +92,7 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> Non
     geometry = network.geometry
     backgrounds = world.backgrounds(cache).split(True)
     frames = backgrounds.draw(_NUM_FRAMES, geometry.width, geometry.height, (_SEED, 0))
-    mesh = inset(world.object.mesh, world.object.scan_excess_m)
+    mesh = world.object.mesh
     _fill_localiser(network.localiser, network.trunk, geometry, mesh, frames)
     width_m = geometry.width / geometry.focal_px  # of a frame at a distance of 1 m
     least, largest = (geometry.diameter_m / FILL / (width_m * depth) for depth in (geometry.far_m, geometry.near_m))
@@ -92,9 +100,7 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> Non
     _fill_bank(network.bank, network.trunk, geometry, mesh, crops)
 
 
-def _fill_localiser(
-    localiser: Localiser, trunk: Trunk, geometry: Geometry, mesh: Mesh, frames: Tensor
-) -> None:
+def _fill_localiser(localiser: Localiser, trunk: Trunk, geometry: Geometry, mesh: Mesh, frames: Tensor) -> None:
     """Templates over grey at every distance, whitened by the backgrounds, then their scores there."""
     background = torch.cat([trunk(F.avg_pool2d(frame[None], FRAME_STRIDE))[1] for frame in frames])
     whitening = localiser.descriptors.whiten(background)

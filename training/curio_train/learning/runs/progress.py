@@ -2,7 +2,8 @@
 
 ::
 
-    RUN/history.jsonl     one line every few steps: step, images, seconds, and each loss averaged since the line before
+    RUN/history.jsonl     one line every few steps: step, images, seconds, and each loss averaged since the line before;
+                          and one a checkpoint with the image error (DSSIM) of the re-renderings of the same images
         tensorboard/      the same curves, and input | re-rendering pairs
         samples.png       the latest pairs: inputs above, re-renderings below
         stages/IMAGES.png the same at stages of training: after so many images, each stage twice as long as before
@@ -25,6 +26,10 @@ from torch.utils.tensorboard import SummaryWriter
 
 from curio_train.errors import CheckpointError
 from curio_train.learning.state import TrainingProgress
+from curio_train.metrics.images import dssim
+
+IMAGE_ERROR = "image_dssim"
+"""Key of the image error in lines of the history."""
 
 _HISTORY, _STAGES = "history.jsonl", "stages"
 _STEPS_A_LINE = 20  # of history and curves
@@ -70,7 +75,8 @@ class Reporter:
             self._show(text, spent)
 
     def pictures(self, pairs: tuple[Tensor, Tensor]) -> None:
-        """Save pairs of inputs and re-renderings, [num, 3, height, width] each, as a picture."""
+        """Save pairs of inputs and re-renderings, [num, 3, height, width] each, as a picture, and note their DSSIM."""
+        error = float(dssim(*(images.cpu().clamp(0, 1) for images in pairs)).mean())
         sheet = torch.cat([torch.cat(list(images.cpu()), dim=2) for images in pairs], dim=1).clamp(0, 1)
         pixels = (sheet * 255).round().byte().permute(1, 2, 0).numpy()
         _, png = cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
@@ -81,6 +87,7 @@ class Reporter:
                 (self._run / _STAGES / f"{self._progress.images:09d}.png").write_bytes(png.tobytes())
             self._curves.add_image("input above, re-rendering below", sheet, self._progress.step)
             (self._run / "samples.png").write_bytes(png.tobytes())
+            self._write({IMAGE_ERROR: error})
 
     def close(self) -> None:
         """Write what is not yet on disk, and end the bar."""
@@ -96,9 +103,7 @@ class Reporter:
         images, seconds = now.images - self._since[1], now.seconds - self._since[2]
         means = {name: value / self._counts[name] for name, value in self._sums.items()}
         rate = images / max(seconds, 1e-9)
-        row = {"step": now.step, "images": now.images, "seconds": round(now.seconds, 3), **means}
-        self._history.write(json.dumps(row) + "\n")
-        self._history.flush()
+        self._write(means)
         for name, value in means.items():
             self._curves.add_scalar(f"loss/{name}", value, now.step)
         self._curves.add_scalar("images_per_second", rate, now.step)
@@ -107,6 +112,12 @@ class Reporter:
         self._since = (now.step, now.images, now.seconds)
         losses = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
         return f"{now.images:,} images  {rate:.0f} images/s  {losses}"
+
+    def _write(self, values: dict[str, float]) -> None:
+        now = self._progress
+        row = {"step": now.step, "images": now.images, "seconds": round(now.seconds, 3), **values}
+        self._history.write(json.dumps(row) + "\n")
+        self._history.flush()
 
     def _show(self, text: str, spent: float) -> None:
         seconds = self._progress.seconds

@@ -9,11 +9,11 @@ from curio_train.config import RunConfig
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress, TrainState
-from curio_train.templates.build import fill
+from curio_train.templates.build import fill, without_scan_excess
 from curio_train.templates.calibration import calibrate
 from curio_train.templates.network import TemplateNetwork
 from curio_train.worlds import build
-from curio_train.worlds.single_object.world import SingleObjectWorld
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 
 def draw_templates(config: RunConfig, path: Path, cache: Path) -> TrainingProgress:
@@ -30,8 +30,9 @@ def draw_templates(config: RunConfig, path: Path, cache: Path) -> TrainingProgre
     world = build(config.world)
     state = TrainState(config, world, torch.device("cpu"))
     network = state.pose.network
-    assert isinstance(world, SingleObjectWorld)  # template networks are made for no other
+    assert isinstance(world, TwoStageWorld)  # template networks are made for no other
     assert isinstance(network, TemplateNetwork)
+    world = without_scan_excess(world)
     run = RunFolder(path, config)
     with run.lock():
         run.write_config(new=True)
