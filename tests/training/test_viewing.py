@@ -1,6 +1,7 @@
 """curio-view in a real browser: open, drag, fit, save, reload."""
 
 import json
+import os
 import re
 import shutil
 import socket
@@ -23,7 +24,9 @@ from curio_train.errors import DataError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import load_mesh
 from curio_train.meshes.shapes import chair
+from curio_train.viewing.pages import Opening, newer_pages, open_pages
 from curio_train.viewing.saving import save
+from curio_train.worlds.options import SpheresOptions
 from scipy.spatial.transform import Rotation
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -63,12 +66,13 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Command:
     """A running ``curio-view``."""
 
-    def __init__(self, *arguments: str | Path) -> None:
+    def __init__(self, *arguments: str | Path, **environment: str) -> None:
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = free.getsockname()[1]
         script = "from curio_train.commands.view import view; view()"
         given = [sys.executable, "-c", script, *map(str, arguments), "--port", str(self.port)]
-        self.process = subprocess.Popen(given, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+        full = {**os.environ, **environment}
+        self.process = subprocess.Popen(given, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=full)
         assert self.process.stderr is not None
         self.url = f"http://127.0.0.1:{self.port}"
         assert f"{self.url}, for this machine alone" in self.process.stderr.readline()
@@ -82,8 +86,8 @@ class Command:
 def view() -> Iterator[Callable[..., Command]]:
     started: list[Command] = []
 
-    def start(*arguments: str | Path) -> Command:
-        started.append(Command(*arguments))
+    def start(*arguments: str | Path, **environment: str) -> Command:
+        started.append(Command(*arguments, **environment))
         return started[-1]
 
     yield start
@@ -191,6 +195,32 @@ def test_a_photograph_with_a_model(files: Path, view: Callable[..., Command], br
     page = opened(browser, command.url)
     assert page.get_by_text("640x480 pixels").is_visible()
     page.close()
+
+
+@needs_browser
+def test_without_a_renderer_the_photograph_is_shown(
+    files: Path, view: Callable[..., Command], browser: Any, tmp_path: Path
+) -> None:
+    given = [files / "found.jsonl", "--mesh", files / "chair.ply", "--out", tmp_path / "edited.jsonl"]
+    command = view(*given, DRJIT_LIBLLVM_PATH=str(tmp_path / "nowhere.so"))
+    page = browser.new_page(viewport={"width": WINDOW[0], "height": WINDOW[1]})
+    page.goto(command.url)
+    page.get_by_text("libLLVM").wait_for(timeout=180_000)  # what is missing, and what installs it
+    until(lambda: "data:image" in re_rendering(page) or "blob:" in re_rendering(page))
+    page.close()
+
+
+def test_a_run_is_opened_again_with_a_newer_checkpoint(tmp_path: Path, write_run: Callable[..., Path]) -> None:
+    run = write_run(tmp_path / "run", SpheresOptions())
+    opening = Opening(str(run), cache=tmp_path)
+    pages, reload = open_pages(opening), newer_pages(opening)
+    assert reload() is None
+    (checkpoint,) = (run / "checkpoints").iterdir()
+    shutil.copytree(checkpoint, checkpoint.with_name("00000009"))
+    again = reload()
+    assert again is not None
+    assert [page.scene.name for page in again] == [page.scene.name for page in pages]
+    assert reload() is None
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
