@@ -131,7 +131,7 @@ def test_bop_refuses_a_path_without_scene_or_image_number(image: str) -> None:
 
 
 def test_bop_object_ids_come_from_linemod_or_the_flag() -> None:
-    assert bop_object_ids(["ape"], None) == {"ape": 1}
+    assert bop_object_ids(["ape", "cam"], None) == {"ape": 1, "cam": 4}  # named as curio-train names them
     assert bop_object_ids(["glue", "holepuncher"], None) == {"glue": 11, "holepuncher": 12}
     assert bop_object_ids(["gear"], 7) == {"gear": 7}
     with pytest.raises(UsageError, match=r"gear.*--obj-id"):

@@ -15,26 +15,8 @@ from pathlib import PurePath
 
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
 
+from curio_serve.bop import LINEMOD_IDS
 from curio_serve.errors import UsageError
-
-# The LineMOD classes under the object ids that BOP's data sets LM and LM-O give them.
-LINEMOD_OBJECT_IDS: Mapping[str, int] = {
-    "ape": 1,
-    "benchvise": 2,
-    "bowl": 3,
-    "camera": 4,
-    "can": 5,
-    "cat": 6,
-    "cup": 7,
-    "driller": 8,
-    "duck": 9,
-    "eggbox": 10,
-    "glue": 11,
-    "holepuncher": 12,
-    "iron": 13,
-    "lamp": 14,
-    "phone": 15,
-}
 
 
 @dataclass(frozen=True)
@@ -267,13 +249,13 @@ def bop_object_ids(objects: Sequence[str], given: int | None) -> dict[str, int]:
         if len(objects) != 1:
             raise UsageError(f"--obj-id {given} names one object, the model finds {len(objects)}: {', '.join(objects)}")
         return {objects[0]: given}
-    unknown = [name for name in objects if name not in LINEMOD_OBJECT_IDS]
+    unknown = [name for name in objects if name not in LINEMOD_IDS]
     if unknown:
         raise UsageError(
             f"--format bop needs the object id of {', '.join(unknown)}: expected a LineMOD class "
-            f"({', '.join(LINEMOD_OBJECT_IDS)}) or --obj-id NUMBER"
+            f"({', '.join(LINEMOD_IDS)}) or --obj-id NUMBER"
         )
-    return {name: LINEMOD_OBJECT_IDS[name] for name in objects}
+    return {name: LINEMOD_IDS[name] for name in objects}
 
 
 def _detection_json(detection: Detection) -> dict[str, object]:

@@ -8,12 +8,13 @@ in millimetres; everything that leaves this module is in metres. Frames never op
 ``scene_gt.json`` is read by :meth:`BopDataset.annotations` alone.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from curio_serve.bop import LINEMOD_IDS
 from PIL import Image
 
 from curio_train.camera import Intrinsics, check_matrix, load_intrinsics
@@ -21,25 +22,6 @@ from curio_train.data.bop_json import Record, read_records
 from curio_train.errors import DataError, UsageError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import METRES, Mesh, load_mesh
-
-LINEMOD_IDS: Mapping[str, int] = {
-    "ape": 1,
-    "benchvise": 2,
-    "bowl": 3,
-    "cam": 4,
-    "can": 5,
-    "cat": 6,
-    "cup": 7,
-    "driller": 8,
-    "duck": 9,
-    "eggbox": 10,
-    "glue": 11,
-    "holepuncher": 12,
-    "iron": 13,
-    "lamp": 14,
-    "phone": 15,
-}
-"""All 15 objects of LineMOD by BOP's numbers."""
 
 LINEMOD_CLASSES = tuple(name for name in LINEMOD_IDS if name not in ("bowl", "cup"))
 """The 13 that papers report: bowl and cup have no usable meshes in the original."""
