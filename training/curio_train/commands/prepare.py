@@ -40,7 +40,7 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
     if isinstance(options, CaptureOptions):
         from curio_train.doctor.examine import refuse_unfit
 
-        for doubt in refuse_unfit(options):
+        for doubt in refuse_unfit(options, self_training=config.recipe.self_training > 0):
             warn(doubt)
         return replace(config, world=_with_paint(options, tell), network=_usual_network(config, options))
     return config
