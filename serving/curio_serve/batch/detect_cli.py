@@ -16,6 +16,7 @@ import tyro
 
 from curio_serve.cores import num_cores
 from curio_serve.errors import CameraError, CurioError, UsageError
+from curio_serve.version import answer_version
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,6 +84,7 @@ class DetectArguments:
 
 def main() -> NoReturn:
     """Entry point of the command."""
+    answer_version("curio-detect", sys.argv[1:])
     arguments: DetectArguments = tyro.cli(DetectArguments, prog="curio-detect")
     # Both by name: a process started in the background inherits an ignored SIGINT, and Python then leaves it so.
     for number in (signal.SIGINT, signal.SIGTERM):
