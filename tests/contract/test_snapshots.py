@@ -9,6 +9,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,8 @@ HELP = {
     "train-circles": "curio-train circles",
     "train-linemod": "curio-train linemod",
     "train-capture": "curio-train capture",
+    "train-linemod-all": "curio-train linemod --help-all",
+    "train-capture-all": "curio-train capture --help-all",
     "train-capture-calibrate": "curio-train capture --calibrate",
     "eval": "curio-eval",
     "export": "curio-export",
@@ -37,6 +40,9 @@ ERRORS = {
     "train-micro-batches": "curio-train circles --batch-size 10",
     "train-no-run-folder": "curio-train circles --resume nowhere",
     "train-no-class": "curio-train linemod",
+    "train-mistyped-world": "curio-train linmod --class ape",
+    "train-mistyped-class": "curio-train linemod --class aple --data lmo",
+    "train-mistyped-flag": "curio-train linemod --class ape --minuts 3",
     "train-pseudo-labels-without-photos": "curio-train linemod --class ape --data lmo --self-training 0.5",
     "train-poses-without-photos": "curio-train linemod --class ape --data lmo --views views.json",
     "train-photos-of-the-paper-network": "curio-train linemod --class ape --data lmo --photos . --one-stage",
@@ -91,6 +97,11 @@ def compare(file: Path, found: str) -> None:
 @pytest.mark.parametrize("name", HELP)
 def test_help(name: str, typed: Callable[[str], str]) -> None:
     compare(SNAPSHOTS / "help" / f"{name}.txt", typed(f"{HELP[name]} --help"))
+
+
+@pytest.mark.parametrize("command", sorted({line.split()[0] for line in HELP.values()} - {"curio-serve"}))
+def test_version(command: str, typed: Callable[[str], str]) -> None:
+    assert typed(f"{command} --version") == f"$ {command} --version\n{command} {version('curio-pose')}\n"
 
 
 @pytest.mark.parametrize("name", ERRORS)

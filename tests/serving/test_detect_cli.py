@@ -8,12 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import onnx
 import pytest
 from curio_serve.batch.detect_cli import DetectArguments, run
 from curio_serve.errors import CurioError, ModelError, UsageError
 from onnx import helper, numpy_helper
+from PIL import Image
 
 
 def command(*arguments: str | Path) -> list[str]:
@@ -74,9 +76,57 @@ def test_a_folder_without_images_is_no_success(models_dir: Path, tmp_path: Path)
         detect(models_dir / "flat", tmp_path / "empty", out=tmp_path / "out.jsonl")
 
 
-def test_a_folder_that_is_no_model_is_named(models_dir: Path, frames: Path) -> None:
+def test_a_folder_that_is_no_model_is_named(tmp_path: Path, frames: Path) -> None:
+    (tmp_path / "none").mkdir()
     with pytest.raises(CurioError, match="no model in"):
-        detect(models_dir, frames)
+        detect(tmp_path / "none", frames)
+
+
+def without_times(line: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in line.items() if name != "milliseconds"}
+
+
+def test_several_models_have_a_line_each(models_dir: Path, frames: Path, camera: Path, tmp_path: Path) -> None:
+    alone = {}
+    for name in ("flat", "pinhole"):
+        assert detect(models_dir / name, frames, camera=camera, out=tmp_path / name) == 0
+        alone[name] = [without_times(line) for line in read(tmp_path / name)]
+    expected = [line for pair in zip(alone["flat"], alone["pinhole"], strict=True) for line in pair]
+    for named in ([models_dir], [models_dir / "flat", models_dir / "pinhole/1"]):
+        assert detect(*named, frames, camera=camera, out=tmp_path / "both", overwrite=True) == 0
+        assert [without_times(line) for line in read(tmp_path / "both")] == expected
+
+
+def test_several_models_draw_into_one_picture(models_dir: Path, frames: Path, camera: Path, tmp_path: Path) -> None:
+    drawn = {}
+    for name in ("flat", "pinhole", "."):
+        folder = tmp_path / "drawn" / name
+        detect(models_dir / name, frames, camera=camera, out=tmp_path / "out", overwrite=True, overlays=folder)
+        drawn[name] = cv2.imread(str(folder / "000000.png")).astype(int)
+    plain = cv2.imread(str(frames / "000000.png")).astype(int)
+    changed = {name: (picture != plain).any(axis=2) for name, picture in drawn.items()}
+    assert changed["flat"].any()
+    assert changed["pinhole"].any()
+    assert (changed["."] == (changed["flat"] | changed["pinhole"])).all()
+
+
+def test_a_model_named_twice_is_refused(models_dir: Path, frames: Path) -> None:
+    with pytest.raises(UsageError, match="pinhole is named twice"):
+        detect(models_dir, models_dir / "pinhole", frames)
+
+
+def test_an_exif_rotation_that_is_not_applied_is_told(
+    models_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", SIZE).save(tmp_path / "turned.jpg", exif=exif)
+    Image.new("RGB", SIZE).save(tmp_path / "upright.jpg")
+    detect(models_dir / "flat", tmp_path, out=tmp_path / "out")
+    told = capsys.readouterr().err
+    assert f"1 images have an EXIF rotation that was not applied (first: {tmp_path}/turned.jpg)" in told
+    detect(models_dir / "flat", tmp_path, out=tmp_path / "out", overwrite=True, exif_rotation=True)
+    assert "EXIF" not in capsys.readouterr().err
 
 
 def test_a_model_that_exhausts_memory_is_refused(frames: Path, tmp_path: Path, spot_onnx: Callable[..., Any]) -> None:

@@ -115,7 +115,7 @@ def test_help_imports_nothing_heavy() -> None:
 def test_errors_are_one_clear_line_and_the_right_status(models_dir: Path, frames: Path) -> None:
     for arguments, status in (
         (["none", str(frames)], 2),
-        ([str(models_dir), str(frames)], 1),
+        ([str(frames), str(frames)], 1),
         ([str(models_dir / "flat"), str(frames), "--out", "/proc/none/out.jsonl"], 1),
         ([str(models_dir / "flat"), str(frames), "--out", "/dev/full"], 1),
     ):

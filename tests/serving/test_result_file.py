@@ -42,11 +42,11 @@ def result(image: Image, model: tuple[str, int] = MODEL) -> ImageResult:
 def run(
     path: Path, form: ResultFormat, images: list[Image] = IMAGES, stop_after: int = 100, **options: bool
 ) -> ResultFile:
-    with ResultFile(path, form, MODEL, **options) as output:
+    with ResultFile(path, form, [MODEL], **options) as output:
         for count, image in enumerate(output.unanswered(iter(images))):
             if count == stop_after:
                 break
-            output.write(form.lines(result(image)))
+            output.write(form.lines([result(image)]))
     return output
 
 
@@ -94,8 +94,41 @@ def test_other_images_are_refused_and_nothing_is_lost(form: ResultFormat, tmp_pa
 @pytest.mark.parametrize("model", [("can", 1), ("ape", 2)])
 def test_another_model_is_refused(form: ResultFormat, model: tuple[str, int], tmp_path: Path) -> None:
     run(tmp_path / "out", form, stop_after=2)
-    with ResultFile(tmp_path / "out", form, model) as output, pytest.raises(UsageError, match="ape version 1; this is"):
+    with (
+        ResultFile(tmp_path / "out", form, [model]) as output,
+        pytest.raises(UsageError, match="ape version 1; this is"),
+    ):
         output.unanswered(iter(IMAGES))
+
+
+PAIR = [("ape", 1), ("can", 2)]
+
+
+def run_pair(path: Path, form: ResultFormat, models: list[tuple[str, int]]) -> None:
+    with ResultFile(path, form, models) as output:
+        for image in output.unanswered(iter(IMAGES)):
+            output.write(form.lines([result(image, model) for model in models]))
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_of_two_models_cut_off_at_any_byte_it_ends_as_if_uninterrupted(form: ResultFormat, tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    run_pair(path, form, PAIR)
+    whole = path.read_bytes()
+    for length in range(len(whole) + 1):
+        path.write_bytes(whole[:length])
+        run_pair(path, form, PAIR)
+        assert path.read_bytes() == whole, length
+
+
+@pytest.mark.parametrize("form", FORMATS[:2])
+def test_a_file_of_fewer_or_more_models_is_refused(form: ResultFormat, tmp_path: Path) -> None:
+    for found, now in ((PAIR[:1], PAIR), (PAIR, PAIR[:1]), (PAIR, PAIR[::-1])):
+        path = tmp_path / "out"
+        path.unlink(missing_ok=True)
+        run_pair(path, form, found)
+        with pytest.raises(UsageError, match=r"line \d+ holds results of model .*; this is "):
+            run_pair(path, form, now)
 
 
 def test_a_damaged_line_is_named(tmp_path: Path) -> None:
@@ -119,14 +152,14 @@ def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
     with path.open("wb") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         with pytest.raises(OutputError, match="another process"):
-            ResultFile(path, JsonLines(), MODEL)
+            ResultFile(path, JsonLines(), [MODEL])
 
 
 def test_a_path_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file" / "out.jsonl", tmp_path):
         with pytest.raises(OutputError, match=str(path)):
-            ResultFile(path, JsonLines(), MODEL)
+            ResultFile(path, JsonLines(), [MODEL])
 
 
 def test_missing_folders_are_made(tmp_path: Path) -> None:
@@ -165,9 +198,9 @@ def test_a_pipe_is_written_through() -> None:
         "from curio_serve.batch.result_file import ResultFile\n"
         "from curio_serve.batch.formats import ImageResult, Csv\n"
         "form = Csv()\n"
-        "with ResultFile(None, form, ('ape', 1)) as output:\n"
+        "with ResultFile(None, form, [('ape', 1)]) as output:\n"
         "    list(output.unanswered(iter([])))\n"
-        "    output.write(form.lines(ImageResult('x.png', 'ape', 1, error='no')))\n"
+        "    output.write(form.lines([ImageResult('x.png', 'ape', 1, error='no')]))\n"
     )
     done = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=True, env=os.environ)
     header, row = done.stdout.splitlines()

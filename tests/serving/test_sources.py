@@ -175,8 +175,8 @@ def test_what_is_no_image_is_counted_and_named(tmp_path: Path) -> None:
     assert heic.startswith("HEIC pictures have to be converted")
 
 
-def test_a_second_model_is_no_folder_of_images(tmp_path: Path) -> None:
+def test_a_model_after_images_is_no_folder_of_images(tmp_path: Path) -> None:
     (tmp_path / "can").mkdir()
     (tmp_path / "can" / "config.pbtxt").touch()
-    with pytest.raises(UsageError, match="a call takes one model"):
+    with pytest.raises(UsageError, match="name all models before the first image"):
         check_arguments([str(tmp_path / "can"), str(tmp_path)])

@@ -14,6 +14,7 @@ from curio_train.commands import train as train_command
 from curio_train.config import NetworkConfig
 from curio_train.data import backgrounds
 from curio_train.data.background_image import BackgroundImages, MixedBackgrounds
+from curio_train.data.photographs import NUM_JUDGED
 from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, MeshError, UsageError
 from curio_train.evaluation.evaluate import evaluate
@@ -25,7 +26,7 @@ from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
 from curio_train.worlds.base import World
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object.capture import NUM_JUDGED, CapturePhotographs
+from curio_train.worlds.single_object.capture import CapturePhotographs
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from torch import Tensor
 
@@ -250,6 +251,12 @@ def test_files_that_do_not_belong_together_are_refused_all_at_once(folder: Path,
         refuse_unfit(options(folder, background=None, backgrounds=tmp_path / "other"))
     with pytest.raises(DataError, match="80x60"):
         BackgroundImages.read(tmp_path / "plate.png", Intrinsics(np.eye(3), WIDTH, HEIGHT))
+
+
+def test_few_photographs_are_said_where_training_would_learn_from_them(folder: Path) -> None:
+    (doubt,) = refuse_unfit(options(folder))
+    assert "only 12; below 80" in doubt
+    assert refuse_unfit(options(folder), self_training=False) == []
 
 
 def call(*words: object) -> int:

@@ -12,13 +12,17 @@ import onnx
 import pytest
 import trimesh
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec
+from curio_train.camera import load_intrinsics
+from curio_train.data.photographs import FEWEST_TO_LEARN_FROM, NUM_JUDGED
 from curio_train.doctor.examine import Subjects, examine_files
 from curio_train.doctor.finding import Finding
 from curio_train.export.onnx import put_spec
 from curio_train.meshes.meshes import load_mesh
+from curio_train.worlds.base import Camera
+from curio_train.worlds.single_object.capture import CapturePhotographs
 from PIL import Image
 
-WIDTH, HEIGHT, NUM_PHOTOS = 160, 120, 64
+WIDTH, HEIGHT, NUM_PHOTOS = 160, 120, 84
 K = [[180.0, 0.0, 81.0], [0.0, 180.0, 58.0], [0.0, 0.0, 1.0]]
 
 
@@ -168,7 +172,7 @@ def test_blurred(files: Files) -> None:
         save(path, cv2.GaussianBlur(photo(int(path.stem)), (0, 0), 4))
     (finding,) = alarms(files.subjects())
     assert finding.fault == "blurred"
-    assert "20 of 64" in finding.text
+    assert "20 of 84" in finding.text
 
 
 def test_exposure(files: Files) -> None:
@@ -177,12 +181,18 @@ def test_exposure(files: Files) -> None:
     assert "exposure" in {finding.fault for finding in alarms(files.subjects())}
 
 
-@pytest.mark.parametrize(("left", "state"), [(30, "warning"), (5, "bad")])
-def test_too_few(files: Files, left: int, state: str) -> None:
-    for path in files.photos[left:]:
+def test_too_few_to_learn_from(files: Files) -> None:
+    """The number at which the doctor warns is the one at which training stops learning from photographs."""
+    for path in files.photos[FEWEST_TO_LEARN_FROM - 1 :]:
         path.unlink()
     (finding,) = alarms(files.subjects())
-    assert (finding.fault, finding.state) == ("too few", state)
+    assert (finding.fault, finding.state) == ("too few", "warning")
+    assert f"only {FEWEST_TO_LEARN_FROM - 1}; below {FEWEST_TO_LEARN_FROM}" in finding.text
+    split = CapturePhotographs(files.folder / "photos", None, load_intrinsics(files.camera), Camera(WIDTH, HEIGHT))
+    assert split.unlabelled().paths == []
+    save(files.folder / "photos" / "one_more.png", photo(1000))
+    assert alarms(files.subjects()) == []
+    assert len(split.unlabelled().paths) == FEWEST_TO_LEARN_FROM - NUM_JUDGED
 
 
 def test_mixed_sizes(files: Files) -> None:
@@ -202,7 +212,7 @@ def test_some_raw_frames_saved_as_bgr(files: Files) -> None:
         cv2.imwrite(str(path), photo(int(path.stem)))
     (finding,) = alarms(replace(files.subjects(), background=None))
     assert finding.fault == "swapped colours"
-    assert "11 of 64" in finding.text
+    assert "14 of 84" in finding.text
 
 
 # Faults of the background image.

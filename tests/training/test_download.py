@@ -3,10 +3,15 @@
 import hashlib
 import io
 import json
+import os
+import pty
 import socket
+import subprocess
+import sys
 import threading
 import zipfile
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -15,7 +20,13 @@ import pytest
 import trimesh
 from curio_train.commands import train as train_command
 from curio_train.data.bop import BopDataset
-from curio_train.data.download import ARCHIVES, download_linemod
+from curio_train.data.download import (
+    SCORING_ARCHIVES,
+    TRAINING_ARCHIVES,
+    download_bytes,
+    download_linemod,
+    missing_archives,
+)
 from curio_train.errors import DataError
 
 COMMIT = "c0ffee" * 6 + "c0ff"
@@ -106,27 +117,35 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
     server.server_close()
 
 
+def test_training_fetches_no_frames(hub: Hub, tmp_path: Path) -> None:
+    assert missing_archives(tmp_path) == list(TRAINING_ARCHIVES)
+    assert download_bytes(TRAINING_ARCHIVES) == hub.sizes["lm_base.zip"] + hub.sizes["lm_models.zip"]
+    assert not (download_linemod(tmp_path) / "test").exists()
+    assert missing_archives(tmp_path) == []
+    assert missing_archives(tmp_path, SCORING_ARCHIVES) == ["lm_test_all.zip"]
+
+
 def test_a_data_set_is_fetched_once(hub: Hub, tmp_path: Path) -> None:
-    folder = download_linemod(tmp_path)
+    folder = download_linemod(tmp_path, SCORING_ARCHIVES)
     assert BopDataset(folder).classes == ("ape",)
     assert BopDataset(folder).camera.width == 640
     assert (folder / "test/000001/rgb/000000.png").stat().st_size == FRAME_BYTES
-    assert [name for name, _ in hub.asked] == list(ARCHIVES)
+    assert [name for name, _ in hub.asked] == list(SCORING_ARCHIVES)
     assert not list(tmp_path.rglob("*.part"))
     hub.refusal = (500, "")
-    assert download_linemod(tmp_path) == folder
+    assert download_linemod(tmp_path, SCORING_ARCHIVES) == folder
 
 
 def test_an_interrupted_download_is_continued(hub: Hub, tmp_path: Path) -> None:
     hub.breaks_at = CHUNK + 40_000
     with pytest.raises(DataError, match=r"503.*what has arrived is kept: give the same command again"):
-        download_linemod(tmp_path)
+        download_linemod(tmp_path, SCORING_ARCHIVES)
     (part,) = tmp_path.rglob("*.part")
     assert part.stat().st_size == CHUNK
     assert part.read_bytes() == hub.files["lm_test_all.zip"][:CHUNK]
     hub.breaks_at = None
     hub.asked.clear()
-    folder = download_linemod(tmp_path)
+    folder = download_linemod(tmp_path, SCORING_ARCHIVES)
     assert hub.asked == [("lm_test_all.zip", f"bytes={CHUNK}-")]
     assert (folder / "test/000001/rgb/000000.png").stat().st_size == FRAME_BYTES
 
@@ -227,15 +246,62 @@ def test_the_command_downloads_unless_data_is_given(
     hub: Hub, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flags = ("--cache", str(tmp_path / "cache"), "--out", str(tmp_path / "run"))
-    assert train(*flags) == 2
-    assert "found neither --data nor --download" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
     assert train(*flags, "--data", str(tmp_path / "nowhere"), "--download") == 1
     assert "there is no such folder" in capsys.readouterr().err
     assert not hub.asked
-    assert train(*flags, "--download") == 1
-    assert "no mesh of duck here; found meshes of: ape" in capsys.readouterr().err
-    assert len(hub.asked) == 3
+    assert train(*flags) == 1
+    told = capsys.readouterr().err
+    assert (
+        "LineMOD's archives lm_base.zip, lm_models.zip (bop-benchmark/lm, CC BY 4.0): 0.0 MB, about 1 min at 10 Mbit/s"
+        in told
+    )
+    assert "[Y/n]" not in told, "nobody is there to be asked"
+    assert "no mesh of duck here; found meshes of: ape" in told
+    assert [name for name, _ in hub.asked] == list(TRAINING_ARCHIVES)
+    assert train(*flags) == 1
+    assert "Mbit/s" not in capsys.readouterr().err, "it is there"
     assert not (tmp_path / "run").exists()
+
+
+def test_a_wrong_class_is_refused_before_any_download(
+    hub: Hub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train("--class", "dukc", "--cache", str(tmp_path)) == 2
+    assert "found 'dukc' (did you mean duck?), expected one of ape" in capsys.readouterr().err
+    assert not hub.asked
+
+
+def test_a_trained_model_is_named(
+    hub: Hub, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    version = tmp_path / "models" / "duck" / "1"
+    version.mkdir(parents=True)
+    (version / "model.onnx").write_bytes(b"")
+    monkeypatch.chdir(tmp_path)
+    assert train("--cache", str(tmp_path)) == 1
+    assert "curio-detect models/duck IMAGES" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("typed", "status", "fetched"), [("n\n", 2, 0), ("\n", 1, 2), ("y\n", 1, 2)])
+def test_on_a_terminal_the_download_is_a_question(
+    hub: Hub, tmp_path: Path, typed: str, status: int, fetched: int
+) -> None:
+    """In a process of its own, whose terminal is a pseudo-terminal."""
+    ours, theirs = pty.openpty()
+    command = [Path(sys.executable).with_name("curio-train"), "linemod", "--class", "duck", "--cache", tmp_path]
+    with subprocess.Popen(command, stdin=theirs, stderr=theirs, stdout=subprocess.DEVNULL, cwd=tmp_path) as process:
+        os.close(theirs)
+        told = b""
+        while b"[Y/n]" not in told:
+            told += os.read(ours, 1024)
+        os.write(ours, typed.encode())
+        with suppress(OSError):  # raised at the end of a pseudo-terminal's output
+            while more := os.read(ours, 1024):
+                told += more
+    os.close(ours)
+    assert process.returncode == status, told.decode()
+    assert len(hub.asked) == fetched
 
 
 def test_no_network_is_told(
@@ -246,6 +312,6 @@ def test_no_network_is_told(
     monkeypatch.setenv("HF_ENDPOINT", f"http://127.0.0.1:{port}")
     assert train("--download", "--cache", str(tmp_path)) == 1
     told = capsys.readouterr().err
-    assert "cannot download bop-benchmark/lm" in told
+    assert "cannot ask for the size of bop-benchmark/lm" in told
     assert "onnection refused" in told
     assert "--data DIR" in told

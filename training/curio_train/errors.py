@@ -16,6 +16,15 @@
 A text says what was found, what was expected, where (file, field, flag) and what to do.
 """
 
+import difflib
+from collections.abc import Iterable
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """A question that proposes the name most like a mistyped one; empty where none is like it."""
+    found = difflib.get_close_matches(word, list(known), 1)
+    return f" (did you mean {found[0]}?)" if found else ""
+
 
 class CurioError(Exception):
     """Base of all errors of this package."""

@@ -1,7 +1,6 @@
 """``curio-detect``: poses in many images, through a model on this machine or behind a server."""
 
 import os
-import re
 import shlex
 import signal
 import sys
@@ -16,23 +15,22 @@ import tyro
 
 from curio_serve.cores import num_cores
 from curio_serve.errors import CameraError, CurioError, UsageError
+from curio_serve.version import answer_version
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from curio_proto.v1.model_spec_pb2 import ModelSpec
+    from collections.abc import Callable, Sequence
 
     from curio_serve.batch.estimators import Estimator, Settings
     from curio_serve.batch.formats import ImageLines, ResultFormat
     from curio_serve.batch.sources import SourceImage
     from curio_serve.client import PoseClient
 
-_SERVED_MODEL = re.compile(r"(?P<address>(?:\[[^\]]+\]|[^/:\[\]]+):\d{1,5})/(?P<model>[^/]+(?:/\d+)?)")
-
 
 @dataclass(frozen=True)
 class DetectArguments:
     """Find a model's objects in images and write one JSON object an image, in the order of the images.
+
+    Several models may stand before the images, or a folder of models: each image then has a line of each model.
 
     Poses are cam_from_obj in metres, in OpenCV's camera frame (x right, y down, z forward). An image that cannot be
     read gets a line with its error, stops nothing, and makes the exit status 1. After a stop of any kind, run the same
@@ -40,7 +38,8 @@ class DetectArguments:
     """
 
     model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
-    """Model folder (its latest version), version folder or .onnx file; if no such path, a server's HOST:PORT/NAME."""
+    """Model folder (its latest version), version folder, .onnx file, or folder of models; if no such path, a server's
+    HOST:PORT/NAME."""
     images: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="IMAGES...")]
     """Files, folders (and those below; of a BOP scene its photographs), globs, videos, or - for a list on stdin."""
     video: str | None = None
@@ -83,6 +82,7 @@ class DetectArguments:
 
 def main() -> NoReturn:
     """Entry point of the command."""
+    answer_version("curio-detect", sys.argv[1:])
     arguments: DetectArguments = tyro.cli(DetectArguments, prog="curio-detect")
     # Both by name: a process started in the background inherits an ignored SIGINT, and Python then leaves it so.
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -119,27 +119,29 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.sources import PassedOver, check_arguments, images
     from curio_serve.models.model_check import ChildCheck
 
+    models, arguments = _models_first(arguments)
     _check_numbers(arguments)
     if arguments.video is None:
         check_arguments(arguments.images)
     cv2.setNumThreads(1)  # the images are what runs in parallel
     settings = _settings(arguments)
-    if os.path.exists(arguments.model):
-        ChildCheck()(Path(arguments.model))
-    estimator = _estimator(arguments, settings)
-    _check_camera(arguments, estimator)
+    for model in models:
+        if os.path.exists(model):
+            ChildCheck()(Path(model))
+    estimators = _estimators(arguments, models, settings)
+    for estimator in estimators:
+        _check_camera(arguments, estimator)
     if arguments.video is not None:
-        return _live(arguments, estimator)
-    form = _format(arguments, estimator.spec)
-    model, passed_over = (estimator.name, estimator.version), PassedOver()
-    with ResultFile(arguments.out, form, model, overwrite=arguments.overwrite) as output:
+        return _live(arguments, estimators)
+    form = _format(arguments, estimators)
+    names, passed_over = [(estimator.name, estimator.version) for estimator in estimators], PassedOver()
+    with ResultFile(arguments.out, form, names, overwrite=arguments.overwrite) as output:
         remaining = output.unanswered(images(arguments.images, passed_over))
         if arguments.ray is None:
-            results = in_order(partial(_answer, estimator, form), remaining, arguments.jobs)
+            results = in_order(partial(_answer, estimators, form), remaining, arguments.jobs)
         else:  # other nodes have another working folder
-            is_path = os.path.exists(arguments.model)
-            there = replace(arguments, model=os.path.abspath(arguments.model)) if is_path else arguments
-            results = over_cluster(arguments.ray, partial(_answering, there, settings), remaining)
+            there = [os.path.abspath(model) if os.path.exists(model) else model for model in models]
+            results = over_cluster(arguments.ray, partial(_answering, arguments, there, settings), remaining)
         with (
             closing(results),
             Progress(output.num_images, output.num_errors, is_shown=arguments.out is not None) as progress,
@@ -158,7 +160,18 @@ def run(arguments: DetectArguments) -> int:
         return 1 if output.num_errors else 0
 
 
-def _live(arguments: DetectArguments, estimator: "Estimator") -> int:
+def _models_first(arguments: DetectArguments) -> tuple[tuple[str, ...], DetectArguments]:
+    """The models of a call, and the call with the images alone after them."""
+    from curio_serve.batch.named_models import split_models
+
+    models, images = split_models(arguments.model, arguments.images)
+    return models, replace(arguments, images=images)
+
+
+def _live(arguments: DetectArguments, estimators: "Sequence[Estimator]") -> int:
+    if len(estimators) > 1:
+        raise UsageError(f"--video shows the detections of one model, found {len(estimators)}; name one")
+    (estimator,) = estimators
     if find_spec("viser") is None:
         raise UsageError("--video needs the extra view: pip install 'curio-pose[view]'")
     from curio_serve.batch.live import show_live
@@ -216,31 +229,40 @@ def _check_overlays(folder: Path, images: tuple[str, ...]) -> None:
         raise UsageError(f"--overlays {folder}: cannot be made: {exc.strerror}") from exc
 
 
-def _estimator(arguments: DetectArguments, settings: "Settings") -> "Estimator":
-    """The model on this machine or behind a server."""
+def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "Settings") -> "list[Estimator]":
+    """Each model on this machine or behind a server."""
     from curio_serve.batch.estimators import LocalEstimator, RemoteEstimator
+    from curio_serve.batch.named_models import SERVED_MODEL
     from curio_serve.models.model_folder import open_model
 
-    if os.path.exists(arguments.model):
-        return LocalEstimator(open_model(arguments.model), settings)
-    served = _SERVED_MODEL.fullmatch(arguments.model)
-    if served is None:
-        raise UsageError(
-            f"MODEL {arguments.model}: no such folder or file, nor HOST:PORT/NAME of a server; expected a folder that "
-            "curio-export wrote, such as models/ape"
-        )
-    return RemoteEstimator(_client(arguments, served["address"]), served["model"], settings)
+    found: list[Estimator] = []
+    for model in models:
+        if os.path.exists(model):
+            found.append(LocalEstimator(open_model(model), settings))
+            continue
+        served = SERVED_MODEL.fullmatch(model)
+        if served is None:
+            raise UsageError(
+                f"MODEL {model}: no such folder or file, nor HOST:PORT/NAME of a server; expected a folder that "
+                "curio-export wrote, such as models/ape"
+            )
+        found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
+    return found
 
 
-def _answering(arguments: DetectArguments, settings: "Settings") -> "Callable[[SourceImage], ImageLines]":
+def _answering(
+    arguments: DetectArguments, models: "Sequence[str]", settings: "Settings"
+) -> "Callable[[SourceImage], ImageLines]":
     """Build the function that answers images in another process."""
-    estimator = _estimator(arguments, settings)
-    return partial(_answer, estimator, _format(arguments, estimator.spec))
+    estimators = _estimators(arguments, models, settings)
+    return partial(_answer, estimators, _format(arguments, estimators))
 
 
-def _answer(estimator: "Estimator", form: "ResultFormat", image: "SourceImage") -> "ImageLines":
+def _answer(estimators: "Sequence[Estimator]", form: "ResultFormat", image: "SourceImage") -> "ImageLines":
     """Answer an image and format its lines, both in the worker: one thread for all lines would be too slow."""
-    return form.lines(estimator(image))
+    from curio_serve.batch.estimators import answers
+
+    return form.lines(answers(estimators, image))
 
 
 def _client(arguments: DetectArguments, address: str) -> "PoseClient":
@@ -268,16 +290,18 @@ def _check_camera(arguments: DetectArguments, estimator: "Estimator") -> None:
         )
 
 
-def _format(arguments: DetectArguments, spec: "ModelSpec") -> "ResultFormat":
+def _format(arguments: DetectArguments, estimators: "Sequence[Estimator]") -> "ResultFormat":
     from curio_serve.batch.formats import Bop, Csv, JsonLines, bop_object_ids
 
     if arguments.format == "jsonl":
         return JsonLines()
     if arguments.format == "csv":
         return Csv()
-    if not spec.camera.camera_matrix:
-        raise UsageError(f"--format bop is for poses in space; the model's world {spec.world!r} is flat")
-    return Bop(bop_object_ids([kind.name for kind in spec.objects], arguments.obj_id))
+    for estimator in estimators:
+        if not estimator.spec.camera.camera_matrix:
+            raise UsageError(f"--format bop is for poses in space; the model's world {estimator.spec.world!r} is flat")
+    names = dict.fromkeys(kind.name for estimator in estimators for kind in estimator.spec.objects)
+    return Bop(bop_object_ids(list(names), arguments.obj_id))
 
 
 def _how_to_go_on(arguments: DetectArguments) -> str:

@@ -55,7 +55,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class Seen:
     """The answer of a model to one image."""
 
     width: int
@@ -85,20 +85,26 @@ class Estimator(ABC):
         self.canonical = canonical_camera(spec, name)
 
     def __call__(self, image: SourceImage) -> ImageResult:
-        """The image's detections, drawn where that is asked for, or what is wrong with it.
+        """The answer to an image by this model alone; see :func:`answers`."""
+        return answers([self], image)[0]
+
+    def look(self, image: SourceImage, data: bytes) -> Seen:
+        """Detect in an image.
+
+        Args:
+            image: The image.
+            data: Content of its file; empty for a video's frame.
 
         Raises:
-            OutputError: The drawing cannot be written.
+            RequestError: The image or its camera is not acceptable.
+            InternalError: The model fails on it.
             ServiceError: The server is out of reach or overloaded.
-            RequestError: The server refuses what would be the same for every image.
         """
-        try:
-            data = b"" if image.pixels is not None else image.read()
-            seen = self._look(image, data, self._camera(image))
-            if self.settings.overlays is not None:
-                self._draw(self.settings.overlays, image, data, seen)
-        except _OF_ONE_IMAGE as exc:
-            return ImageResult(image.name, self.name, self.version, error=str(exc))
+        return self._look(image, data, self._camera(image))
+
+    def result(self, image: SourceImage, data: bytes, seen: Seen) -> ImageResult:
+        """What is written down about an image."""
+        is_turned = image.pixels is None and images.open_header(data).orientation > 1
         return ImageResult(
             image.name,
             self.name,
@@ -109,7 +115,12 @@ class Estimator(ABC):
             seen.results,
             seen.decode_ms,
             seen.inference_ms,
+            is_turned=is_turned and not self.settings.apply_exif_rotation,
         )
+
+    def failed(self, image: SourceImage, exc: Exception) -> ImageResult:
+        """An image without an answer."""
+        return ImageResult(image.name, self.name, self.version, error=str(exc))
 
     def overlay(self, pixels: np.ndarray) -> tuple[np.ndarray, list[Detection]]:
         """A video's frame with its detections drawn in, and the detections, most confident first.
@@ -127,7 +138,7 @@ class Estimator(ABC):
         return draw(pixels, seen.results, self.spec, seen.camera), found
 
     @abstractmethod
-    def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> _Seen:
+    def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> Seen:
         """Detects in a video's frame or in the bytes of an image file; the camera is that of the stored pixels."""
 
     def _camera(self, image: SourceImage) -> PinholeCamera | None:
@@ -145,19 +156,61 @@ class Estimator(ABC):
         images.check_size(width, height)
         return images.Frame(image.pixels, width, height)
 
-    def _draw(self, folder: Path, image: SourceImage, data: bytes, seen: _Seen) -> None:
-        frame = seen.frame or self._frame(image, data)
-        pixels = draw(frame.pixels, seen.results, self.spec, seen.camera)
-        path = _drawing_path(folder, image, self.settings.sources_root)
-        parameters = _FAST_PNG if path.suffix.lower() == ".png" else []
-        is_encoded, encoded = cv2.imencode(path.suffix, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), parameters)
-        if not is_encoded:
-            raise OutputError(f"{path}: a drawing of {seen.width}x{seen.height} pixels cannot be encoded")
+    def drawn(self, image: SourceImage, data: bytes, seen: Seen, pixels: np.ndarray | None) -> np.ndarray:
+        """The frame with the detections drawn in.
+
+        Args:
+            image: The image.
+            data: Content of its file.
+            seen: What was found.
+            pixels: Frame with other models' detections, uint8 RGB [height, width, 3]; None: none yet.
+        """
+        if pixels is None:
+            pixels = (seen.frame or self._frame(image, data)).pixels
+        return draw(pixels, seen.results, self.spec, seen.camera)
+
+
+def answers(estimators: Sequence[Estimator], image: SourceImage) -> list[ImageResult]:
+    """Each model's detections in an image, or what is wrong with it; drawn into one picture where that is asked for.
+
+    Args:
+        estimators: With the same settings.
+        image: The image.
+
+    Raises:
+        OutputError: The drawing cannot be written.
+        ServiceError: The server is out of reach or overloaded.
+        RequestError: The server refuses what would be the same for every image.
+    """
+    settings, results, pixels = estimators[0].settings, list[ImageResult](), None
+    try:
+        data = b"" if image.pixels is not None else image.read()
+    except ImageError as exc:
+        return [estimator.failed(image, exc) for estimator in estimators]
+    for estimator in estimators:
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(encoded.tobytes())
-        except OSError as exc:
-            raise OutputError(f"--overlays: {path} cannot be written: {exc.strerror}") from exc
+            seen = estimator.look(image, data)
+            if settings.overlays is not None:
+                pixels = estimator.drawn(image, data, seen, pixels)
+            results.append(estimator.result(image, data, seen))
+        except _OF_ONE_IMAGE as exc:
+            results.append(estimator.failed(image, exc))
+    if pixels is not None and settings.overlays is not None:
+        _write_drawing(_drawing_path(settings.overlays, image, settings.sources_root), pixels)
+    return results
+
+
+def _write_drawing(path: Path, pixels: np.ndarray) -> None:
+    parameters = _FAST_PNG if path.suffix.lower() == ".png" else []
+    is_encoded, encoded = cv2.imencode(path.suffix, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), parameters)
+    if not is_encoded:
+        height, width = pixels.shape[:2]
+        raise OutputError(f"{path}: a drawing of {width}x{height} pixels cannot be encoded")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(encoded.tobytes())
+    except OSError as exc:
+        raise OutputError(f"--overlays: {path} cannot be written: {exc.strerror}") from exc
 
 
 class LocalEstimator(Estimator):
@@ -167,7 +220,7 @@ class LocalEstimator(Estimator):
         super().__init__(model.name, model.version, model.spec, settings)
         self._detector = Detector(model)
 
-    def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> _Seen:
+    def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> Seen:
         started = time.perf_counter()
         header, reduction = None, 1
         if image.pixels is None:
@@ -186,7 +239,7 @@ class LocalEstimator(Estimator):
         decode_ms = None if image.pixels is not None else 1000 * (decoded - started)
         inference_ms = 1000 * (time.perf_counter() - decoded)
         full_size = frame if frame.reduction == 1 else None
-        return _Seen(frame.width, frame.height, camera, results, decode_ms, inference_ms, full_size)
+        return Seen(frame.width, frame.height, camera, results, decode_ms, inference_ms, full_size)
 
 
 class RemoteEstimator(Estimator):
@@ -204,7 +257,7 @@ class RemoteEstimator(Estimator):
         super().__init__(model.partition("/")[0], found.version, found.spec, settings)
         self._client = client
 
-    def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> _Seen:
+    def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> Seen:
         payload = data if image.pixels is None else image.pixels
         if self.settings.apply_exif_rotation and image.pixels is None:
             frame = self._frame(image, data)  # turned here, so that the K written down is the turned one
@@ -218,7 +271,7 @@ class RemoteEstimator(Estimator):
         )
         camera = camera or self.canonical.for_frame(answer.width, answer.height)
         spent = answer.milliseconds
-        return _Seen(answer.width, answer.height, camera, answer.results, spent.decode, spent.inference)
+        return Seen(answer.width, answer.height, camera, answer.results, spent.decode, spent.inference)
 
 
 def _turned(camera: PinholeCamera | None, frame: images.Frame) -> PinholeCamera | None:

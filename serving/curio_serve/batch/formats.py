@@ -1,7 +1,8 @@
 """What a detection looks like as JSON Lines, CSV and BOP results, and how such lines are read back after a stop.
 
 Each format knows four things: the line the file opens with, the lines of one image, how those lines name the image, and
-what one line says. The file itself is :mod:`curio_serve.batch.result_file`'s.
+what one line says. Where several models are run, an image has the lines of each, in the order of the models. The file
+itself is :mod:`curio_serve.batch.result_file`'s.
 """
 
 import csv
@@ -42,6 +43,8 @@ class ImageResult:
     """Pixels to detections."""
     error: str = ""
     """Why there is no answer."""
+    is_turned: bool = False
+    """EXIF asks for a rotation that was not applied."""
 
     @property
     def detections(self) -> list[Detection]:
@@ -63,6 +66,8 @@ class ImageLines:
     """Why there is no answer."""
     data: bytes
     """The lines, each with its newline."""
+    is_turned: bool = False
+    """EXIF asks for a rotation that was not applied."""
 
 
 @dataclass(frozen=True)
@@ -89,15 +94,17 @@ class ResultFormat(ABC):
     has_line_for_every_image: bool = True
     """Also for one without detections."""
     is_one_line_an_image: bool = False
-    """A complete line is then a complete image."""
+    """A complete line is then all that one model has to say about an image."""
 
-    def lines(self, result: ImageResult) -> ImageLines:
-        """Format the lines of an image."""
-        return ImageLines(result.image, result.error, self.encode(result))
+    def lines(self, results: Sequence[ImageResult]) -> ImageLines:
+        """Format the lines of an image, those of one model after those of another."""
+        errors = dict.fromkeys(result.error for result in results if result.error)
+        is_turned = any(result.is_turned for result in results)
+        return ImageLines(results[0].image, "; ".join(errors), b"".join(map(self.encode, results)), is_turned)
 
     @abstractmethod
     def encode(self, result: ImageResult) -> bytes:
-        """The lines of one image, each with its newline."""
+        """The lines of one model about one image, each with its newline."""
 
     @abstractmethod
     def key(self, image: str) -> str:

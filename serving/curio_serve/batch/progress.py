@@ -26,6 +26,7 @@ class Progress:
         self._num_before = num_before
         self._num_new = 0
         self._num_errors = num_errors_before
+        self._num_turned, self._first_turned = 0, ""
         self._problems: list[str] = []
         self._start_s = time.perf_counter()
 
@@ -39,6 +40,9 @@ class Progress:
     def count(self, lines: ImageLines) -> None:
         """One more image."""
         self._num_new += 1
+        if lines.is_turned:
+            self._first_turned = self._first_turned or lines.image
+            self._num_turned += 1
         if lines.error:
             self._num_errors += 1
             if len(self._problems) < _NUM_PROBLEMS_SHOWN:
@@ -51,6 +55,12 @@ class Progress:
         seconds = time.perf_counter() - self._start_s
         before = f" after {self._num_before} of earlier runs" if self._num_before else ""
         _say(f"{self._num_new} images{before} in {seconds:.1f} s ({self._num_new / seconds:.1f} images/s) to {label}")
+        if self._num_turned:
+            _say(
+                f"{self._num_turned} images have an EXIF rotation that was not applied (first: {self._first_turned}); "
+                "viewers turn them, K is taken to be of the stored pixels. With --exif-rotation they are turned, and K "
+                "with them"
+            )
         if self._num_errors:
             _say(
                 f"{self._num_errors} images have no answer:" if self._problems else f"{self._num_errors} have no answer"

@@ -9,7 +9,8 @@ is the one that an uninterrupted run would have written. Neither the file nor th
 import fcntl
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Protocol, TypeVar
 
@@ -34,7 +35,7 @@ class ResultFile:
     Args:
         path: The file; None: standard output.
         form: What its lines look like.
-        model: Name and version whose results it holds.
+        models: Names and versions of those whose results it holds, in the order of an image's lines.
         overwrite: Drop what is in it.
 
     Raises:
@@ -47,13 +48,13 @@ class ResultFile:
     """Of these, images without an answer, where the format says so."""
 
     def __init__(
-        self, path: Path | None, form: ResultFormat, model: tuple[str, int], *, overwrite: bool = False
+        self, path: Path | None, form: ResultFormat, models: Sequence[tuple[str, int]], *, overwrite: bool = False
     ) -> None:
         self.num_images = 0
         self.num_errors = 0
         self._path = path
         self._form = form
-        self._model = model
+        self._models = tuple(models)
         self._descriptor = os.dup(1) if path is None else _open_locked(path)
         self._is_regular = path is not None and stat.S_ISREG(os.fstat(self._descriptor).st_mode)
         if self._is_regular and overwrite:
@@ -125,53 +126,79 @@ class ResultFile:
             return 0
         start = lines.seek(len(self._form.header))
         number = int(bool(self._form.header))
-        last: tuple[str, int] | None = None  # key and offset of the image whose lines are being read
-        is_error = False
+        last: _Image | None = None
         for line in lines:
             number += 1
             if not line.endswith(b"\n"):
                 break
             record = self._parse(line, number)
-            if last is None or record.opens_image or record.key != last[0]:
+            opens = record.opens_image and record.model in (None, self._models[0])
+            if last is None or opens or record.key != last.key:
                 if last is not None:
-                    self._take(last[0], images, number - 1, is_error)
-                last, is_error = (record.key, start), record.is_error
+                    self._take(last, images, number - 1)
+                last = _Image(record.key, start)
+            last.add(record)
             start += len(line)
         if last is None:
             return start
-        if self._form.is_one_line_an_image:
-            self._take(last[0], images, number, is_error)
+        if self._form.is_one_line_an_image and tuple(last.models) == self._models:
+            self._take(last, images, number)
             return start
-        return last[1]  # more rows of this image may have been lost: it is answered anew
+        return last.start  # more rows of this image may have been lost: it is answered anew
 
     def _parse(self, line: bytes, number: int) -> Line:
         try:
             record = self._form.parse(line)
         except (ValueError, StopIteration) as exc:
             raise self._mismatch(number, f"what this format does not write ({exc})") from exc
-        if record.model is not None and record.model != self._model:
-            raise self._mismatch(
-                number, "results of model {} version {}; this is {} version {}".format(*record.model, *self._model)
-            )
+        if record.model is not None and record.model not in self._models:
+            raise self._mismatch(number, f"results of model {_label([record.model])}; this is {_label(self._models)}")
         return record
 
-    def _take(self, key: str, images: Iterator[NamedT], number: int, is_error: bool) -> None:
-        """Takes images off the iterator up to the one with that key."""
+    def _take(self, last: "_Image", images: Iterator[NamedT], number: int) -> None:
+        """Takes images off the iterator up to the one whose lines were read."""
+        if last.models and tuple(last.models) != self._models:
+            raise self._mismatch(
+                number, f"results of model {_label(last.models)} alone about {last.key}; this is {_label(self._models)}"
+            )
         for image in images:
             self.num_images += 1
             found = self._form.key(image.name)
-            if found == key:
-                self.num_errors += is_error
+            if found == last.key:
+                self.num_errors += last.is_error
                 return
             if self._form.has_line_for_every_image:
-                raise self._mismatch(number, f"image {key} where the images given have {found}")
-        raise self._mismatch(number, f"image {key}, which is not among the images given or not in this order")
+                raise self._mismatch(number, f"image {last.key} where the images given have {found}")
+        raise self._mismatch(number, f"image {last.key}, which is not among the images given or not in this order")
 
     def _mismatch(self, number: int, found: str) -> UsageError:
         return UsageError(
             f"cannot go on with {self.label}: line {number} holds {found}. Give the same images, model and format as "
             "before, another --out, or --overwrite to replace the file."
         )
+
+
+@dataclass
+class _Image:
+    """The lines of one image, while they are read back."""
+
+    key: str
+    """See :meth:`ResultFormat.key`."""
+    start: int
+    """Offset of the first line."""
+    models: list[tuple[str, int]] = field(default_factory=list)
+    """Those that its lines are of, where the format says it."""
+    is_error: bool = False
+    """A model had no answer."""
+
+    def add(self, line: Line) -> None:
+        if line.model is not None and line.model not in self.models:
+            self.models.append(line.model)
+        self.is_error |= line.is_error
+
+
+def _label(models: Sequence[tuple[str, int]]) -> str:
+    return ", ".join(f"{name} version {version}" for name, version in models)
 
 
 def _open_locked(path: Path) -> int:

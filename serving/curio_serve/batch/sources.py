@@ -109,7 +109,9 @@ def check_arguments(arguments: Sequence[str]) -> None:
         raise UsageError("- was given twice; standard input can be read once")
     for argument in arguments:
         if os.path.exists(os.path.join(argument, CONFIG_FILE)):
-            raise UsageError(f"{argument} is a model and stands where images do; a call takes one model: call it twice")
+            raise UsageError(
+                f"{argument} is a model and stands after the images; name all models before the first image"
+            )
         if argument != STANDARD_INPUT and not os.path.exists(argument) and not _has_match(argument):
             raise UsageError(f"{argument}: no such file or folder, and no file matches it; check the path")
 

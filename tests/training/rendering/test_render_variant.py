@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 from curio_train.errors import RendererError
-from curio_train.rendering import variant
+from curio_train.rendering import llvm, variant
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The only folder in which libLLVM is looked for."""
-    monkeypatch.setattr(variant, "LIBRARY_FOLDERS", (str(tmp_path),))
+    monkeypatch.setattr(llvm, "LIBRARY_FOLDERS", (str(tmp_path),))
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     return tmp_path
 
@@ -29,24 +29,24 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ],
 )
 def test_version_is_read_off_the_name(name: str, version: int | None) -> None:
-    assert variant.llvm_version(f"/usr/lib/{name}") == version
+    assert llvm.llvm_version(f"/usr/lib/{name}") == version
 
 
 def test_newest_library_is_taken(folder: Path) -> None:
     for name in ("libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1"):
         (folder / name).touch()
-    assert variant.check_llvm() == str(folder / "libLLVM.so.19.1")
+    assert llvm.check_llvm() == str(folder / "libLLVM.so.19.1")
 
 
 def test_a_missing_library_names_the_package(folder: Path) -> None:
     with pytest.raises(RendererError, match=r"No libLLVM was found .*17 or newer.*apt-get install libllvm19"):
-        variant.check_llvm()
+        llvm.check_llvm()
 
 
 def test_an_old_library_is_refused_before_it_is_loaded(folder: Path) -> None:
     (folder / "libLLVM-15.so.1").touch()
     with pytest.raises(RendererError, match=r"libLLVM-15\.so\.1 is LLVM 15.*needs 17 or newer.*libllvm19"):
-        variant.check_llvm()
+        llvm.check_llvm()
 
 
 def test_the_variable_wins(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -54,10 +54,10 @@ def test_the_variable_wins(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (folder / "libLLVM-14.so.1").touch()
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(folder / "libLLVM-14.so.1"))
     with pytest.raises(RendererError, match="LLVM 14"):
-        variant.check_llvm()
+        llvm.check_llvm()
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(folder / "nowhere.so"))
     with pytest.raises(RendererError, match=r"nowhere\.so"):
-        variant.check_llvm()
+        llvm.check_llvm()
 
 
 def test_an_old_library_ends_in_a_message_not_in_an_abort(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from curio_train.errors import UsageError
 
 @dataclass(frozen=True)
 class DoctorCommand:
-    """Check this machine, and a mesh, a camera file, photographs and a model where they are given."""
+    """Check the mesh, camera file, photographs and model that are named; without any, this machine."""
 
     mesh: Path | None = None
     """Mesh file: PLY, OBJ, STL, glTF or OFF."""

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,7 +11,8 @@ from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from curio_train.commands.field_help import parsed
-from curio_train.commands.running import CACHE, answer, warn
+from curio_train.commands.linemod_data import fetched_linemod
+from curio_train.commands.running import CACHE, answer, tell, warn
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class EvaluateCommand:
     """How many images."""
     data: Path | None = None
     """BOP data set whose real frames are scored as well; needed for an exported LineMOD model."""
+    download: FlagCreatePairsOff[bool] = False
+    """Without --data, fetch LineMOD with its real frames into --cache, once, some gigabytes, and score on them."""
     bop_results: Path | None = None
     """Folder for a results file of the real frames in BOP's format."""
     refine: FlagCreatePairsOff[bool] = False
@@ -46,6 +49,8 @@ def _evaluate(command: EvaluateCommand) -> int:
     from curio_train.evaluation.evaluate import evaluate
     from curio_train.evaluation.tables import print_evaluation
 
+    if command.download and command.data is None:
+        command = replace(command, data=fetched_linemod(command.cache, tell, ask=False, frames=True))
     given = {name: getattr(command, name) for name in ("split", "num_images", "data", "bop_results", "refine", "cache")}
     with Console(stderr=True).status("") as status:
         result = evaluate(command.path, **given, progress=status.update, warn=warn)

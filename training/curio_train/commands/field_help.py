@@ -3,10 +3,12 @@
 tyro shows such strings as they stand in the source, line breaks included; in an ``Attributes:`` block it joins lines.
 """
 
+import sys
 from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
 import tyro
+from curio_serve.version import answer_version
 from docstring_parser import parse_from_object
 
 C = TypeVar("C")
@@ -20,6 +22,7 @@ def parsed(command: type[C], arguments: Sequence[str] | None, prog: str) -> C:
         arguments: None: those of this process.
         prog: Name of the command, for its help.
     """
+    answer_version(prog, sys.argv[1:] if arguments is None else arguments)
     join_help_lines([command])
     return tyro.cli(command, args=arguments, prog=prog)
 

@@ -34,7 +34,7 @@ def end(run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None]) 
         warn(str(exc))
     if not isinstance(config.world, CaptureOptions):
         return (
-            f"to see what it learned: {run / REPORT_FILE}\n"
+            f"to see what it learned: {run / REPORT_FILE}, or curio-view {run}\n"
             f"to serve it: curio-export {run} --out models/, then curio-serve models/"
         )
     return _exported(run, config.world.camera)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from curio_train.commands.linemod_data import with_linemod
 from curio_train.config import NetworkConfig, RunConfig
 from curio_train.errors import UsageError
 from curio_train.worlds.options import CaptureOptions, LinemodOptions
@@ -22,7 +23,8 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
         tell: Told of what was found out.
 
     Raises:
-        UsageError: Pseudo-labels are asked for, and there are no photographs.
+        UsageError: Pseudo-labels are asked for, and there are no photographs; LineMOD has no such class; or a
+            download was declined.
         DataError: A download failed, or files of one's own are certain not to work.
     """
     options = config.world
@@ -31,16 +33,14 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
             f"--self-training {config.recipe.self_training}: found no photographs to learn from; expected --photos, "
             "which linemod and capture have"
         )
-    if isinstance(options, LinemodOptions) and options.data is None and options.download:
-        from curio_train.data.download import download_linemod
-
-        config = replace(config, world=replace(options, data=download_linemod(cache), download=False))
-    if isinstance(config.world, LinemodOptions):
-        _refuse_unreadable(config.world)
+    if isinstance(options, LinemodOptions):
+        options = with_linemod(options, cache, tell)
+        config = replace(config, world=options)
+        _refuse_unreadable(options)
     if isinstance(options, CaptureOptions):
         from curio_train.doctor.examine import refuse_unfit
 
-        for doubt in refuse_unfit(options):
+        for doubt in refuse_unfit(options, self_training=config.recipe.self_training > 0):
             warn(doubt)
         return replace(config, world=_with_paint(options, tell), network=_usual_network(config, options))
     return config

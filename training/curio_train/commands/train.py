@@ -7,16 +7,19 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_type_hints
+from typing import TYPE_CHECKING, Literal, NoReturn, get_type_hints
 
 import tyro
+from curio_serve.version import answer_version
 from tyro.conf import OmitArgPrefixes
 
 from curio_train.capture.options import CalibrateCommand
 from curio_train.commands.field_help import join_help_lines, parsed
 from curio_train.commands.project_file import with_project
 from curio_train.commands.running import CACHE, answer, tell, warn
+from curio_train.commands.short_help import FLAG_ALL, print_short_help
 from curio_train.config import NetworkConfig, Preset, Recipe, RunConfig, WorldOptions, preset_recipe
+from curio_train.errors import UsageError, nearest
 from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.worlds import WORLDS
@@ -54,6 +57,7 @@ class TrainCommand:
 def train(arguments: Sequence[str] | None = None) -> None:
     """``curio-train WORLD …``: exit status 0 done, 1 failed, 2 wrong call, 128 + signal when interrupted."""
     given = sys.argv[1:] if arguments is None else list(arguments)
+    answer_version("curio-train", given)
     if given[:1] == ["capture"] and "--calibrate" in given:
         calibration = parsed(CalibrateCommand, given[1:], "curio-train capture")
         sys.exit(answer(lambda _: _calibrate(calibration)))
@@ -73,38 +77,69 @@ def _calibrate(command: CalibrateCommand) -> int:
 
 
 def parse(arguments: list[str]) -> TrainCommand:
-    """A call as typed; what it leaves out comes from the preset, or from the run it resumes."""
-    arguments = with_project(arguments, _path_flags())
+    """A call as typed; what it leaves out comes from the preset, or from the run it resumes.
+
+    Raises:
+        SystemExit: Help was printed, or the call is wrong.
+        CurioError: It names a world, a file or a run that cannot be used.
+    """
+    world, *typed = arguments or [""]
+    if world not in WORLDS:
+        return _refuse_world(arguments)
+    kind = WORLDS[world]
+    typed = with_project(arguments, _path_flags())[1:]
+    default, stored = _defaults(world, typed)
+    prog, about = f"curio-train {world}", (kind.__doc__ or "").partition("\n\n")[0]
+    join_help_lines([RunConfig, Recipe, NetworkConfig, *WORLDS.values()])
+    if stored is None and {"-h", "--help"} & set(typed) and FLAG_ALL not in typed:
+        print_short_help(prog, about, default.world, default, Session())
+    command = tyro.cli(
+        TrainCommand,
+        args=["--help" if word == FLAG_ALL else word for word in typed],
+        default=TrainCommand(default),
+        prog=prog,
+        description=about,
+    )
+    if stored is not None and command.session.resume is not None:
+        refuse_other(stored, command.config, command.session.resume)
+    return command
+
+
+def _defaults(world: str, typed: list[str]) -> tuple[RunConfig, RunConfig | None]:
+    """The configuration that flags change, and that of the run to resume, if there is one."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", nargs="?", default="laptop")
     first.add_argument("--resume", nargs="?", type=Path)
     first.add_argument("--photos", nargs="?")
-    seen, _ = first.parse_known_args(arguments)
+    seen, _ = first.parse_known_args(typed)
 
-    preset: Preset = "paper" if seen.preset == "paper" else "laptop"  # an unknown preset is tyro's to refuse
-    defaults = {
-        name: RunConfig(_unset(kind), method=kind.default_method, recipe=preset_recipe(preset, kind))
-        for name, kind in WORLDS.items()
-    }
-    if seen.photos is None:  # then --self-training is an error, and a default that is no error must be 0
-        defaults["linemod"] = replace(linemod := defaults["linemod"], recipe=replace(linemod.recipe, self_training=0.0))
     stored = load_config(seen.resume) if seen.resume else None
-    if stored is not None:
-        defaults[world_name(stored)] = stored
-    commands = tyro.extras.subcommand_type_from_defaults(
-        {name: TrainCommand(config) for name, config in defaults.items()},
-        {name: (kind.__doc__ or "").partition("\n\n")[0] for name, kind in WORLDS.items()},
-    )
-    join_help_lines([RunConfig, Recipe, NetworkConfig, *WORLDS.values()])
-    command: TrainCommand = tyro.cli(
-        commands,
-        args=arguments,
+    if stored is not None and world_name(stored) == world:
+        return stored, stored
+    kind = WORLDS[world]
+    preset: Preset = "paper" if seen.preset == "paper" else "laptop"  # an unknown preset is tyro's to refuse
+    recipe = preset_recipe(preset, kind)
+    if world == "linemod" and seen.photos is None:  # then --self-training is an error, and its default must be none
+        recipe = replace(recipe, self_training=0.0)
+    return RunConfig(_unset(kind), method=kind.default_method, recipe=recipe), stored
+
+
+def _refuse_world(arguments: list[str]) -> NoReturn:
+    """Print the list of worlds, or refuse what is none of them."""
+    if arguments and not arguments[0].startswith("-"):
+        raise UsageError(
+            f"{arguments[0]} is no world{nearest(arguments[0], WORLDS)}; expected one of {', '.join(WORLDS)}"
+        )
+    tyro.cli(
+        tyro.extras.subcommand_type_from_defaults(
+            {name: TrainCommand(RunConfig(_unset(kind))) for name, kind in WORLDS.items()},
+            {name: (kind.__doc__ or "").partition("\n\n")[0] for name, kind in WORLDS.items()},
+        ),
+        args=["--help" if word == FLAG_ALL else word for word in arguments],
         prog="curio-train",
         description=f"Learn to read poses from images without labels. Worlds: {', '.join(WORLDS)}.",
     )
-    if stored is not None:
-        refuse_other(stored, command.config, seen.resume)
-    return command
+    raise UsageError(f"found {' '.join(arguments)} before the world; expected curio-train WORLD and then flags")
 
 
 def _path_flags() -> set[str]:
@@ -140,6 +175,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
         tell(end(path, config, session.cache, warn))
         return 0
+    tell(f"{path}: to watch it learn: curio-view {path}, or tensorboard --logdir {path}")
     outcome, progress = learn(
         config,
         path,

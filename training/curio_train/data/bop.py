@@ -19,7 +19,7 @@ from PIL import Image
 
 from curio_train.camera import Intrinsics, check_matrix, load_intrinsics
 from curio_train.data.bop_json import Record, read_records
-from curio_train.errors import DataError, UsageError
+from curio_train.errors import DataError, UsageError, nearest
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import METRES, Mesh, load_mesh
 
@@ -132,7 +132,9 @@ class BopDataset:
             UsageError: There is no such class.
         """
         if name not in LINEMOD_IDS:
-            raise UsageError(f"--class: found {name!r}, expected one of {' '.join(LINEMOD_IDS)}")
+            raise UsageError(
+                f"--class: found {name!r}{nearest(name, LINEMOD_IDS)}, expected one of {' '.join(LINEMOD_IDS)}"
+            )
         return LINEMOD_IDS[name]
 
     @cached_property

@@ -17,7 +17,7 @@ import stat
 import sys
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
@@ -29,31 +29,56 @@ from huggingface_hub.utils import WeakFileLock, build_hf_headers, disable_progre
 from curio_train.errors import DataError
 
 REPOSITORY = "bop-benchmark/lm"
-ARCHIVES = ("lm_base.zip", "lm_models.zip", "lm_test_all.zip")
-"""Cameras and targets, meshes, and all real frames; some repositories pack everything into a folder ``lm``."""
+TRAINING_ARCHIVES = ("lm_base.zip", "lm_models.zip")
+"""Cameras and targets, and meshes: all that training reads. Some repositories pack everything into a folder ``lm``."""
 
+SCORING_ARCHIVES = (*TRAINING_ARCHIVES, "lm_test_all.zip")
+"""These, and all real frames, which are for scoring alone."""
+
+_STATE = ".download"
 _OFFLINE = "or download it elsewhere and name its folder: --data DIR"
 
 
-def download_linemod(cache: Path) -> Path:
+def linemod_folder(cache: Path) -> Path:
+    """Where a download is kept."""
+    return cache.expanduser() / "bop" / "lm"
+
+
+def missing_archives(cache: Path, archives: Sequence[str] = TRAINING_ARCHIVES) -> list[str]:
+    """Those of the archives that were not downloaded yet."""
+    state = linemod_folder(cache) / _STATE
+    return [name for name in archives if not (state / f"{name}.done").exists()]
+
+
+def download_bytes(archives: Sequence[str]) -> int:
+    """Size of archives as the hub states it.
+
+    Raises:
+        DataError: The hub cannot be reached, or states none.
+    """
+    with _as_data_errors(f"cannot ask for the size of {REPOSITORY}"):
+        return sum(_stated_size(name, _metadata(name)) for name in archives)
+
+
+def download_linemod(cache: Path, archives: Sequence[str] = TRAINING_ARCHIVES) -> Path:
     """The folder of LineMOD, downloaded as far as it is not there yet.
 
     Args:
         cache: Folder for it.
+        archives: What of it is needed.
 
     Raises:
         DataError: The hub cannot be reached, refuses, or sends something else; or there is no place to keep it.
     """
-    folder = cache.expanduser() / "bop" / "lm"
-    state = folder / ".download"
+    folder = linemod_folder(cache)
+    state = folder / _STATE
     with _as_data_errors(f"cannot download {REPOSITORY} to {folder}"):
         state.mkdir(parents=True, exist_ok=True)
         if not sys.stderr.isatty():
             disable_progress_bars()
         with WeakFileLock(state / "lock"):  # runs of several classes may be started at once
-            for name in ARCHIVES:
-                if not (state / f"{name}.done").exists():
-                    _fetch(name, folder, state)
+            for name in missing_archives(cache, archives):
+                _fetch(name, folder, state)
     return folder
 
 
@@ -86,15 +111,10 @@ def _first_line(exc: Exception) -> str:
 
 def _fetch(name: str, folder: Path, state: Path) -> None:
     """Download, check and unpack one archive."""
-    endpoint = os.environ.get("HF_ENDPOINT")
-    found = get_hf_file_metadata(hf_hub_url(REPOSITORY, name, repo_type="dataset", endpoint=endpoint))
-    if found.size is None or found.etag is None or len(found.etag) != 64:
-        raise DataError(
-            f"{REPOSITORY}/{name}: the hub states size {found.size} and checksum {found.etag}, expected a SHA-256; is "
-            f"HF_ENDPOINT a hub? {_OFFLINE}"
-        )
+    found = _metadata(name)
+    size, endpoint = _stated_size(name, found), os.environ.get("HF_ENDPOINT")
     url = hf_hub_url(REPOSITORY, name, repo_type="dataset", revision=found.commit_hash, endpoint=endpoint)
-    part = _receive(name, url, found, found.size, state)
+    part = _receive(name, url, found, size, state)
     with part.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if digest != found.etag:
@@ -106,6 +126,20 @@ def _fetch(name: str, folder: Path, state: Path) -> None:
     _unpack(part, name, folder)
     (state / f"{name}.done").write_text(f"{digest}  {name}\n", encoding="utf-8")
     part.unlink()
+
+
+def _metadata(name: str) -> HfFileMetadata:
+    endpoint = os.environ.get("HF_ENDPOINT")
+    return get_hf_file_metadata(hf_hub_url(REPOSITORY, name, repo_type="dataset", endpoint=endpoint))
+
+
+def _stated_size(name: str, found: HfFileMetadata) -> int:
+    if found.size is None or found.etag is None or len(found.etag) != 64:
+        raise DataError(
+            f"{REPOSITORY}/{name}: the hub states size {found.size} and checksum {found.etag}, expected a SHA-256; is "
+            f"HF_ENDPOINT a hub? {_OFFLINE}"
+        )
+    return found.size
 
 
 def _receive(name: str, url: str, found: HfFileMetadata, size: int, state: Path) -> Path:

@@ -49,6 +49,12 @@ class UnlabelledPhotographs(NamedTuple):
 MAX_UNLABELLED = 300
 """Self-training keeps photographs in memory and refines the pose in each, which takes a sixth of a second."""
 
+NUM_JUDGED = 40
+"""Photographs of a part of one's own that its model is judged by, and that it therefore never learns from."""
+
+FEWEST_TO_LEARN_FROM = 2 * NUM_JUDGED
+"""With fewer photographs of a part of one's own, self-training is off: all of them judge the model."""
+
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 # 50 megapixels: larger than any camera of this trade, small enough to be decoded without harm.

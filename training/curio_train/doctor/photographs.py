@@ -5,12 +5,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from curio_train.camera import Intrinsics
-from curio_train.data.photographs import Photographs
-from curio_train.doctor.finding import Finding, State
+from curio_train.data.photographs import FEWEST_TO_LEARN_FROM, Photographs
+from curio_train.doctor.finding import Finding
 from curio_train.doctor.picture_content import Photograph, examine_content, measure
 from curio_train.errors import CurioError
 
-_FEWEST, _FEW = 10, 60
+TOO_FEW = "too few"
+"""The fault of a folder with few photographs."""
+
 _SAME_FOCAL = 0.15  # focal lengths in EXIF are nominal, and rounded to whole millimetres
 _FULL_FRAME_WIDTH_MM = 36.0
 
@@ -63,12 +65,13 @@ def _sizes(folder: Path, photographs: Sequence[Photograph]) -> Finding:
 
 def _count(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     count = len(photographs)
-    if count < _FEW:
-        text = f"only {count}; a detector learns from about 200, and below {_FEW} mostly what these show"
-        state: State = "bad" if count < _FEWEST else "warning"
-        yield Finding(
-            "photograph count", state, text, "Take more, from all sides and in the light of later use", fault="too few"
+    if count < FEWEST_TO_LEARN_FROM:
+        text = (
+            f"only {count}; below {FEWEST_TO_LEARN_FROM} a part's model does not learn from them (self-training is "
+            "off), they only judge it"
         )
+        remedy = f"Take {FEWEST_TO_LEARN_FROM} or more, from all sides and in the light of later use"
+        yield Finding("photograph count", "warning", text, remedy, fault=TOO_FEW)
 
 
 def _turned(photographs: Sequence[Photograph]) -> Iterator[Finding]:

@@ -1,20 +1,29 @@
 """Small trials of the renderer and of training, to be run in a process of their own."""
 
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from curio_train.camera import Intrinsics
+from curio_train.config import RunConfig, preset_recipe
+from curio_train.data.backgrounds import POOL_HEIGHT, POOL_WIDTH, ClutterBackgrounds
 from curio_train.errors import RendererError
-from curio_train.geometry import matrix_from_rotation_6d
-from curio_train.learning.losses import image_loss
+from curio_train.learning.hardware import choose_threads
+from curio_train.learning.parallel import Ranks
+from curio_train.learning.trainer import Trainer
 from curio_train.meshes.shapes import box, sphere
-from curio_train.networks.paper.network import PoseNetwork
 from curio_train.rendering.renderer import Renderer
-from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, Field, Layout
+from curio_train.worlds import WORLDS, build
+from curio_train.worlds.base import ImageSource, ObjectKind, StagedWorld, World, stages_of
+from curio_train.worlds.image_sets import StoredImages
+from curio_train.worlds.options import LinemodOptions
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.world import Object, SingleObjectWorld
 
-_SMALL_PX, _SIDE_PX = 32, 128
-_BATCH, _STEPS = 16, 3
+_SMALL_PX = 32
+_STEPS, _NUM_IMAGES = 3, 64
 
 
 def _camera_matrix(side: int) -> np.ndarray:
@@ -42,29 +51,42 @@ def render_a_box() -> float:
     return fraction
 
 
-def images_per_second() -> float:
-    """Images a second of learning by re-rendering: network, renderer, and back through both, as it is now."""
-    layout = Layout(
-        (
-            Field(TRANSLATION, 3, unit="m", frame="camera", lower=(-0.1, -0.1, 0.4), upper=(0.1, 0.1, 0.6)),
-            Field(ROTATION_6D, 6, frame="camera", lower=(-1.0,) * 6, upper=(1.0,) * 6),
-            Field(LIGHT, 3, per_object=False, frame="camera", lower=(-1.0,) * 3, upper=(1.0,) * 3),
-        )
-    )
-    network = PoseNetwork(layout, _SIDE_PX)
-    renderer = Renderer([sphere(0.05, subdivisions=5)], [0], _SIDE_PX, _SIDE_PX, ambient=0.3)
-    images = torch.rand(_BATCH, 3, _SIDE_PX, _SIDE_PX, generator=torch.Generator().manual_seed(0))
-    black = torch.zeros_like(images)
+def images_per_second(name: str) -> float:
+    """Images a second of training a world as ``curio-train NAME`` does by default, as quick as the CPU is now.
 
-    def step() -> None:
-        code = network(images)
-        rotation = matrix_from_rotation_6d(code[ROTATION_6D])
-        matrix = _camera_matrix(_SIDE_PX)
-        again = renderer(rotation, code[TRANSLATION], camera_matrix=matrix, backgrounds=black, light=code[LIGHT])
-        image_loss(again, images).backward()
+    Of worlds that read files the object is a sphere of 20,000 faces in frames of 640x480 pixels.
+    """
+    kind = WORLDS[name]
+    options = LinemodOptions("sphere") if kind is LinemodOptions else kind()
+    world = _sphere_over_noise() if kind is LinemodOptions else build(options)
+    config = RunConfig(options, kind.default_method, recipe=preset_recipe("laptop", kind))
+    sources = [_source(stage) for stage in stages_of(world)]
+    trainer = Trainer(config, world, sources, Ranks(0, 1, torch.device("cpu")))
+    choose_threads(trainer.warm_up, reserved=int(not config.terms.reads_images))
+    steps = len(world.stage_schedule) if isinstance(world, StagedWorld) else _STEPS
+    with trainer.synthetic.prefetching():
+        for _ in range(steps):  # compiles the kernels
+            trainer.step(1.0)
+        begun = time.perf_counter()
+        for _ in range(2 * steps):
+            trainer.step(1.0)
+        seconds = time.perf_counter() - begun
+        trainer.synthetic.wait_idle()
+    return config.recipe.batch_size * 2 * steps / seconds
 
-    step()  # compiles the kernels
-    begun = time.perf_counter()
-    for _ in range(_STEPS):
-        step()
-    return _BATCH * _STEPS / (time.perf_counter() - begun)
+
+def _sphere_over_noise() -> TwoStageWorld:
+    mesh = sphere(0.05, subdivisions=5)
+    kind = ObjectKind("sphere", (0,), mesh.diameter_m, mesh.box_corners_m)
+    noise = np.random.default_rng(0).integers(256, size=(_NUM_IMAGES, POOL_HEIGHT, POOL_WIDTH, 3), dtype=np.uint8)
+    camera = Intrinsics(np.array([[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1.0]]), 640, 480)
+    return TwoStageWorld("linemod", Object(kind, mesh, camera, 0.5, 1.5, lambda _: ClutterBackgrounds(noise)))
+
+
+def _source(stage: World) -> ImageSource:
+    """As a run's, but from few images, and none that are kept."""
+    if isinstance(stage, SingleObjectWorld):
+        return stage.source("train", 0, with_code=False, cache=Path())
+    with torch.no_grad():
+        images = stage.render(stage.sample(_NUM_IMAGES, (0,)))
+    return StoredImages((images.clamp(0, 1) * 255).round().byte(), None, seed=0, shuffle=True)

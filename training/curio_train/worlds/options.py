@@ -70,7 +70,8 @@ class LinemodOptions(WorldOptions):
     class_name: Annotated[str, tyro.conf.arg(name="class")]
     """The object: ape, benchvise, can, cat, …"""
     data: Path | None = None
-    """Folder in BOP's layout (lm or lmo) with models, models_info.json and camera.json."""
+    """Folder in BOP's layout (lm or lmo) with models, models_info.json and camera.json. Without it LineMOD's own are
+    downloaded, after a question."""
     backgrounds: Path | None = None
     """Folder of photographs for backgrounds; without it clutter is rendered."""
     photos: Path | None = None
@@ -87,7 +88,7 @@ class LinemodOptions(WorldOptions):
     """Train the paper's network, whose one encoder sees the frame squeezed to 128x128, instead of the two-stage
     detector: localisation in the whole frame, then pose in a crop around the object."""
     download: FlagCreatePairsOff[bool] = False
-    """Without --data, fetch LineMOD from BOP's repository into the cache folder, once; some gigabytes."""
+    """Without --data, fetch LineMOD's meshes and cameras from BOP's repository into --cache, once, without asking."""
 
     def __post_init__(self) -> None:
         """Make paths absolute, and refuse what contradicts itself."""

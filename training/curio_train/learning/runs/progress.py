@@ -34,7 +34,7 @@ IMAGE_ERROR = "image_dssim"
 _HISTORY, _STAGES = "history.jsonl", "stages"
 _STEPS_A_LINE = 20  # of history and curves
 _SECONDS_A_LINE = 10  # of the log where stderr is no terminal
-_BAR_WIDTH = 16
+_BAR_WIDTH = 12
 
 
 class Reporter:
@@ -110,8 +110,8 @@ class Reporter:
         self._sums.clear()
         self._counts.clear()
         self._since = (now.step, now.images, now.seconds)
-        losses = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
-        return f"{now.images:,} images  {rate:.0f} images/s  {losses}"
+        losses = ", ".join(f"{_named(name)} {value:.4g}" for name, value in means.items())
+        return f"{now.images:,} images, {rate:.0f}/s  {losses}"
 
     def _write(self, values: dict[str, float]) -> None:
         now = self._progress
@@ -172,6 +172,12 @@ def read_history(run: Path) -> list[dict[str, Any]]:
     except (ValueError, RecursionError) as exc:
         reason = str(exc)
     raise CheckpointError(f"{file} cannot be read ({reason}); delete it to go on without the curves so far")
+
+
+def _named(loss: str) -> str:
+    """A loss for people: "image loss"; where stages of a network learn in turn, "crop pose loss"."""
+    term, _, stage = loss.partition(", ")
+    return f"{stage or term} loss"
 
 
 def _drop_after(run: Path, step: int) -> None:

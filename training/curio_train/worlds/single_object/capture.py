@@ -24,7 +24,15 @@ from curio_train.camera import Intrinsics, load_intrinsics
 from curio_train.data.background_image import BACKGROUND_IMAGE_FRACTION, BackgroundImages, MixedBackgrounds
 from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, PhotographBackgrounds
 from curio_train.data.part_color import is_unpainted
-from curio_train.data.photographs import MAX_UNLABELLED, Photographs, UnlabelledPhotographs, read_frames, spread
+from curio_train.data.photographs import (
+    FEWEST_TO_LEARN_FROM,
+    MAX_UNLABELLED,
+    NUM_JUDGED,
+    Photographs,
+    UnlabelledPhotographs,
+    read_frames,
+    spread,
+)
 from curio_train.errors import UsageError
 from curio_train.geometry import random_rotations
 from curio_train.meshes.meshes import Mesh, load_mesh
@@ -37,10 +45,6 @@ from curio_train.worlds.single_object.two_stage import TwoStageWorld, frame_came
 from curio_train.worlds.single_object.viewpoints import upper_hemisphere_rotations
 from curio_train.worlds.single_object.world import Object
 from curio_train.worlds.tabletop.files import build_tabletop
-
-NUM_JUDGED = 40
-"""Photographs that a model is judged by, and that it therefore never learns from; with fewer than twice as many it
-learns from none."""
 
 
 class CapturePhotographs:
@@ -85,7 +89,7 @@ class CapturePhotographs:
     def _split(self) -> tuple[list[Path], list[Path]]:
         """Photographs to judge by, and the others; a model is judged by all if they are few."""
         paths = list(Photographs(self._folder).paths)
-        if len(paths) < 2 * NUM_JUDGED:
+        if len(paths) < FEWEST_TO_LEARN_FROM:
             return paths, []
         judged = spread(paths, NUM_JUDGED)
         return judged, sorted(set(paths).difference(judged))

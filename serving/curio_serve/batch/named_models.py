@@ -1,0 +1,66 @@
+"""The models that a command line names before its images: one, several, or all of a folder such as ``models/``."""
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from curio_serve.errors import UsageError
+from curio_serve.models.model_folder import CONFIG_FILE, MODEL_FILE, versions
+
+SERVED_MODEL = re.compile(r"(?P<address>(?:\[[^\]]+\]|[^/:\[\]]+):\d{1,5})/(?P<model>[^/]+(?:/\d+)?)")
+"""``HOST:PORT/NAME`` or ``HOST:PORT/NAME/VERSION``."""
+
+
+def split_models(first: str, rest: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The models and the images of a call ``MODEL [MODEL ...] IMAGES...``.
+
+    Args:
+        first: The first argument, always a model or a folder of models.
+        rest: The others; those at their beginning that are models are taken as such.
+
+    Raises:
+        UsageError: A model is named twice.
+        ModelError: A folder cannot be read.
+    """
+    count = 0
+    while count < len(rest) and _names_models(rest[count]):
+        count += 1
+    models = tuple(model for argument in (first, *rest[:count]) for model in _expanded(argument))
+    places = [os.path.realpath(model) if os.path.exists(model) else model for model in models]
+    twice = next((model for number, model in enumerate(models) if places[number] in places[:number]), None)
+    if twice is not None:
+        raise UsageError(f"{twice} is named twice; name each model once, and then the images")
+    return models, tuple(rest[count:])
+
+
+def is_model(path: str) -> bool:
+    """Whether a path is a model's folder, a version's folder or an .onnx file.
+
+    Raises:
+        ModelError: The folder cannot be read.
+    """
+    if not os.path.isdir(path):
+        return path.endswith(".onnx") and os.path.isfile(path)
+    has_file = any(os.path.exists(os.path.join(path, name)) for name in (CONFIG_FILE, MODEL_FILE))
+    return has_file or bool(versions(Path(path)))
+
+
+def _names_models(argument: str) -> bool:
+    if os.path.exists(argument):
+        return is_model(argument) or bool(_models_in(argument))
+    return SERVED_MODEL.fullmatch(argument) is not None
+
+
+def _expanded(argument: str) -> list[str]:
+    """The argument, or the models in it where it is a folder of models."""
+    return [argument] if not os.path.isdir(argument) or is_model(argument) else _models_in(argument) or [argument]
+
+
+def _models_in(folder: str) -> list[str]:
+    """Model folders in a folder, by name; nothing deeper is looked at."""
+    if not os.path.isdir(folder):
+        return []
+    with os.scandir(folder) as entries:
+        paths = sorted(entry.path for entry in entries if os.path.exists(os.path.join(entry.path, CONFIG_FILE)))
+    return [path for path in paths if is_model(path)]

@@ -1,0 +1,59 @@
+"""An exported model: whether it can be run, and was trained for this mesh and such a camera."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from curio_proto.v1.model_spec_pb2 import ModelSpec
+
+from curio_train.camera import Intrinsics
+from curio_train.doctor.finding import Finding
+from curio_train.errors import CurioError
+from curio_train.exported_model import ExportedModel, find_model
+from curio_train.meshes.meshes import METRES, Mesh
+
+_SAME_SIZE = 0.01
+_OTHER_VIEW = 2.0
+
+
+def examine_model(path: Path, mesh: Mesh | None, camera: Intrinsics | None) -> Iterator[Finding]:
+    """Whether the model can be run, and was trained for this mesh and such a camera."""
+    try:
+        spec = ExportedModel.open(find_model(path)).spec
+    except CurioError as exc:
+        yield Finding("model", "bad", str(exc), fault="model unreadable")
+        return
+    names = ", ".join(kind.name for kind in spec.objects)
+    yield Finding("model", "good", f"{path}: {spec.name} of the world {spec.world}, finds {names}")
+    if mesh is not None:
+        yield from _other_mesh(spec, mesh)
+    if camera is not None and spec.camera.camera_matrix:
+        yield from _other_view(spec, camera)
+
+
+def _other_mesh(spec: ModelSpec, mesh: Mesh) -> Iterator[Finding]:
+    if any(kind.mesh_sha256 == mesh.sha256 for kind in spec.objects):
+        return
+    ratios = [mesh.diameter_m / kind.diameter_m for kind in spec.objects if kind.diameter_m > 0]
+    diameters = ", ".join(f"{kind.diameter_m * 1000:.4g} mm" for kind in spec.objects)
+    text = f"the model was trained for another mesh file: SHA-256 {mesh.sha256[:12]}… is none of the model's"
+    size = f"its objects have diameters of {diameters}, the mesh {mesh.diameter_m * 1000:.4g} mm"
+    if any(abs(ratio - 1) < _SAME_SIZE for ratio in ratios):
+        remedy = "The size agrees: it may be another export of the same part. Check its origin and axes, or train again"
+        yield Finding("model mesh", "warning", f"{text}; {size}", remedy, fault="other mesh")
+        return
+    steps = {a / b for a in METRES.values() for b in METRES.values() if a != b}
+    unit = any(abs(ratio / step - 1) < _SAME_SIZE for ratio in ratios for step in steps)
+    remedy = "Set --mesh-unit: a unit was mistaken" if unit else "Name the model's own mesh, or train for this one"
+    yield Finding("model mesh", "bad", f"{text}; {size}", remedy, fault="mesh unit" if unit else "other mesh")
+
+
+def _other_view(spec: ModelSpec, camera: Intrinsics) -> Iterator[Finding]:
+    """Any K can be warped to the model's, but what lies outside the model's view is not seen."""
+    own = np.array(spec.camera.camera_matrix).reshape(3, 3)[0, 0] / spec.camera.width
+    ratio = camera.matrix[0, 0] / camera.width / own
+    if not 1 / _OTHER_VIEW <= ratio <= _OTHER_VIEW:
+        wider = "wider" if ratio < 1 else "narrower"
+        text = f"the camera's view is much {wider} than the model's own ({ratio:.2g} of its focal length)"
+        remedy = "Objects will be seen at other sizes than in training: train with this camera"
+        yield Finding("model camera", "warning", text, remedy, "possible", fault="other view")
