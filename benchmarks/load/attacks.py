@@ -35,7 +35,8 @@ def unfolding(address: str, seconds: float) -> int:
 def raw_frames(address: str, seconds: float, num_callers: int = 40) -> int:
     """So many callers with raw frames of 10 megapixels; the number sent."""
     raw = RawImage(format=PIXEL_FORMAT_RGB8, width=3648, height=2736, data=bytes(3648 * 2736 * 3))
-    request = DetectRequest(models=[ModelSelector(name=MODEL)], camera=Camera(camera_matrix=np.ravel(K)), raw=raw)
+    camera = Camera(camera_matrix=np.ravel(np.diag([5.7, 5.7, 1]) @ K))
+    request = DetectRequest(models=[ModelSelector(name=MODEL)], camera=camera, raw=raw)
     data = request.SerializeToString()
     return _repeat(address, seconds, num_callers, lambda channel: channel.unary_unary(_DETECT)(data, timeout=20))
 
