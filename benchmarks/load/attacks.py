@@ -13,7 +13,7 @@ from curio_proto.v1.detector_pb2 import PIXEL_FORMAT_RGB8, Camera, DetectRequest
 
 from load.generator import MODEL, K
 
-_DETECT = "/curio.v1.PoseDetector/Detect"
+_DETECT, _STREAM = "/curio.v1.PoseDetector/Detect", "/curio.v1.PoseDetector/DetectStream"
 _LARGE = [("grpc.max_send_message_length", -1), ("grpc.use_local_subchannel_pool", 1)]
 _PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 _DATA, _HEADERS, _SETTINGS, _PING, _WINDOW_UPDATE = 0, 1, 4, 6, 8
@@ -35,7 +35,8 @@ def unfolding(address: str, seconds: float) -> int:
 def raw_frames(address: str, seconds: float, num_callers: int = 40) -> int:
     """So many callers with raw frames of 10 megapixels; the number sent."""
     raw = RawImage(format=PIXEL_FORMAT_RGB8, width=3648, height=2736, data=bytes(3648 * 2736 * 3))
-    request = DetectRequest(models=[ModelSelector(name=MODEL)], camera=Camera(camera_matrix=np.ravel(K)), raw=raw)
+    camera = Camera(camera_matrix=np.ravel(np.diag([5.7, 5.7, 1]) @ K))
+    request = DetectRequest(models=[ModelSelector(name=MODEL)], camera=camera, raw=raw)
     data = request.SerializeToString()
     return _repeat(address, seconds, num_callers, lambda channel: channel.unary_unary(_DETECT)(data, timeout=20))
 
@@ -57,7 +58,12 @@ def unfinished(address: str, seconds: float, num_calls: int = 160) -> int:
         return sum(threads.map(lambda _: _unfinished_call(address, end), range(num_calls)))
 
 
-def empty_calls(address: str, seconds: float, num_connections: int = 16) -> int:
+def idle_streams(address: str, seconds: float) -> int:
+    """Streams that never send a frame: as many as a server has, and again as soon as it has ended one."""
+    return empty_calls(address, seconds, path=_STREAM)
+
+
+def empty_calls(address: str, seconds: float, num_connections: int = 16, path: str = _DETECT) -> int:
     """Calls that never send their message, some 300 a second on so many connections; the number begun."""
     host, port = address.rsplit(":", 1)
     connections: dict[int, tuple[socket.socket, int]] = {}
@@ -69,7 +75,7 @@ def empty_calls(address: str, seconds: float, num_connections: int = 16) -> int:
                     connections[number] = (socket.create_connection((host, int(port)), timeout=5), 1)
                     connections[number][0].sendall(opening())
                 connection, stream = connections[number]
-                connection.sendall(_call(stream + 2))
+                connection.sendall(_call(stream + 2, path))
                 connections[number] = (connection, stream + 2)
                 num_begun += 1
             except OSError:  # the server has closed it
@@ -171,13 +177,13 @@ def _frame(kind: int, flags: int, stream: int, data: bytes) -> bytes:
 
 def opening(*more: tuple[bytes, bytes]) -> bytes:
     """The beginning of a connection, and of a call of Detect on it, with further headers."""
-    return _PREFACE + _frame(_SETTINGS, 0, 0, b"") + _call(1, *more)
+    return _PREFACE + _frame(_SETTINGS, 0, 0, b"") + _call(1, _DETECT, *more)
 
 
-def _call(stream: int, *more: tuple[bytes, bytes]) -> bytes:
-    """A call of Detect without its message. Headers are literals without an index (HPACK)."""
+def _call(stream: int, path: str, *more: tuple[bytes, bytes]) -> bytes:
+    """A call without its message. Headers are literals without an index (HPACK)."""
     headers = {
-        ":method": "POST", ":scheme": "http", ":path": _DETECT, ":authority": "attack",
+        ":method": "POST", ":scheme": "http", ":path": path, ":authority": "attack",
         "te": "trailers", "content-type": "application/grpc",
     }  # fmt: skip
     texts = [*(tuple(text.encode() for text in pair) for pair in headers.items()), *more]

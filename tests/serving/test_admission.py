@@ -14,10 +14,11 @@ from prometheus_client import CollectorRegistry
 
 
 class Caller:
-    """A call without gRPC: its deadline, and a way to hang up."""
+    """A call without gRPC: its deadline, its connection, and a way to hang up."""
 
-    def __init__(self, remaining_s: float | None = None) -> None:
+    def __init__(self, remaining_s: float | None = None, peer: str = "a") -> None:
         self._remaining_s = remaining_s
+        self._peer = peer
         self._callbacks: list[Callable[[], None]] = []
         self._has_ended = False
         self.is_waiting = threading.Event()
@@ -27,6 +28,9 @@ class Caller:
 
     def is_active(self) -> bool:
         return not self._has_ended
+
+    def peer(self) -> str:
+        return self._peer
 
     def add_callback(self, callback: Callable[[], None]) -> bool:
         self._callbacks.append(callback)
@@ -218,6 +222,15 @@ def test_who_would_come_too_late_is_refused_at_once(monkeypatch: pytest.MonkeyPa
             pass
         assert caught.value.retry_after_s == pytest.approx(0.3, rel=0.05)
         with queue.reserve(Caller(0.4)), queue.reserve(Caller(None)):
+            pass
+
+
+def test_reserved_calls_that_a_call_overtakes_do_not_refuse_it() -> None:
+    queue = WorkQueue(1, 2, Metrics(CollectorRegistry()), {"short": 2, "long": 0}.__getitem__)
+    with queue.reserve(Caller(peer="long")), queue.reserve(Caller(peer="long")), queue.reserve(Caller(peer="long")):
+        with pytest.raises(Overloaded, match="3 are waiting"), queue.reserve(Caller(peer="long")):
+            pass
+        with queue.reserve(Caller(peer="short")):
             pass
 
 

@@ -1,5 +1,6 @@
 """Attacks on a real server: memory, work and places are bounded, and it can always be ended."""
 
+import contextlib
 import os
 import signal
 import socket
@@ -18,6 +19,8 @@ import grpc
 import pytest
 from curio_proto.v1 import detector_pb2 as pb
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
+from curio_serve.client import PoseClient
+from curio_serve.errors import Overloaded
 from curio_serve.server import metrics_port
 from load.attacks import opening
 from prometheus_client import CollectorRegistry
@@ -117,6 +120,33 @@ def test_a_connection_has_a_part_of_the_streams(
         assert next(PoseDetectorStub(other).DetectStream(iter([REQUEST]), timeout=30)).results
         for stream in streams:
             stream.cancel()
+
+
+def test_idle_streams_do_not_keep_others_out(
+    start_server: StartServer, models_dir: Path, never: Callable[[], Iterator[bytes]]
+) -> None:
+    server = start_server(models_dir, "--max-streams", "8")
+
+    def one() -> Iterator[pb.DetectRequest]:
+        yield REQUEST
+        yield from never()
+
+    options = [("grpc.use_local_subchannel_pool", 1)]
+    with (
+        grpc.insecure_channel(server.address, options=options) as greedy,
+        PoseClient(server.address, timeout_s=30) as other,
+    ):
+        idle = [PoseDetectorStub(greedy).DetectStream(one()) for _ in range(8)]
+        assert all(next(stream).results for stream in idle)
+        answers: list[pb.DetectResponse] = []
+        end = time.monotonic() + 30
+        while not answers and time.monotonic() < end:
+            with contextlib.suppress(Overloaded):  # until one of them counts as idle
+                answers = list(other.detect_stream([REQUEST], timeout_s=30))
+        assert answers[0].results
+        assert sum(call.is_active() for call in idle) >= 7
+        for call in idle:
+            call.cancel()
 
 
 def test_models_times_regions_are_bounded(server: Any) -> None:

@@ -76,6 +76,14 @@ class Desk:
 
         return self._threads.submit(work)
 
+    def know(self, peer: str, length: int) -> None:
+        """Receive a message of such a length from a connection, and answer it."""
+        caller, answered = Caller(peer), threading.Event()
+        answer = self.call(caller, done=answered)
+        caller.send(b"x" * length)
+        answered.set()
+        assert len(answer.result(30)) == length
+
     def close(self) -> None:
         self.done.set()
         self._threads.shutdown()
@@ -117,6 +125,7 @@ def test_a_message_is_read_only_when_there_is_memory(make_desk: Callable[..., De
 
 def test_the_connection_that_holds_least_comes_first(make_desk: Callable[..., Desk]) -> None:
     desk = make_desk()
+    desk.know("modest", 100)
     greedy, released = [Caller("greedy") for _ in range(4)], threading.Event()
     calls = []
     for caller in greedy[:2]:
@@ -135,6 +144,85 @@ def test_the_connection_that_holds_least_comes_first(make_desk: Callable[..., De
     assert calls[0].result(30)
     for caller in (*greedy, modest):
         caller.cancel()
+
+
+def test_short_messages_do_not_wait_behind_long_ones(
+    make_desk: Callable[..., Desk], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_LONG_BYTES", 10)
+    monkeypatch.setattr(module, "_HURRIED_S", 60.0)
+    desk = make_desk(held_bytes=400)
+    callers = [Caller(f"long {number}") for number in range(3)]
+    for caller in callers:
+        desk.know(caller.peer(), 100)
+    desk.know("short", 5)
+    answers = [desk.call(caller) for caller in callers]
+    assert all(caller.is_reading.wait(30) for caller in callers[:2])
+    assert callers[2].is_waiting.wait(30)
+    short, fresh = Caller("short"), Caller("fresh")
+    for caller in (short, fresh):
+        answers.append(desk.call(caller))
+        assert caller.is_reading.wait(30)
+    # Half of the memory, which long messages share, is taken; the rest is now, too.
+    assert not callers[2].is_reading.is_set()
+    assert (desk.reception.num_behind("short"), desk.reception.num_behind("long 0")) == (1, 0)
+    last = Caller("short")
+    answers.append(desk.call(last))
+    assert last.is_waiting.wait(30)
+    fresh.cancel()
+    assert last.is_reading.wait(30)
+    assert not callers[2].is_reading.is_set()
+    callers[0].cancel()
+    assert callers[2].is_reading.wait(30)
+    for caller in (*callers, short, last):
+        caller.cancel()
+    assert all(answer.exception(30) for answer in answers)
+
+
+def test_one_long_message_makes_the_next_ones_count_as_long(
+    make_desk: Callable[..., Desk], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_LONG_BYTES", 10)
+    monkeypatch.setattr(module, "_HURRIED_S", 60.0)
+    desk = make_desk(held_bytes=100)
+    for length in (100, 5, 5):
+        desk.know("both", length)
+    desk.know("short", 5)
+    blocking, waiting = Caller("other"), Caller("both")
+    calls = [desk.call(blocking)]
+    assert blocking.is_reading.wait(30)
+    calls.append(desk.call(waiting))
+    assert waiting.is_waiting.wait(30)
+    assert desk.reception.num_behind("short") == 1
+    for caller in (blocking, waiting):
+        caller.cancel()
+    assert all(call.exception(30) for call in calls)
+
+
+def test_first_messages_that_do_not_come_leave_half_of_the_memory(
+    make_desk: Callable[..., Desk], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_HURRIED_S", 60.0)
+    desk = make_desk()
+    for peer in ("known", "better known"):
+        desk.know(peer, 100)
+    silent = [Caller(f"silent {number}") for number in range(3)]
+    calls = []
+    for caller in silent[:2]:
+        calls.append(desk.call(caller))
+        assert caller.is_reading.wait(30)
+    known = [Caller("known"), Caller("better known")]
+    for caller in (silent[2], *known):
+        calls.append(desk.call(caller))
+        assert caller.is_waiting.wait(30)
+    silent[0].cancel()
+    assert known[0].is_reading.wait(30)
+    silent[1].cancel()
+    assert silent[2].is_reading.wait(30)
+    assert not known[1].is_reading.is_set()
+    for caller in (*silent, *known):
+        caller.cancel()
+    assert all(call.exception(30) for call in calls)
 
 
 @pytest.mark.parametrize("is_stream", [False, True])

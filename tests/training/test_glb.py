@@ -1,6 +1,9 @@
 """A scene written as GLB stands where it stood: trimesh reads every pose back, and so do we, with the whole code."""
 
 import json
+import os
+import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -100,3 +103,55 @@ def test_another_programs_file_is_refused(tmp_path: Path) -> None:
     path.write_bytes(trimesh.Scene([trimesh.creation.box()]).export(file_type="glb"))
     with pytest.raises(DataError, match="no camera written by curio"):
         from_glb(path)
+
+
+def _of_tree(tree: object) -> bytes:
+    text = tree if isinstance(tree, bytes) else json.dumps(tree).encode()
+    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A) + text
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        b"[" * 100_000,
+        {"nodes": 5},
+        {"nodes": [{"extras": {"curio": {}}}]},
+        {"nodes": [{"name": "camera", "extras": {"curio": {}}}]},
+        {"nodes": [{"name": "camera", "matrix": [0] * 16, "extras": {"curio": {}}}]},
+        {"nodes": [{"name": "camera", "extras": {"curio": {}}}, {"name": "light", "extras": {"curio": {}}}]},
+    ],
+)
+def test_damaged_content_is_refused(tmp_path: Path, tree: object) -> None:
+    path = tmp_path / "damaged.glb"
+    path.write_bytes(_of_tree(tree))
+    with pytest.raises(DataError, match=r"damaged\.glb"):
+        from_glb(path)
+
+
+@pytest.mark.parametrize("read", [from_glb, lambda path: list(read_scenes(path))])
+def test_only_regular_files_of_some_size_are_read(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    pipe, large = tmp_path / "pipe", tmp_path / "large"
+    os.mkfifo(pipe)
+    large.touch()
+    os.truncate(large, 50 << 30)
+    for file, expected in ((pipe, "not a regular file"), (Path("/dev/zero"), "not a regular file"), (large, "at most")):
+        with pytest.raises(DataError, match=expected):
+            read(file)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "[" * 100_000,
+        '{"detections": [], "image": "a.png", "width": 1e999, "height": 4, "camera_matrix": [[1,0,0],[0,1,0],[0,0,1]]}',
+        '{"world": "spheres", "code": [1]}',
+        '{"world": "spheres", "code": {"a": [[1], []]}}',
+        '{"world": "spheres", "code": {}}',
+        '{"world": "spheres", "code": {"light": 1}}',
+    ],
+)
+def test_damaged_lines_are_refused(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "found.jsonl"
+    path.write_text(f"{line}\n")
+    with pytest.raises(DataError, match=r"found\.jsonl, line 1"):
+        list(read_scenes(path))

@@ -1,5 +1,6 @@
 """What a run may begin with: runs and exported models give the same network, and what they are not is told."""
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +20,7 @@ from curio_train.learning.runs.session import learn
 from curio_train.learning.state import TrainState
 from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions
+from safetensors.torch import save_file
 from torch import Tensor
 
 CONFIG = RunConfig(CirclesOptions(), method="noncur")
@@ -114,6 +116,28 @@ def cut(version: Path) -> None:
     file.write_bytes(file.read_bytes()[:-7])
 
 
+def a_pipe(version: Path) -> None:
+    (version / "weights.safetensors").unlink()
+    os.mkfifo(version / "weights.safetensors")
+
+
+def a_device(version: Path) -> None:
+    (version / "weights.safetensors").unlink()
+    (version / "weights.safetensors").symlink_to("/dev/zero")
+
+
+def far_too_large(version: Path) -> None:
+    os.truncate(version / "weights.safetensors", 50 << 30)
+
+
+def with_strange_notes(version: Path) -> None:
+    save_file(
+        {},
+        version / "weights.safetensors",
+        dict.fromkeys(("images_seen", "training_seconds", "synthetic_labels"), "many"),
+    )
+
+
 def of_nothing(version: Path) -> None:
     (version / "model.onnx").unlink()
 
@@ -123,6 +147,10 @@ def of_nothing(version: Path) -> None:
     [
         (without_weights, CheckpointError, r"circles/1 was exported without weights.safetensors"),
         (cut, CheckpointError, r"weights\.safetensors cannot be read .*export the model anew"),
+        (a_pipe, CheckpointError, r"weights\.safetensors cannot be read \(.*not a regular file"),
+        (a_device, CheckpointError, r"weights\.safetensors cannot be read \(.*not a regular file"),
+        (far_too_large, CheckpointError, r"weights\.safetensors cannot be read \(.*at most 2147483648 are accepted"),
+        (with_strange_notes, CheckpointError, r"weights\.safetensors says .*many.*export the model anew"),
         (of_nothing, UsageError, "neither a run folder .* nor a model"),
     ],
 )

@@ -1,6 +1,7 @@
 """The plane that parts stand on: files of camera places, what is seen of it, and where anything ever lay."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,7 @@ def test_where_things_ever_were_is_told_from_noise_and_exposure() -> None:
         (json.dumps({"plate.png": {"cam_from_world": "here"}}), "no matrix"),
         (json.dumps({"plate.png": {"cam_from_world": np.diag([2, 2, 2, 1]).tolist()}}), "not rigid"),
         (json.dumps({"plate.png": {"cam_from_world": camera(-20).tolist()}}), "looks up"),
+        ("[" * 100_000, "not JSON .*nested too deeply"),
     ],
 )
 def test_camera_places_that_do_not_do(tmp_path: Path, content: str | None, expected: str) -> None:
@@ -69,3 +71,13 @@ def test_camera_places_that_do_not_do(tmp_path: Path, content: str | None, expec
         file.write_text(content)
     with pytest.raises(CameraError, match=expected):
         CameraPoseFile.read(file).pose_above_plane(tmp_path / "plate.png")
+
+
+def test_a_file_of_camera_places_is_a_regular_file(tmp_path: Path) -> None:
+    pipe, large = tmp_path / "pipe.json", tmp_path / "large.json"
+    os.mkfifo(pipe)
+    large.touch()
+    os.truncate(large, 50 << 30)
+    for file, expected in ((pipe, "not a regular file"), (Path("/dev/zero"), "not a regular file"), (large, "at most")):
+        with pytest.raises(CameraError, match=f"--plane {file}: cannot be read .*{expected}"):
+            CameraPoseFile.read(file)

@@ -33,6 +33,9 @@ class Call(Protocol):
     def is_active(self) -> bool:
         """Whether the call has not ended."""
 
+    def peer(self) -> str:
+        """The connection that it came over."""
+
     def add_callback(self, callback: Callable[[], None]) -> bool:
         """Have a function called when the call ends; False if it has ended already."""
 
@@ -59,9 +62,20 @@ class Place:
 class WorkQueue:
     """A fixed number of slots behind a bounded queue, first come, first served."""
 
-    def __init__(self, num_slots: int, max_waiting: int, metrics: Metrics) -> None:
+    def __init__(
+        self, num_slots: int, max_waiting: int, metrics: Metrics, num_behind: Callable[[str], int] = lambda _: 0
+    ) -> None:
+        """Nobody waits yet.
+
+        Args:
+            num_slots: Calls that work at the same time.
+            max_waiting: Calls that wait for that.
+            metrics: Show both.
+            num_behind: Given a connection, how many calls with a reservation a further call of it would overtake.
+        """
         self.num_slots = num_slots
         self._max_waiting = max_waiting
+        self._num_behind = num_behind
         self._lock = threading.Lock()
         self._num_free = num_slots
         self._waiting: deque[Place] = deque()
@@ -89,7 +103,8 @@ class WorkQueue:
         with self._lock:
             if self._why_not(remaining_s):
                 self._drop_old_reservations()
-                if reason := self._why_not(remaining_s):
+                num_behind = min(self._num_behind(call.peer()), len(self._reserved))
+                if reason := self._why_not(remaining_s, num_behind):
                     self._refuse(reason)
             place = Place()
             self._reserved[place] = time.monotonic()
@@ -170,9 +185,9 @@ class WorkQueue:
             else:
                 self._num_free += 1
 
-    def _why_not(self, remaining_s: float | None) -> str:
+    def _why_not(self, remaining_s: float | None, num_behind: int = 0) -> str:
         """Why a further call cannot be answered in time; empty if it can, as far as is known."""
-        num_ahead = len(self._reserved) + len(self._waiting) - self._num_free
+        num_ahead = len(self._reserved) - num_behind + len(self._waiting) - self._num_free
         if num_ahead >= self._max_waiting:
             return _IS_FULL
         if num_ahead <= 0 or remaining_s is None:

@@ -2,9 +2,7 @@
 
 import itertools
 import secrets
-import threading
 import time
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +15,8 @@ from curio_serve.api.admission import WorkQueue, check_is_wanted
 from curio_serve.api.messages import camera_from_message, frame_from_raw, region_from_message
 from curio_serve.api.registration import only_message
 from curio_serve.api.status import CallLog, frame_error
-from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, Overloaded
+from curio_serve.api.streams import Streams
+from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError
 from curio_serve.imaging import image
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
@@ -26,8 +25,6 @@ from curio_serve.telemetry import Metrics
 
 Context = grpc.ServicerContext
 _MAX_ID_LENGTH = 128
-# One connection may have this part of the streams, but at least so many.
-_STREAM_FRACTION, _LEAST_STREAMS = 4, 8
 _ID_PREFIX, _ID_NUMBERS = secrets.token_hex(8), itertools.count()
 
 
@@ -49,9 +46,8 @@ class PoseService(PoseDetectorServicer):
     def __init__(self, repository: Repository, work: WorkQueue, limits: Limits, metrics: Metrics) -> None:
         self._repository, self._work, self._limits, self._metrics = repository, work, limits, metrics
         self._calls = CallLog(metrics)
-        self._streams: Counter[str] = Counter()  # of each connection
-        self._lock = threading.Lock()
-        metrics.streams.set_function(self._streams.total)
+        self._streams = Streams(limits.max_streams)
+        metrics.streams.set_function(lambda: len(self._streams))
 
     def Detect(self, requests: Iterator[messages.DetectRequest], context: Context) -> messages.DetectResponse:
         """Answer the one request; a full queue refuses it before it is read."""
@@ -66,10 +62,12 @@ class PoseService(PoseDetectorServicer):
         self, requests: Iterator[messages.DetectRequest], context: Context
     ) -> Iterator[messages.DetectResponse]:
         with self._calls.record("DetectStream", context):
-            self._open_stream(context)
+            stream = self._streams.open(context)
             # One frame of a stream at a time: the next is read when this one is answered, so the client feels the load.
             for request in requests:
+                stream.works()
                 yield self._frame_of_stream(request, context)
+                stream.waits()
 
     def ListModels(self, request: messages.ListModelsRequest, context: Context) -> messages.ListModelsResponse:
         with self._calls.record("ListModels", context):
@@ -93,28 +91,6 @@ class PoseService(PoseDetectorServicer):
         except CurioError as exc:
             request_id = request.request_id[:_MAX_ID_LENGTH] or new_request_id()
             return messages.DetectResponse(request_id=request_id, error=frame_error(exc))
-
-    def _open_stream(self, context: Context) -> None:
-        peer, most = context.peer(), self._limits.max_streams
-        most_of_peer = max(_LEAST_STREAMS, most // _STREAM_FRACTION)
-        with self._lock:
-            if self._streams.total() >= most:
-                raise Overloaded(f"{most} streams are open, which is the limit (--max-streams)", 1.0)
-            if self._streams[peer] >= most_of_peer:
-                raise Overloaded(
-                    f"{most_of_peer} streams of this connection are open, which is the limit of one connection "
-                    f"(a part of --max-streams {most}); open another connection, or close a stream",
-                    1.0,
-                )
-            self._streams[peer] += 1
-        if not context.add_callback(partial(self._close_stream, peer)):
-            self._close_stream(peer)
-
-    def _close_stream(self, peer: str) -> None:
-        with self._lock:
-            self._streams[peer] -= 1
-            if not self._streams[peer]:
-                del self._streams[peer]
 
     def _list(self) -> messages.ListModelsResponse:
         answer = messages.ListModelsResponse()

@@ -1,8 +1,11 @@
 """Bounds the memory that arriving and waiting messages take, and the time that they may take to arrive.
 
 gRPC tells the length of a message only once it is there. So a call reserves memory for the longest message before it
-reads its own, keeps as much as its message takes, and gives that back when it ends. A call without memory waits;
-the connection that holds least comes first, and among equals one whose messages have arrived before.
+reads its own, keeps as much as its message takes, and gives that back when it ends. A call without memory waits; the
+connection comes first that would hold least, if its message is as long as its last ones.
+
+Long messages share one half of the memory. Each is copied while the interpreter is locked, so with many of them at a
+time every other call would wait for seconds; and calls with short messages shall not wait for memory.
 
 A stream may be idle for long, so it reserves nothing before a message is there. If the whole process takes too much
 memory, the streams that are waiting for messages are ended.
@@ -25,7 +28,9 @@ from curio_serve.telemetry import log
 _TICK_S = 0.1
 # While other calls wait for memory, a message has to arrive within this time.
 _HURRIED_S = 1.0
-_MOST_PROVEN = 4096
+_MOST_KNOWN = 4096
+# The shortest of the long messages. The first of a connection is taken for so long, and not for a long one.
+_LONG_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,8 @@ class _Arrival:
     """Where its thread sleeps until there is memory."""
     num_bytes: int = 0
     """Memory that it holds or has reserved."""
+    claim: int = 0
+    """What counts of it when connections are compared: until it has arrived, its expected length."""
     limit_s: float = 0.0
     since: float = 0.0
     """When reading began, on the monotonic clock."""
@@ -68,9 +75,11 @@ class Reception:
         """Nothing is watched before :meth:`start`."""
         self._limits = limits
         self._lock = threading.Lock()
-        self._free = max(limits.held_bytes, limits.message_bytes)
-        self._held: Counter[str] = Counter()  # bytes of each connection
-        self._proven: dict[str, None] = {}  # connections whose messages have arrived, oldest first
+        self._all_bytes = self._free = max(limits.held_bytes, limits.message_bytes)
+        self._claims: Counter[str] = Counter()  # bytes of each connection
+        self._long_claims = 0  # bytes of long messages
+        self._lengths: dict[str, int] = {}  # expected of each connection that has sent a message, oldest first
+        self._firsts: set[_Arrival] = set()  # those with memory for the first message of a connection
         self._waiting: list[_Arrival] = []
         self._arriving: set[_Arrival] = set()
         self._stopped = threading.Event()
@@ -122,28 +131,43 @@ class Reception:
             raise CallCancelled(f"the call was ended because its message {waited}") from exc
         finally:
             self._arriving.discard(arrival)
-        self._release(arrival, arrival.num_bytes - len(data))
-        if arrival.peer not in self._proven:
-            self._prove(arrival.peer)
+        self._release(arrival, arrival.num_bytes - len(data), len(data))
         return data
 
-    def _prove(self, peer: str) -> None:
-        with self._lock:
-            if len(self._proven) >= _MOST_PROVEN:
-                del self._proven[next(iter(self._proven))]
-            self._proven[peer] = None
+    def _learn(self, peer: str, length: int) -> None:
+        """Expect messages of such a length from a connection; after a long one, its next short ones count as long."""
+        if peer not in self._lengths and len(self._lengths) >= _MOST_KNOWN:
+            del self._lengths[next(iter(self._lengths))]
+        self._lengths[peer] = max(length, self._lengths.get(peer, 0) // 2)
 
-    def _rank(self, waiting: _Arrival) -> tuple[int, bool]:
-        """Sorts the waiting: connections that hold least come first, and among them those that have delivered."""
-        return self._held[waiting.peer], waiting.peer not in self._proven
+    def _expected(self, peer: str) -> int:
+        return self._lengths.get(peer, min(_LONG_BYTES, self._limits.message_bytes))
+
+    def _rank(self, peer: str) -> tuple[bool, int]:
+        """Sorts the waiting; the least comes first.
+
+        First messages, which may never come, get one half of the memory before the others, and the rest after them.
+        """
+        are_many = 2 * len(self._firsts) * self._limits.message_bytes >= self._all_bytes
+        return are_many and peer not in self._lengths, self._claims[peer] + self._expected(peer)
+
+    def _may_have(self, peer: str) -> bool:
+        expected = self._expected(peer)
+        return expected <= _LONG_BYTES or not self._long_claims or self._long_claims + expected <= self._all_bytes // 2
+
+    def num_behind(self, peer: str) -> int:
+        """How many calls wait for memory that a further call of a connection would overtake."""
+        with self._lock:
+            rank = self._rank(peer)
+            return sum(self._rank(waiting.peer) > rank for waiting in self._waiting)
 
     def _reserve(self, arrival: _Arrival) -> None:
         """Reserve memory for the longest message, if need be after others."""
         with self._lock:
-            if not self._waiting and self._free >= self._limits.message_bytes:
-                self._grant(arrival)
-                return
             self._waiting.append(arrival)
+            self._hand_out()
+            if arrival.num_bytes:
+                return
         if not arrival.context.add_callback(arrival.place.wake):
             arrival.place.wake()
         arrival.place.sleep(None)
@@ -153,31 +177,51 @@ class Reception:
             self._waiting.remove(arrival)
         raise CallCancelled("the call ended before there was memory for its message (--message-memory-mb)")
 
+    def _hand_out(self) -> None:
+        """Give free memory to those who wait and may have it."""
+        while self._free >= self._limits.message_bytes:
+            candidates = [waiting for waiting in self._waiting if self._may_have(waiting.peer)]
+            if not candidates:
+                return
+            following = min(candidates, key=lambda waiting: self._rank(waiting.peer))
+            self._waiting.remove(following)
+            self._grant(following)
+            following.place.wake()
+
     def _grant(self, arrival: _Arrival) -> None:
         arrival.num_bytes = self._limits.message_bytes
         self._free -= arrival.num_bytes
-        self._held[arrival.peer] += arrival.num_bytes
+        if arrival.peer not in self._lengths:
+            self._firsts.add(arrival)
+        self._claim(arrival, self._expected(arrival.peer))
 
-    def _release(self, arrival: _Arrival, num_bytes: int) -> None:
+    def _claim(self, arrival: _Arrival, num_bytes: int) -> None:
+        self._claims[arrival.peer] += num_bytes - arrival.claim
+        self._long_claims += num_bytes * (num_bytes > _LONG_BYTES) - arrival.claim * (arrival.claim > _LONG_BYTES)
+        arrival.claim = num_bytes
+        if not self._claims[arrival.peer]:
+            del self._claims[arrival.peer]
+
+    def _release(self, arrival: _Arrival, num_bytes: int, length: int = 0) -> None:
         """Give back that much of an arrival's memory, and let others have it.
 
         Args:
             arrival: Holds it.
             num_bytes: Negative for a stream's message, which is there before its memory is reserved.
+            length: Of its message, if that has just arrived.
         """
-        if not num_bytes:
+        if not num_bytes and not length:
             return
         with self._lock:
             arrival.num_bytes -= num_bytes
             self._free += num_bytes
-            self._held[arrival.peer] -= num_bytes
-            if not self._held[arrival.peer]:
-                del self._held[arrival.peer]
-            while self._waiting and self._free >= self._limits.message_bytes:
-                following = min(self._waiting, key=self._rank)
-                self._waiting.remove(following)
-                self._grant(following)
-                following.place.wake()
+            self._claim(arrival, length)
+            self._firsts.discard(arrival)
+            if length:
+                self._learn(arrival.peer, length)
+            elif arrival.is_late:
+                self._lengths.pop(arrival.peer, None)
+            self._hand_out()
 
     def _watch(self) -> None:
         while not self._stopped.wait(_TICK_S):

@@ -54,12 +54,12 @@ class PoseServer:
         self._repository = Repository(config.models, config.versions, Runtime(config.providers, batch))
         # Calls that wait for a batch leave their core to others, which decode meanwhile.
         workers = config.workers or num_cores() + (batch if batch > 1 else 0)
-        self._work = WorkQueue(workers, config.queue, self._metrics)
+        self._reception = Reception(_reception_limits(config))
+        self._work = WorkQueue(workers, config.queue, self._metrics, self._reception.num_behind)
         # Watchers of health wait without a thread each.
         watchers = ThreadPoolExecutor(1)
         self._health = health.HealthServicer(experimental_non_blocking=True, experimental_thread_pool=watchers)
         self._inference = InferenceService(self._repository, self._work, self._metrics)
-        self._reception = Reception(_reception_limits(config))
         self._check = ChildCheck()
         self._server: grpc.Server | None = None
         self._stopped = threading.Event()

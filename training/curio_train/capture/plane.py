@@ -3,7 +3,6 @@
 The world's frame is that of ``--calibrate --views-out``: y up, the plane at y = 0, metres.
 """
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,9 +11,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+from curio_serve.files import read_json
 
 from curio_train.errors import CameraError, DataError
 
+_MAX_BYTES = 1 << 26
 _MAX_SHEAR = 1e-3
 _SAME_TILT_DEG, _SAME_HEIGHT = 2.0, 0.05
 _MAX_DISTANCE = 3.0  # of points on the plane, relative to the one on the optical axis
@@ -47,10 +48,10 @@ class CameraPoseFile:
             CameraError: It is missing, or no such file.
         """
         try:
-            entries = json.loads(file.read_text(encoding="utf-8"))
+            entries = read_json(file, _MAX_BYTES)
         except OSError as exc:
             raise CameraError(f"{flag} {file}: cannot be read ({exc.strerror})") from exc
-        except (json.JSONDecodeError, UnicodeDecodeError) as exc:
+        except ValueError as exc:
             raise CameraError(f"{flag} {file}: not JSON ({exc})") from exc
         if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
             raise CameraError(f"{flag} {file}: expected an object of photographs, each with its cam_from_world")

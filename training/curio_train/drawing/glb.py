@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from curio_serve.files import read_file
 from PIL import Image
 
 from curio_train.drawing.axes import GL_FROM_CV, embed, light_of, linear, pose_matrix, root_from_camera, towards_light
@@ -20,7 +21,7 @@ from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Placed, Scene
 from curio_train.errors import DataError
 from curio_train.geometry import Pose
-from curio_train.meshes.meshes import Mesh
+from curio_train.meshes.meshes import MAX_BYTES, Mesh
 
 _LUX = math.pi  # of a directional light of strength 1: the irradiance of a surface that faces it
 _CAMERA, _SUN = "camera", "light"
@@ -60,6 +61,15 @@ def from_glb(path: Path) -> Scene:
         DataError: The file cannot be read, or was not written by curio.
     """
     tree = _tree(path)
+    try:
+        return _scene(tree, path)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as exc:
+        raise DataError(
+            f"{path}: not a scene of curio ({type(exc).__name__}: {exc}); expected a file of curio-render --format glb"
+        ) from exc
+
+
+def _scene(tree: dict[str, Any], path: Path) -> Scene:
     nodes = {node["name"]: node for node in tree.get("nodes", ()) if _EXTRAS in node.get("extras", {})}
     camera = nodes.pop(_CAMERA, None)
     if camera is None:
@@ -141,10 +151,10 @@ def _add_node(tree: dict[str, Any], name: str, matrix: np.ndarray, more: dict[st
 def _tree(path: Path) -> dict[str, Any]:
     """The JSON chunk of a GLB file."""
     try:
-        content = path.read_bytes()
+        content = read_file(path, MAX_BYTES)
         magic, _, _, length, _ = struct.unpack_from("<4sIIII", content)
         tree = json.loads(content[20 : 20 + length])
-    except (OSError, struct.error, ValueError) as exc:
+    except (OSError, struct.error, ValueError, RecursionError) as exc:
         raise DataError(f"{path}: not a readable GLB file ({exc})") from exc
     if magic != b"glTF" or not isinstance(tree, dict):
         raise DataError(f"{path}: found no glTF header, expected a GLB file")

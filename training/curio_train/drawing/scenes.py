@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from curio_serve.files import read_file
 
 from curio_train.camera import check_matrix
 from curio_train.errors import DataError
@@ -19,6 +20,7 @@ from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World
 from curio_train.worlds.generated.mesh_world import MeshWorld
 
+_MAX_BYTES = 1 << 28
 EXPECTED = 'a line of curio-detect with "detections", or {"world": NAME, "code": {FIELD: numbers}}'
 
 
@@ -87,13 +89,13 @@ def read_scenes(path: Path) -> Iterator[Scene]:
             continue
         try:
             yield _from_code(record, number) if "code" in record else _from_detections(record, number, where)
-        except (KeyError, TypeError, ValueError) as exc:
+        except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as exc:
             raise DataError(f"{where}: not a scene ({type(exc).__name__}: {exc}); expected {EXPECTED}") from exc
 
 
 def _records(path: Path) -> Iterator[tuple[int, Any]]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_file(path, _MAX_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as exc:
         raise DataError(f"{path}: cannot be read ({exc}); expected {EXPECTED}") from exc
     if not text.strip():
@@ -101,13 +103,13 @@ def _records(path: Path) -> Iterator[tuple[int, Any]]:
     try:
         yield 1, json.loads(text)
         return
-    except ValueError:
+    except (ValueError, RecursionError):
         pass  # more than one line, or damaged: the lines below tell
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip():
             try:
                 yield number, json.loads(line)
-            except ValueError as exc:
+            except (ValueError, RecursionError) as exc:
                 raise DataError(f"{path}, line {number}: not JSON ({exc}); expected {EXPECTED}") from exc
 
 

@@ -35,7 +35,7 @@ from curio_train.worlds.base import World
 
 _NUM_KEPT = 2
 _TENSORS, _PROGRESS, _SUMS = "tensors.safetensors", "course.json", "SHA256SUMS"
-_MAX_TENSOR_BYTES = 1 << 31
+MAX_TENSOR_BYTES = 1 << 31
 
 
 class RunFolder:
@@ -154,7 +154,7 @@ class RunFolder:
             raise CheckpointError(f"{self.path} has no checkpoint yet; train it first: --resume {self.path}")
         last = checkpoints[-1]
         try:
-            tensors = read_file(last / _TENSORS, _MAX_TENSOR_BYTES)
+            tensors = read_file(last / _TENSORS, MAX_TENSOR_BYTES)
             progress = read_file(last / _PROGRESS, MAX_JSON_BYTES)
             if (last / _SUMS).exists():  # earlier versions wrote none
                 sums = read_file(last / _SUMS, MAX_JSON_BYTES).decode().split()

@@ -6,6 +6,7 @@ shares constants. So each version also stores the network as it was trained, in 
 
 from pathlib import Path
 
+from curio_serve.files import check_regular
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -13,7 +14,7 @@ from torch import Tensor
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, CurioError, ExportError, UsageError
 from curio_train.exported_model import WEIGHTS_FILE, find_model
-from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.checkpoint import MAX_TENSOR_BYTES, RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, load_config
 from curio_train.learning.state import TrainState, under
 
@@ -36,7 +37,10 @@ def begin_with(state: TrainState, path: Path) -> None:
         tensors, images, seconds = under("pose.network.", tensors), before.all_images, before.all_seconds
     else:
         tensors, notes = _weights_and_notes(path)
-        images, seconds = int(notes[_IMAGES]), float(notes[_SECONDS])
+        try:
+            images, seconds = int(notes[_IMAGES]), float(notes[_SECONDS])
+        except ValueError as exc:
+            raise CheckpointError(f"{path}: its {WEIGHTS_FILE} says {notes}; export the model anew") from exc
     try:
         state.pose.network.load_state_dict(tensors)
     except RuntimeError as exc:
@@ -104,6 +108,7 @@ def _weights_and_notes(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             "or the run folder that it was exported from"
         )
     try:
+        check_regular(file.stat(), file, MAX_TENSOR_BYTES)
         with safe_open(file, framework="pt") as content:
             tensors = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118 (no mapping)
             notes = content.metadata() or {}

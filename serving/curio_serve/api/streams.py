@@ -1,0 +1,108 @@
+"""Bounds the number of open streams, and lets no idle ones keep others out.
+
+A connection may have a part of all. Once all are open, a new stream takes the place of an idle one: of the connection
+that has most, the one that has waited longest for its next frame. A connection with as many streams is not touched.
+"""
+
+import threading
+import time
+from functools import partial
+from typing import Protocol
+
+from curio_serve.api.admission import Call
+from curio_serve.errors import Overloaded
+
+# One connection may have this part of the streams, but at least so many.
+_FRACTION, _LEAST = 4, 8
+# A stream that has waited longer for its next frame counts as idle.
+_IDLE_S = 1.0
+
+
+class StreamCall(Call, Protocol):
+    """The part of gRPC's servicer context that streams use."""
+
+    def cancel(self) -> object:
+        """End the call."""
+
+
+class Stream:
+    """An open stream."""
+
+    def __init__(self, call: StreamCall) -> None:
+        self.call, self.peer = call, call.peer()
+        self._idle_since: float | None = time.monotonic()
+
+    def works(self) -> None:
+        """Say that it has a frame."""
+        self._idle_since = None
+
+    def waits(self) -> None:
+        """Say that it waits for a frame."""
+        self._idle_since = time.monotonic()
+
+    @property
+    def idle_s(self) -> float:
+        """How long it has waited for a frame."""
+        since = self._idle_since
+        return 0.0 if since is None else time.monotonic() - since
+
+
+class Streams:
+    """All open streams."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._most_of_peer = most, max(_LEAST, most // _FRACTION)
+        self._lock = threading.Lock()
+        self._open: dict[str, list[Stream]] = {}  # of each connection
+
+    def __len__(self) -> int:
+        """How many are open."""
+        return sum(map(len, list(self._open.values())))
+
+    def open(self, call: StreamCall) -> Stream:
+        """Take a place, which is free again when the call ends.
+
+        Raises:
+            Overloaded: Too many streams are open.
+        """
+        stream = Stream(call)
+        with self._lock:
+            num_own = len(self._open.get(stream.peer, ()))
+            if num_own >= self._most_of_peer:
+                raise Overloaded(
+                    f"{self._most_of_peer} streams of this connection are open, which is the limit of one connection "
+                    f"(a part of --max-streams {self._most}); open another connection, or close a stream",
+                    1.0,
+                )
+            replaced = self._replaceable(num_own) if len(self) >= self._most else None
+            if replaced:
+                self._remove(replaced)
+            self._open.setdefault(stream.peer, []).append(stream)
+        if replaced:
+            replaced.call.cancel()
+        if not call.add_callback(partial(self._close, stream)):
+            self._close(stream)
+        return stream
+
+    def _replaceable(self, num_own: int) -> Stream:
+        """The idle stream whose place a connection with so many streams may have."""
+        found = [
+            (len(streams), idle_s, stream)
+            for streams in self._open.values()
+            for stream in streams
+            if len(streams) > num_own and (idle_s := stream.idle_s) > _IDLE_S
+        ]
+        if not found:
+            raise Overloaded(f"{self._most} streams are open, which is the limit (--max-streams)", 1.0)
+        return max(found, key=lambda entry: entry[:2])[2]
+
+    def _close(self, stream: Stream) -> None:
+        with self._lock:
+            self._remove(stream)
+
+    def _remove(self, stream: Stream) -> None:
+        streams = self._open.get(stream.peer, [])
+        if stream in streams:
+            streams.remove(stream)
+            if not streams:
+                del self._open[stream.peer]
