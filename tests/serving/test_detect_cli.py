@@ -120,8 +120,8 @@ def test_an_exif_rotation_that_is_not_applied_is_told(
 ) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6
-    Image.new("RGB", SIZE).save(tmp_path / "turned.jpg", exif=exif)
-    Image.new("RGB", SIZE).save(tmp_path / "upright.jpg")
+    Image.new("RGB", (320, 240)).save(tmp_path / "turned.jpg", exif=exif)
+    Image.new("RGB", (320, 240)).save(tmp_path / "upright.jpg")
     detect(models_dir / "flat", tmp_path, out=tmp_path / "out")
     told = capsys.readouterr().err
     assert f"1 images have an EXIF rotation that was not applied (first: {tmp_path}/turned.jpg)" in told
