@@ -7,6 +7,8 @@ import stat
 from pathlib import Path
 from typing import Any
 
+_MAX_GIVEN_BYTES = 4 << 20
+
 
 def read_file(path: str | Path, max_bytes: int) -> bytes:
     """The content of a regular file.
@@ -22,6 +24,19 @@ def read_file(path: str | Path, max_bytes: int) -> bytes:
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         check_regular(os.fstat(file.fileno()), path, max_bytes)
         return file.read(max_bytes)
+
+
+def read_given(path: str | Path) -> bytes:
+    """The content of a small file that a command line names: of a pipe, too, as a shell's ``<(...)`` is one.
+
+    Raises:
+        OSError: It cannot be read, or is larger than 4 MiB; ``strerror`` says which.
+    """
+    with open(path, "rb") as file:
+        content = file.read(_MAX_GIVEN_BYTES + 1)
+    if len(content) > _MAX_GIVEN_BYTES:
+        raise OSError(errno.EFBIG, f"more than {_MAX_GIVEN_BYTES} bytes", str(path))
+    return content
 
 
 def read_json(path: str | Path, max_bytes: int) -> Any:

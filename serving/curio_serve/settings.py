@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from curio_serve.errors import UsageError
+from curio_serve.files import read_given
 
 
 def read_toml(path: Path, flag: str) -> dict[str, Any]:
@@ -19,10 +20,10 @@ def read_toml(path: Path, flag: str) -> dict[str, Any]:
         UsageError: The file cannot be read, or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_given(path).decode("utf-8"))
     except OSError as exc:
         raise UsageError(f"{flag} {path} cannot be read: {exc.strerror}; expected a TOML file") from exc
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as exc:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as exc:
         raise UsageError(f"{flag} {path} is not TOML: {exc}") from exc
 
 

@@ -140,6 +140,16 @@ def test_bop_camera(tmp_path: Path) -> None:
     assert camera.size == (640, 480)
 
 
+def test_distortion_beside_focal_lengths_counts(tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    values = {"fx": 572.4, "fy": 573.6, "cx": 325.3, "cy": 242.0, "width": 640, "height": 480}
+    path.write_text(json.dumps({**values, "distortion": [0.1, 0, 0, 0]}))
+    assert read_camera_file(path).camera_for("any.png").distortion == (0.1, 0, 0, 0)
+    path.write_text(json.dumps({**values, "distortion": [0, 0, 1e12, 0]}))
+    with pytest.raises(CameraError, match="moves pixels"):
+        read_camera_file(path)
+
+
 def test_bop_scene_camera_is_looked_up_by_the_images_number(tmp_path: Path) -> None:
     path = tmp_path / "scene_camera.json"
     entries = {str(n): {"cam_K": [500.0 + n, 0, 320, 0, 500, 240, 0, 0, 1], "depth_scale": 1.0} for n in (0, 7, 12)}

@@ -174,6 +174,10 @@ def test_texts_beyond_ascii_fit_into_the_trailers(server: Any) -> None:
         (["--workers", "100000"], "--workers is 100000; expected at most 1024"),
         (["--host", ""], "--host is empty"),
         (["--client-ca", "{readme}"], "--client-ca {readme} cannot be used; expected a PEM file"),
+        (["--client-ca", "/dev/null"], "--client-ca /dev/null cannot be used; expected a PEM file"),
+        (["--client-ca", "/dev/zero"], "--client-ca /dev/zero cannot be read: more than 4194304 bytes"),
+        (["--token-file", "/dev/zero"], "--token-file /dev/zero cannot be read: more than 4194304 bytes"),
+        (["--config", "/dev/zero"], "--config /dev/zero cannot be read: more than 4194304 bytes"),
     ],
 )
 def test_wrong_settings_are_named(models_dir: Path, tmp_path: Path, arguments: list[str], words: str) -> None:

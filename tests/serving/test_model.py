@@ -263,6 +263,20 @@ def test_config_is_compared_with_the_graph(folder: Path, old: str, new: str, wor
         open_model(folder)
 
 
+@pytest.mark.parametrize("name", ["SHA256SUMS", "config.pbtxt", "1/golden.npz"])
+def test_files_beside_a_model_are_regular_and_bounded(folder: Path, name: str) -> None:
+    file = folder / name
+    file.unlink(missing_ok=True)
+    os.mkfifo(file)
+    with pytest.raises(ModelError, match=f"{name} cannot be read: not a regular file"):
+        open_model(folder)
+    file.unlink()
+    file.touch()
+    os.truncate(file, 20 << 30)
+    with pytest.raises(ModelError, match=f"{name} cannot be read: 21474836480 bytes, at most"):
+        open_model(folder)
+
+
 def test_model_files_that_are_none(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.onnx")
     with open(tmp_path / "sparse.onnx", "wb") as sparse:

@@ -110,6 +110,22 @@ def test_pipes_devices_and_endless_files_are_errors_of_these_images(tmp_path: Pa
             image.read()
 
 
+def test_a_link_in_a_circle_is_an_error_of_its_own(tmp_path: Path) -> None:
+    touch(tmp_path, "a.png", "z.png")
+    (tmp_path / "link.png").symlink_to("link.png")
+    (tmp_path / "notes").symlink_to("notes")
+    found = list(images([str(tmp_path)], PassedOver()))
+    assert [Path(image.name).name for image in found] == ["a.png", "link.png", "z.png"]
+    with pytest.raises(ImageError, match="cannot be read: Too many levels of symbolic links"):
+        found[1].read()
+
+
+def test_a_pipe_is_no_video(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "clip.mp4")
+    (found,) = images([str(tmp_path / "clip.mp4")], PassedOver())
+    assert found.error == "cannot be read: not a regular file"
+
+
 def test_relative_names_stay_apart_below_the_common_folder(tmp_path: Path) -> None:
     touch(tmp_path, "a/0.png", "b/0.png", "b/c/0.png")
     assert common_folder([str(tmp_path / "a")]) == tmp_path / "a"

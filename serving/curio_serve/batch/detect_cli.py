@@ -267,6 +267,7 @@ def _answer(estimators: "Sequence[Estimator]", form: "ResultFormat", image: "Sou
 
 def _client(arguments: DetectArguments, address: str) -> "PoseClient":
     from curio_serve.client import PoseClient, Tls
+    from curio_serve.files import read_given
 
     tls = None
     if arguments.server_ca is not None:
@@ -274,7 +275,7 @@ def _client(arguments: DetectArguments, address: str) -> "PoseClient":
     elif arguments.tls_certificate is not None or arguments.tls_key is not None:
         raise UsageError("--tls-certificate and --tls-key need --server-ca: they are shown over TLS only")
     try:
-        token = "" if arguments.token_file is None else arguments.token_file.read_text(encoding="utf-8").strip()
+        token = "" if arguments.token_file is None else read_given(arguments.token_file).decode("utf-8").strip()
     except (OSError, UnicodeDecodeError) as exc:
         raise UsageError(f"--token-file {arguments.token_file} cannot be read: {exc}") from exc
     # Patient: a busy or restarting server shall not end a run over many images.

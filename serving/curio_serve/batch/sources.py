@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from curio_serve.errors import ImageError, UsageError
-from curio_serve.files import read_file
+from curio_serve.files import check_regular, read_file
 from curio_serve.imaging.image import MAX_FILE_BYTES
 from curio_serve.models.model_folder import CONFIG_FILE
 
@@ -196,14 +196,27 @@ def _entries_after(folder: str, last: str, passed_over: PassedOver) -> Iterator[
         for entry in entries:
             is_hidden, is_folder = entry.name.startswith("."), entry.is_dir(follow_symlinks=False)
             is_image = not is_hidden and os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES
-            if not is_image and not last and not entry.is_dir():  # in the first pass alone
+            leads_to_folder = _leads_to_folder(entry)
+            if not is_image and not last and not leads_to_folder:  # in the first pass alone
                 passed_over.file(entry.name)
-            if entry.name > last and ((is_folder and not is_hidden) or (is_image and not entry.is_dir())):
+            if entry.name > last and ((is_folder and not is_hidden) or (is_image and not leads_to_folder)):
                 yield entry.name, is_folder
+
+
+def _leads_to_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # a link in a circle: an image that cannot be read
+        return False
 
 
 def _video_frames(path: str) -> Iterator[SourceImage]:
     """Frames as stored: a rotation noted in the video is not applied, because K belongs to the stored pixels."""
+    try:
+        check_regular(os.stat(path), path)
+    except OSError as exc:
+        yield SourceImage(path, path, error=f"cannot be read: {exc.strerror}")
+        return
     capture = cv2.VideoCapture(path)
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     number = 0

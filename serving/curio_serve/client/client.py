@@ -22,6 +22,7 @@ from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
 from curio_serve.client.request import CameraLike, ImageLike, RegionLike, detect_request, selector
 from curio_serve.client.retries import Attempts, error_from_call
 from curio_serve.errors import UsageError
+from curio_serve.files import read_given
 
 # Connect again soon after a server was replaced; gRPC's own first pause is a second.
 _CHANNEL_OPTIONS = (("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_reconnect_backoff_ms", 2000))
@@ -255,6 +256,6 @@ def _read(path: Path | None) -> bytes | None:
     if path is None:
         return None
     try:
-        return path.read_bytes()
+        return read_given(path)
     except OSError as exc:
         raise UsageError(f"{path}: cannot be read: {exc.strerror}") from exc

@@ -1,7 +1,7 @@
 """Reads camera files: our JSON, BOP's camera.json and scene_camera.json, OpenCV's YAML, ROS's camera_info.
 
 ours              {"camera_matrix": [[fx,0,cx],[0,fy,cy],[0,0,1]], "width": w, "height": h, "distortion": [...]}
-camera.json       {"fx":, "fy":, "cx":, "cy":, "width":, "height":, ...}
+camera.json       {"fx":, "fy":, "cx":, "cy":, "width":, "height":, "distortion": [...], ...}; BOP has none
 scene_camera.json {"0": {"cam_K": [9 values], ...}, "1": ...}: K of each image, by the number in its file's name
 OpenCV YAML       camera_matrix, distortion_coefficients, image_width, image_height (as written by its calibration)
 ROS YAML          the same names (as written by camera_calibration), or a CameraInfo message: k, d, width, height
@@ -91,7 +91,9 @@ def _from_json(path: Path, content: Any) -> CameraFile:
     if isinstance(content, dict) and {"fx", "fy", "cx", "cy"} <= content.keys():
         fx, fy, cx, cy = (float(content[name]) for name in ("fx", "fy", "cx", "cy"))
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        return CameraFile(path, PinholeCamera(matrix, (), _size(content.get("width"), content.get("height"))), {})
+        distortion = _distortion(content.get("distortion"))
+        size = _size(content.get("width"), content.get("height"))
+        return CameraFile(path, PinholeCamera(matrix, distortion, size), {})
     if isinstance(content, dict) and content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
         return CameraFile(path, None, {int(n): PinholeCamera(_matrix(v["cam_K"])) for n, v in content.items()})
     found = sorted(content)[:8] if isinstance(content, dict) else type(content).__name__

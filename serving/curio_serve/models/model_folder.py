@@ -7,6 +7,7 @@ network gives those outputs on this machine.
 A version's folder is named 1 to 999999999 in ASCII digits without a leading zero; as in Triton, others are passed over.
 """
 
+import io
 import re
 import stat
 import zipfile
@@ -18,12 +19,14 @@ from curio_proto.files.triton_config_pb2 import TritonConfig, TritonType
 from google.protobuf import text_format
 
 from curio_serve.errors import InternalError, ModelError
+from curio_serve.files import read_file
 from curio_serve.models.model import DEFAULT_RUNTIME, INPUT, Model, Runtime, load
 
 CONFIG_FILE = "config.pbtxt"
 MODEL_FILE = "model.onnx"
 GOLDEN_FILE = "golden.npz"
 _GOLDEN_TOLERANCE = 1e-3  # metres, image widths, entries of matrices; float16 weights on another processor stay below
+_MAX_TEXT_BYTES, _MAX_GOLDEN_BYTES = 1 << 20, 1 << 28
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
@@ -99,9 +102,10 @@ def open_model(path: str | Path) -> Model:
 def _check_sum(folder: Path, file: str, sha256: str) -> None:
     """Compare with SHA256SUMS (``sha256sum``'s format), if the folder has one."""
     sums = folder / "SHA256SUMS"
-    if not sums.is_file():
+    if not sums.exists():
         return
-    lines = (line.split(maxsplit=1) for line in sums.read_text(encoding="utf-8", errors="replace").splitlines())
+    text = read_file(sums, _MAX_TEXT_BYTES).decode("utf-8", errors="replace")
+    lines = (line.split(maxsplit=1) for line in text.splitlines())
     expected = {parts[1].strip().lstrip("*").removeprefix("./"): parts[0].lower() for parts in lines if len(parts) == 2}
     if file not in expected:
         raise ModelError(f"{sums} does not list {file}; it lists {sorted(expected)}. Export again, or add its line")
@@ -115,10 +119,11 @@ def _check_sum(folder: Path, file: str, sha256: str) -> None:
 def _check_config(folder: Path, model: Model) -> None:
     """Compare config.pbtxt, if the folder has one, with the graph."""
     path = folder / CONFIG_FILE
-    if not path.is_file():
+    if not path.exists():
         return
+    text = read_file(path, _MAX_TEXT_BYTES)
     try:
-        config = text_format.Parse(path.read_text(encoding="utf-8"), TritonConfig(), allow_unknown_field=True)
+        config = text_format.Parse(text.decode("utf-8"), TritonConfig(), allow_unknown_field=True)
     except (text_format.ParseError, UnicodeDecodeError, RecursionError) as exc:
         raise ModelError(f"{path} is not a Triton model configuration: {exc}") from exc
     if config.name not in ("", folder.name):
@@ -141,10 +146,11 @@ def _check_config(folder: Path, model: Model) -> None:
 
 def _check_golden(path: Path, model: Model) -> None:
     """Run the golden image, if the version has one, and compare the outputs with those stored beside it."""
-    if not path.is_file():
+    if not path.exists():
         return
+    content = read_file(path, _MAX_GOLDEN_BYTES)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
             expected = dict(file)
     # zipfile raises RuntimeError for encrypted members and unknown methods; np.load returns a bare array as it is.
     except (ValueError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as exc:

@@ -164,10 +164,11 @@ class Reception:
     def _reserve(self, arrival: _Arrival) -> None:
         """Reserve memory for the longest message, if need be after others."""
         with self._lock:
+            if not self._waiting and self._free >= self._limits.message_bytes and self._may_have(arrival.peer):
+                self._grant(arrival)
+                return
             self._waiting.append(arrival)
             self._hand_out()
-            if arrival.num_bytes:
-                return
         if not arrival.context.add_callback(arrival.place.wake):
             arrival.place.wake()
         arrival.place.sleep(None)
@@ -179,7 +180,7 @@ class Reception:
 
     def _hand_out(self) -> None:
         """Give free memory to those who wait and may have it."""
-        while self._free >= self._limits.message_bytes:
+        while self._waiting and self._free >= self._limits.message_bytes:
             candidates = [waiting for waiting in self._waiting if self._may_have(waiting.peer)]
             if not candidates:
                 return
@@ -196,10 +197,13 @@ class Reception:
         self._claim(arrival, self._expected(arrival.peer))
 
     def _claim(self, arrival: _Arrival, num_bytes: int) -> None:
-        self._claims[arrival.peer] += num_bytes - arrival.claim
-        self._long_claims += num_bytes * (num_bytes > _LONG_BYTES) - arrival.claim * (arrival.claim > _LONG_BYTES)
-        arrival.claim = num_bytes
-        if not self._claims[arrival.peer]:
+        before, arrival.claim = arrival.claim, num_bytes
+        if num_bytes > _LONG_BYTES or before > _LONG_BYTES:
+            self._long_claims += num_bytes * (num_bytes > _LONG_BYTES) - before * (before > _LONG_BYTES)
+        left = self._claims[arrival.peer] + num_bytes - before
+        if left:
+            self._claims[arrival.peer] = left
+        else:
             del self._claims[arrival.peer]
 
     def _release(self, arrival: _Arrival, num_bytes: int, length: int = 0) -> None:

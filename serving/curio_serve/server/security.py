@@ -13,6 +13,7 @@ from grpc_health.v1 import health
 
 from curio_serve.api.status import status_from_error
 from curio_serve.errors import TokenError, UsageError, status_of
+from curio_serve.files import read_given
 from curio_serve.server.config import ServeConfig
 from curio_serve.telemetry import Metrics, log
 
@@ -97,13 +98,13 @@ def _read_authority(path: Path) -> bytes:
     data = _read(path, "--client-ca")
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_verify_locations(cadata=data.decode("ascii"))
-    except (ssl.SSLError, UnicodeDecodeError) as exc:
+    except (ssl.SSLError, ValueError) as exc:  # ValueError: no ASCII, or empty
         raise UsageError(f"--client-ca {path} cannot be used; expected a PEM file of certificates") from exc
     return data
 
 
 def _read(path: Path, flag: str) -> bytes:
     try:
-        return path.read_bytes()
+        return read_given(path)
     except OSError as exc:
         raise UsageError(f"{flag} {path} cannot be read: {exc.strerror}") from exc
