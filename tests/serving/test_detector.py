@@ -182,6 +182,26 @@ def test_missing_k_is_refused_and_a_default_is_only_the_specs(
     assert len(Detector(load(path)).detect(picture, None)) == 1
 
 
+@pytest.mark.parametrize(("depth_m", "outside"), [(0.3, True), (0.7, False), (1.2, True)])
+def test_depths_that_were_not_trained_are_marked(
+    spot_onnx: Callable[..., onnx.ModelProto],
+    spot_spec: Callable[[bool], ModelSpec],
+    spot_image: DrawSpot,
+    tmp_path: Path,
+    depth_m: float,
+    outside: bool,
+) -> None:
+    spec = spot_spec(True)
+    spec.fields[0].lower.extend([-1, -1, 0.5])
+    spec.fields[0].upper.extend([1, 1, 1.0])
+    path = tmp_path / "ranged.onnx"
+    path.write_bytes(spot_onnx(True, spec).SerializeToString())
+    camera = PinholeCamera(K)
+    picture = _picture(spot_image, np.array([0.02, -0.01, depth_m]), camera)
+    [result] = Detector(load(path)).detect(picture, camera)
+    assert [found.outside_trained_range for found in result.detections] == [outside]
+
+
 def test_a_camera_that_cannot_have_taken_the_frame(pinhole: Detector) -> None:
     with pytest.raises(CameraError, match="outside the frame of 320x240"):
         pinhole.detect(np.zeros((240, 320, 3), np.uint8), PinholeCamera(K + np.diag([9, 9, 0])))

@@ -150,6 +150,16 @@ def test_values_beyond_a_byte_are_refused(stub: GRPCInferenceServiceStub) -> Non
         stub.ModelInfer(request, timeout=10)
 
 
+@pytest.mark.parametrize("call", ["ModelConfig", "RepositoryIndex", "ModelStatistics", "RepositoryModelLoad"])
+def test_calls_that_are_not_there_are_unimplemented(server: Any, call: str) -> None:
+    """As docs/serving.md says of Triton's extensions."""
+    with grpc.insecure_channel(server.address) as channel:
+        ask = channel.unary_unary(f"/inference.GRPCInferenceService/{call}")
+        with pytest.raises(grpc.RpcError) as refusal:
+            ask(b"", timeout=10)
+    assert refusal.value.code() is grpc.StatusCode.UNIMPLEMENTED
+
+
 def test_tritonclient_works_unchanged(server: Any, picture: np.ndarray, tmp_path: Path) -> None:
     """In a process of its own, because two copies of the ``inference`` messages cannot be loaded together.
 

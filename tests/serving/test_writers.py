@@ -61,6 +61,7 @@ def test_json_line_has_the_keys_and_shapes_of_the_contract() -> None:
                 "quaternion_xyzw": [0, 0, 0.5**0.5, 0.5**0.5],
                 "color": [0.1, 0.2, 0.3],
                 "box_px": [[2 * i, 2 * i + 1] for i in range(8)],
+                "outside_trained_range": False,
             }
         ],
         "light": [0, -1, -2],

@@ -10,6 +10,7 @@ import pytest
 import torch
 import trimesh
 from curio_train.evaluation.agreement import differing, overlap
+from curio_train.evaluation.closeups import CLOSEUP_PX
 from curio_train.evaluation.photographed import Judgement, judge
 from curio_train.evaluation.report_figures import samples
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
@@ -113,6 +114,17 @@ def test_confidence_does_not_hide_what_was_found(folder: Path) -> None:
     assert judged(world, unsure).metrics == judged(world, code).metrics
 
 
+def test_close_ups_show_the_part_and_its_contour(folder: Path) -> None:
+    """Of a right pose: the part fills much of the close-up, and the contour runs along its edge."""
+    columns = judged(build(options(folder)), truth(build(options(folder)))).columns
+    plain, outlined, drawn = (columns[name] for name in ("close-up", "its contour", "what was found"))
+    assert plain.shape == outlined.shape == drawn.shape == (NUM, 3, CLOSEUP_PX, CLOSEUP_PX)
+    inked = ((plain - outlined).abs().amax(dim=1) > 0.1).float().mean(dim=(1, 2))
+    assert (inked > 0.005).all()
+    assert (inked < 0.3).all(), "the inside stays visible"
+    assert (plain - drawn).abs().mean() < 0.1
+
+
 def test_photographs_with_nothing_in_them_are_counted(folder: Path, tmp_path: Path) -> None:
     for number in range(NUM):
         (tmp_path / f"{number}.png").write_bytes((folder / "plate.png").read_bytes())
@@ -128,7 +140,9 @@ def test_the_worst_come_first_with_their_figures(folder: Path) -> None:
     code = truth(world)
     code[TRANSLATION][3, 0, 0] += 0.15
     found = judged(world, code)
-    assert torch.equal(found.columns["photograph"][0], world.photographs.judged(NUM)[3])
+    paths, photographs = world.photographs.judged(NUM)
+    assert torch.equal(found.columns["photograph"][0], photographs[3])
+    assert found.captions[0].startswith(f"{paths[3].name}\n")
     assert "overlap 0.0" in found.captions[0]
     assert found.summary["num_photographs"] == NUM
     assert found.summary["metrics"]["own_view_agreeing"] == 0.8

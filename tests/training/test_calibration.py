@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from curio_train.camera import load_intrinsics, save_intrinsics
 from curio_train.capture.calibration import Board, calibrate
+from curio_train.commands.train import train
 from curio_train.errors import CameraError, DataError
 from scipy.spatial.transform import Rotation
 
@@ -79,8 +80,24 @@ def test_views_that_are_too_alike(tmp_path: Path) -> None:
 
 def test_another_board_is_not_found(tmp_path: Path) -> None:
     write(tmp_path, PLAIN, 6)
-    with pytest.raises(CameraError, match="in 0 of 6 photographs"):
+    with pytest.raises(CameraError, match="found no board of 8x5 squares in 6 or more of 6 photographs"):
         calibrate(tmp_path, Board(8, 5, SQUARE_M, 0.02))
+    with pytest.raises(CameraError, match="found no board of 12x9 squares nor of as many inner corners"):
+        calibrate(tmp_path, Board(12, 9, SQUARE_M))
+
+
+def test_squares_and_inner_corners_are_both_understood(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "board").mkdir()
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "board", PLAIN, 10)
+    for counts, text in (("9 6", "counts squares"), ("8 5", "counts the inner corners of a board of 9x6 squares")):
+        with pytest.raises(SystemExit) as exit_:
+            train(["capture", "--calibrate", "--images", "board", "--board", *counts.split(), "--square-mm", "30"])
+        assert exit_.value.code == 0
+        assert f"--board {counts} {text}" in capsys.readouterr().out
+        assert load_intrinsics(tmp_path / "camera.json").matrix == pytest.approx(MATRIX, rel=0.02, abs=8)
 
 
 def test_photographs_of_two_sizes(tmp_path: Path) -> None:

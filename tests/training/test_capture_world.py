@@ -179,9 +179,9 @@ def photographs(world: World) -> CapturePhotographs:
 
 
 def test_photographs_come_in_the_canonical_size_without_distortion(folder: Path, world: TwoStageWorld) -> None:
-    found = photographs(world).judged(5)
+    _, found = photographs(world).judged(5)
     assert found.shape == (5, 3, world.camera.height, world.camera.width)
-    assert photographs(world).judged(100).shape[0] == 12
+    assert photographs(world).judged(100)[1].shape[0] == 12
     plate = photographs(world).background_image()
     assert plate is not None
     assert (found[0] == plate).all(dim=0).float().mean() > 0.9, "but for a square that differs"
@@ -208,7 +208,7 @@ def test_a_model_is_not_judged_by_what_it_learned_from(folder: Path, tmp_path: P
     def greys(images: Tensor) -> set[int]:
         return set((images[:, 0, HEIGHT // 2, WIDTH // 2] * 85).round().int().tolist())
 
-    judged = photographs(many).judged(1000)
+    _, judged = photographs(many).judged(1000)
     assert len(greys(judged)) == NUM_JUDGED
     assert PseudoLabels.from_photographs(many, predict) is None
     assert greys(torch.cat(read)) == set(range(2 * NUM_JUDGED)) - greys(judged)
@@ -297,14 +297,18 @@ def test_from_files_to_a_model_by_a_project_file(
     report = (run / "report.html").read_text()
     assert 'id="photographs"' in report
     assert "what was found covers what differs from the background image" in report
-    assert str(folder) not in (run / "models" / "bracket" / "CARD.md").read_text()
+    assert "capture: bracket; sleep, seed 0" in report
+    card = (run / "models" / "bracket" / "CARD.md").read_text()
+    assert str(folder) not in card
+    assert "In 12 photographs, without labels: Do not trust it: " in card, "as the report says"
     with pytest.raises(UsageError, match="run folder"):
         load_subject(run / "models" / "bracket" / "1")
     config_file = run / "config.json"
     config_file.write_text(config_file.read_text().replace(str(folder / "photos"), str(tmp_path / "gone")))
     warnings: list[str] = []
     assert evaluate(run, num_images=4, cache=cache, warn=warnings.append)["metrics"], "scores need no photographs"
-    assert ["gone" in warning for warning in warnings] == [True, True]
+    assert ["gone" in warning for warning in warnings] == [True]
+    assert 'class="scores"' in (run / "report.html").read_text()
 
 
 def test_project_files_that_cannot_be_used(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -207,6 +207,11 @@ def test_unreadable_photographs(files: Files) -> None:
     assert "005.png" in finding.text
 
 
+def test_hidden_files_are_no_photographs(files: Files) -> None:
+    (files.folder / "photos" / "._000.png").write_bytes(b"\x00\x05\x16\x07")
+    assert alarms(files.subjects()) == []
+
+
 def test_some_raw_frames_saved_as_bgr(files: Files) -> None:
     for path in files.photos[::6]:
         cv2.imwrite(str(path), photo(int(path.stem)))

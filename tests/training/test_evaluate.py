@@ -261,3 +261,21 @@ def test_refined_poses_stand_beside_those_as_read(data: Path, tmp_path: Path) ->
     assert ["ADD(-S) below 0.1 diameters, share", "0.25", "0.125", "0.75"] in [row[1:-1] for row in rows]
     seen = next(row for row in rows if "40–60 % visible" in "".join(row))
     assert seen[2:4] == ["0", "1"]
+
+
+def test_no_table_has_means_and_medians() -> None:
+    metrics = {"rotation_deg": 5.0, "rotation_deg_median": 3.0, "add_recall": 0.5}
+    result = {
+        "source": "ape", "world": "linemod", "objects": ["ape"], "method": "sleep", "preset": "laptop", "seed": 0,
+        "images_seen": 10, "training_seconds": 60.0, "split": "test", "num_images": 5,
+        "metrics": metrics, "untrained": metrics,
+    }  # fmt: skip
+    console = Console(record=True, width=120, file=io.StringIO())
+    print_evaluation(result, console)
+    means, medians = console.export_text().split("5 images of the test split: ")[1:]
+    assert means.split("\n")[0].strip() == "means and shares"
+    assert "rotation, degrees " in means
+    assert "median" not in means
+    assert medians.split("\n")[0].strip() == "medians"
+    assert "rotation, degrees, median" in medians
+    assert "ADD(-S)" not in medians

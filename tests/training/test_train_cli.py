@@ -143,6 +143,44 @@ def test_wrong_calls_get_one_clear_message(
     assert output == ""
 
 
+WITHOUT_EXTRAS = """
+import importlib, sys
+
+class BaseInstall:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in missing.split(","):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+missing, module, function, *sys.argv = sys.argv[1:]
+sys.meta_path.insert(0, BaseInstall())
+getattr(importlib.import_module(f"curio_train.commands.{module}"), function)()
+"""
+TRAIN = "torch,cattrs,mitsuba,drjit,trimesh,scipy,skimage,jaxtyping,huggingface_hub,onnx,safetensors,PIL,jinja2"
+
+
+@pytest.mark.parametrize(
+    ("missing", "call", "extra"),
+    [
+        (TRAIN, "train train curio-train linemod --class ape --data lmo", "train"),
+        (TRAIN, "train train curio-train circles", "train"),
+        (TRAIN, "train train curio-train capture --calibrate --images . --board 9 6", "train"),
+        (TRAIN, "evaluate evaluate curio-eval run", "train"),
+        (TRAIN, "export export curio-export run", "train"),
+        (TRAIN, "doctor doctor curio-doctor", "train"),
+        (TRAIN, "render render curio-render poses.jsonl --out out", "train"),
+        ("viser", "view view curio-view chairs", "view"),
+    ],
+)
+def test_a_base_install_names_the_extra(missing: str, call: str, extra: str, tmp_path: Path) -> None:
+    """The packages of an extra cannot be imported, as after ``pip install .``."""
+    command = [sys.executable, "-c", WITHOUT_EXTRAS, missing, *call.split()]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=PATIENCE_S)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert "pip install 'curio-pose[" in done.stderr
+    assert extra in done.stderr
+
+
 def test_runs_are_neither_overwritten_nor_continued_as_something_else(tmp_path: Path, cache: Path, call: Call) -> None:
     run = tmp_path / "run"
     common = ["circles", "--method", "noncur", "--images", 4, "--cache", cache, *SMALL]

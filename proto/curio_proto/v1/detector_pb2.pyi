@@ -99,7 +99,7 @@ class DetectRequest(_message.Message):
     def __init__(self, request_id: _Optional[str] = ..., models: _Optional[_Iterable[_Union[ModelSelector, _Mapping]]] = ..., encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., regions: _Optional[_Iterable[_Union[Region, _Mapping]]] = ..., min_confidence: _Optional[float] = ..., max_detections: _Optional[int] = ..., apply_exif_rotation: bool = ...) -> None: ...
 
 class Detection(_message.Message):
-    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px")
+    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     TRANSLATION_M_FIELD_NUMBER: _ClassVar[int]
@@ -108,6 +108,7 @@ class Detection(_message.Message):
     QUATERNION_XYZW_FIELD_NUMBER: _ClassVar[int]
     COLOR_FIELD_NUMBER: _ClassVar[int]
     BOX_PX_FIELD_NUMBER: _ClassVar[int]
+    OUTSIDE_TRAINED_RANGE_FIELD_NUMBER: _ClassVar[int]
     object: str
     confidence: float
     translation_m: _containers.RepeatedScalarFieldContainer[float]
@@ -116,7 +117,8 @@ class Detection(_message.Message):
     quaternion_xyzw: _containers.RepeatedScalarFieldContainer[float]
     color: _containers.RepeatedScalarFieldContainer[float]
     box_px: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ...) -> None: ...
+    outside_trained_range: bool
+    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ...) -> None: ...
 
 class RegionResult(_message.Message):
     __slots__ = ("model", "model_version", "region", "status", "detections", "light")

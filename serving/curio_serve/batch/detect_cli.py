@@ -59,7 +59,8 @@ class DetectArguments:
     obj_id: int | None = None
     """Object id in BOP's results. None: that of the LineMOD class the object is named after."""
     overlays: Path | None = None
-    """Folder for pictures with boxes and axes drawn in, laid out like the images."""
+    """Folder for pictures with boxes and axes drawn in, laid out like the images. An exported model holds no mesh,
+    and a box looks the same after half a turn: curio-render --mesh --over-photograph draws the mesh."""
     min_confidence: float = 0.0
     """Leave out detections below, 0 to 1."""
     max_detections: int | None = None

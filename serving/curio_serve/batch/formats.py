@@ -275,6 +275,7 @@ def _detection_json(detection: Detection) -> dict[str, object]:
         "quaternion_xyzw": list(detection.quaternion_xyzw) or None,
         "color": list(detection.color) or None,
         "box_px": [[_finite(value) for value in corner] for corner in _rows(detection.box_px, 2)] or None,
+        "outside_trained_range": detection.outside_trained_range,
     }
 
 

@@ -12,6 +12,7 @@ from curio_proto.v1.detector_pb2 import (
     DetectResponse,
     RegionResult,
 )
+from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_serve.errors import ArgumentError, CameraError, CameraMissing, ImageError
 from curio_serve.imaging.camera import PinholeCamera
@@ -28,6 +29,7 @@ Array = np.ndarray
 Values = Mapping[str, Any]  # outputs of one image by name, as plain numbers
 _REDUCTIONS = (8, 4, 2)
 _MAX_BATCH = 8
+_DEPTH_TOLERANCE = 0.01  # of the range: an object at its end is as likely beyond it
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -36,6 +38,7 @@ class Detector:
 
     def __init__(self, model: Model) -> None:
         self.model = model
+        self._depths_m = trained_depths_m(model.spec)
 
     def detect(
         self,
@@ -84,7 +87,7 @@ class Detector:
             if crop is None:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
-                _fill(result, crop, self.model.slots, next(outputs), min_confidence, max_detections)
+                _fill(result, crop, self.model.slots, next(outputs), min_confidence, max_detections, self._depths_m)
         return results
 
     def _outputs(self, images: list[Array], before_run: Callable[[], None]) -> list[Values]:
@@ -130,6 +133,18 @@ class Detector:
         return PinholeFrame(pixels, camera, canonical, reduction)
 
 
+def trained_depths_m(spec: ModelSpec) -> tuple[float, float]:
+    """Smallest and largest depth along the canonical camera's axis that a model was trained for, metres.
+
+    A head may predict beyond them, and does so where K is of another camera or of another size.
+    """
+    field = next((field for field in spec.fields if field.name == "translation_m"), None)
+    if field is None or field.frame != "camera" or len(field.lower) != 3 or len(field.upper) != 3:
+        return -math.inf, math.inf
+    tolerance = _DEPTH_TOLERANCE * (field.upper[2] - field.lower[2])
+    return field.lower[2] - tolerance, field.upper[2] + tolerance
+
+
 def _check_arguments(pixels: Array, regions: Sequence[Region], min_confidence: float) -> None:
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
         raise ImageError(f"pixels are {pixels.dtype} {pixels.shape}; expected uint8 RGB [height, width, 3]")
@@ -151,6 +166,7 @@ def _fill(
     values: Values,
     min_confidence: float,
     max_detections: int | None,
+    depths_m: tuple[float, float],
 ) -> None:
     """Write the most confident detections of one crop into a result, best first, in the frame's camera.
 
@@ -180,6 +196,7 @@ def _fill(
             quaternion_xyzw=quaternion_xyzw(rotation) if rotation else (),
             color=values["color"][row] if "color" in values else (),
             box_px=crop.project(_transformed(slots[row].box_corners, rotation or _UPRIGHT, translation)),
+            outside_trained_range=not depths_m[0] <= values["translation_m"][row][2] <= depths_m[1],
         )
 
 

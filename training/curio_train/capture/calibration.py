@@ -1,7 +1,7 @@
 """A camera's K and distortion from photographs of a flat board (Zhang 2000, by OpenCV)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -47,6 +47,15 @@ class Board:
             )
         if not self.dictionary.startswith("DICT_") or not hasattr(cv2.aruco, self.dictionary):
             raise CameraError(f"{self.dictionary!r} is no dictionary of OpenCV; expected one like DICT_4X4_50")
+
+    @property
+    def readings(self) -> "tuple[Board, ...]":
+        """What the counts may mean: inner corners, as OpenCV counts those of a plain chessboard, or squares.
+
+        The larger board comes first: a part of it may be taken for the smaller one, but not the other way round.
+        """
+        larger = replace(self, columns=self.columns + 1, rows=self.rows + 1)
+        return (self,) if self.marker_m is not None else (larger, self)
 
     def find(self, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """The board's inner corners in an image.
@@ -95,6 +104,8 @@ class Calibration:
     """Photographs in which the board was found."""
     unused: tuple[Path, ...]
     """Photographs in which it was not."""
+    board: Board
+    """As it was found: its counts were given in squares, or in inner corners."""
 
 
 def calibrate(folder: Path, board: Board) -> Calibration:
@@ -104,30 +115,32 @@ def calibrate(folder: Path, board: Board) -> Calibration:
         DataError: No photographs, broken ones, or of several sizes.
         CameraError: The board is seen in too few of them, or they do not determine a camera.
     """
-    views, unused, size = [], [], (0, 0)
+    greys, size = {}, (0, 0)
     for path in Photographs(folder).paths:
-        grey = cv2.cvtColor(read_photograph(path), cv2.COLOR_RGB2GRAY)
+        grey = greys[path] = cv2.cvtColor(read_photograph(path), cv2.COLOR_RGB2GRAY)
         if size not in ((0, 0), grey.shape[::-1]):
             raise DataError(
                 f"{path} has {grey.shape[1]}x{grey.shape[0]} pixels, others {size[0]}x{size[1]}; expected one size"
             )
         size = (grey.shape[1], grey.shape[0])
-        found = board.find(grey)
-        if found is None:
-            unused.append(path)
-        else:
-            views.append(found)
-    if len(views) < _FEWEST_VIEWS:
-        raise CameraError(
-            f"{folder}: found the board of {board.columns}x{board.rows} squares in {len(views)} of "
-            f"{len(views) + len(unused)} photographs, expected {_FEWEST_VIEWS} or more; are the counts of squares "
-            "right, is the board sharp and wholly in the frame?"
-        )
-    return _solve(folder, views, size, tuple(unused))
+    for reading in board.readings:
+        seen = {path: reading.find(grey) for path, grey in greys.items()}
+        views = [found for found in seen.values() if found is not None]
+        if len(views) >= _FEWEST_VIEWS:
+            return _solve(folder, views, size, tuple(path for path, found in seen.items() if found is None), reading)
+    counts = "nor of as many inner corners " if len(board.readings) > 1 else ""
+    raise CameraError(
+        f"{folder}: found no board of {board.columns}x{board.rows} squares {counts}in {_FEWEST_VIEWS} or more of "
+        f"{len(greys)} photographs; are the counts right, is the board sharp and wholly in the frame?"
+    )
 
 
 def _solve(
-    folder: Path, views: Sequence[tuple[np.ndarray, np.ndarray]], size: tuple[int, int], unused: tuple[Path, ...]
+    folder: Path,
+    views: Sequence[tuple[np.ndarray, np.ndarray]],
+    size: tuple[int, int],
+    unused: tuple[Path, ...],
+    board: Board,
 ) -> Calibration:
     points, pixels = zip(*views, strict=True)
     try:
@@ -152,7 +165,7 @@ def _solve(
     camera = Intrinsics(
         check_matrix(matrix, width, height, str(folder)), width, height, tuple(distortion.ravel()[:5].tolist())
     )
-    return Calibration(camera, float(error), uncertainty, len(views), unused)
+    return Calibration(camera, float(error), uncertainty, len(views), unused, board)
 
 
 def _spread_deg(turns: Sequence[np.ndarray]) -> float:

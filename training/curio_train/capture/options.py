@@ -15,7 +15,8 @@ class CalibrateCommand:
     calibrate: tyro.conf.FlagCreatePairsOff[bool] = False
     """This command."""
     board: tuple[int, int] | None = None
-    """Squares of a chessboard or ChArUco board along and across. Without, photographs of a still scene are matched with
+    """Squares of a chessboard or ChArUco board along and across; of a chessboard also its inner corners, as OpenCV
+    counts. Without, photographs of a still scene are matched with
     each other (structure from motion), and the first has to look down on a table or floor."""
     square_mm: float = 30.0
     """Side of a square."""

@@ -40,12 +40,23 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
             "--views-out and --camera are for photographs of a scene; leave them out, or leave out --board"
         )
     marker_m = None if command.marker_mm is None else command.marker_mm / 1000
-    found = calibrate(command.images, Board(*command.board, command.square_mm / 1000, marker_m, command.dictionary))
+    board = Board(*command.board, command.square_mm / 1000, marker_m, command.dictionary)
+    found = calibrate(command.images, board)
     save_intrinsics(command.camera_out, found.camera)
     unused = f", not found in {', '.join(path.name for path in found.unused[:5])}" if found.unused else ""
     return (
         f"{command.camera_out}: focal length {found.camera.matrix[0, 0]:.1f} pixels ± {found.focal_uncertainty:.2%}, "
         f"corners off by {found.error_px:.2f} pixels in {found.num_views} photographs{unused}"
+        + _reading(board, found.board)
+    )
+
+
+def _reading(given: Board, found: Board) -> str:
+    if found == given:
+        return f"; --board {given.columns} {given.rows} counts squares"
+    return (
+        f"; --board {given.columns} {given.rows} counts the inner corners of a board of {found.columns}x{found.rows} "
+        "squares"
     )
 
 

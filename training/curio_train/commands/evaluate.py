@@ -23,8 +23,8 @@ class EvaluateCommand:
     """A run folder, a model folder (its latest version), a version's folder, or an .onnx file."""
     split: Literal["train", "validation", "test"] = "test"
     """Which images of the world."""
-    num_images: int = 500
-    """How many images."""
+    num_images: int | None = None
+    """How many images; unless given, 100 of linemod and of capture, which are rendered for it, and 500 of others."""
     data: Path | None = None
     """BOP data set whose real frames are scored as well; needed for an exported LineMOD model."""
     download: FlagCreatePairsOff[bool] = False

@@ -7,11 +7,14 @@ from pathlib import Path
 
 from rich.console import Console
 
-from curio_train.errors import CurioError
+from curio_train.errors import CurioError, UsageError
 from curio_train.learning.runs.interruption import Interrupted, Interruption, interruptible
 
 CACHE = Path("~/.cache/curio-pose")
 """Where image sets that a world draws once, and downloads, are kept."""
+
+_EXTRAS = {"pycolmap": "capture", "viser": "view", "ray": "ray"}
+"""Extras by the packages that they alone bring; all others of training are in ``train``."""
 
 
 def answer(work: Callable[[Interruption], int]) -> int:
@@ -23,12 +26,27 @@ def answer(work: Callable[[Interruption], int]) -> int:
         except CurioError as exc:
             console.print("error:", str(exc), style="bold red", markup=False)
             return exc.exit_status
+        except ModuleNotFoundError as exc:
+            console.print("error:", _missing_extra(exc), style="bold red", markup=False)
+            return UsageError.exit_status
         except Interrupted as exc:
             console.print(f"stopped by {exc}; whatever was saved before is intact", markup=False)
             return exc.exit_status
         except BrokenPipeError:  # the reader of our output (head, less) has seen enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
+
+
+def _missing_extra(exc: ModuleNotFoundError) -> str:
+    """Which extra brings a package that is not installed; a missing module of our own is a fault, and raised."""
+    package = (exc.name or "").partition(".")[0]
+    if not package or package.startswith("curio_"):
+        raise exc
+    extra = _EXTRAS.get(package, "train")
+    return (
+        f"this needs the package {package}, which the base install leaves out; install the extra {extra}: "
+        f"pip install 'curio-pose[{extra}]' (in a clone: pip install '.[{extra}]')"
+    )
 
 
 def warn(text: str) -> None:

@@ -157,7 +157,7 @@ def _read_shrunk(path: Path) -> np.ndarray:
 
 
 class Photographs:
-    """The images of a folder (not of its subfolders), in the order of their names.
+    """The images of a folder (not of its subfolders), in the order of their names; hidden files are passed over.
 
     Args:
         folder: Where they lie.
@@ -169,7 +169,9 @@ class Photographs:
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
             raise DataError(f"{folder}: there is no such folder; expected one with photographs")
-        self.paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        # macOS leaves a file ._IMG.jpg beside each IMG.jpg, which is no image.
+        visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+        self.paths = sorted(path for path in visible if path.suffix.lower() in SUFFIXES)
         if not self.paths:
             raise DataError(f"{folder}: found no images, expected files ending in {' '.join(SUFFIXES)}")
         # Decoding costs more than rendering the object in front: a few hundred photographs stay in memory, shrunk.

@@ -1,6 +1,5 @@
 """Score a run or a model on held-out images of its world, beside the same network untrained, and on real frames."""
 
-import json
 from collections.abc import Callable, Sized
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,10 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from curio_train.errors import CheckpointError, DataError, ReportError, UsageError
+from curio_train.errors import DataError, ReportError, UsageError
 from curio_train.evaluation.photographed import judge
 from curio_train.evaluation.real_frames import evaluate_real_frames
 from curio_train.evaluation.report import write_report
+from curio_train.evaluation.results import keep
 from curio_train.evaluation.scores import add_errors, pose_scores, scene_errors, scene_scores
 from curio_train.evaluation.subject import Predict, Subject, load_subject
 from curio_train.export.card import EVALUATION_FILE
@@ -25,6 +25,9 @@ from curio_train.refinement.render_and_compare import with_refinement
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
 from curio_train.worlds.base import Split, World
 from curio_train.worlds.single_object.world import SingleObjectWorld
+
+QUICK, ALL = 100, 500
+"""Held-out images that are scored: a minute of rendering whole frames, and the paper's number."""
 
 _BATCH_SIZE = 50
 _NUM_EMPTY = 100
@@ -47,7 +50,7 @@ def evaluate(
     path: Path,
     *,
     split: Split = "test",
-    num_images: int = 500,
+    num_images: int | None = None,
     data: Path | None = None,
     bop_results: Path | None = None,
     refine: bool = False,
@@ -60,7 +63,8 @@ def evaluate(
     Args:
         path: See :func:`~curio_train.evaluation.subject.load_subject`.
         split: Which images of the world.
-        num_images: How many; of a finite set at most all.
+        num_images: How many; of a finite set at most all. Unless given, :data:`QUICK` of a world that renders whole
+            frames, and :data:`ALL` of others.
         data: A BOP data set whose real frames are scored as well, in the LineMOD world.
         bop_results: Folder for a results file of those frames in BOP's format.
         refine: Score the poses once more after :class:`~curio_train.refinement.render_and_compare.RenderAndCompare`.
@@ -78,13 +82,15 @@ def evaluate(
     Raises:
         CurioError: Any of this package's errors.
     """
-    if num_images < 1:
+    if num_images is not None and num_images < 1:
         raise UsageError(f"--num-images is {num_images}, expected at least 1")
     if bop_results is not None and data is None:
         raise UsageError("--bop-results needs the real frames that it is about: --data DIR")
     subject = load_subject(path, data)
     if data is not None and not isinstance(subject.world, SingleObjectWorld):
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
+    if num_images is None:
+        num_images = QUICK if isinstance(subject.world, SingleObjectWorld) else ALL
     better = replace(subject, predict=with_refinement(subject.predict, subject.world)) if refine else None
     progress(f"{num_images} images of the {split} split")
     held_out = draw(subject.world, split, num_images, cache)
@@ -103,17 +109,18 @@ def evaluate(
         result["refined"] = {"metrics": _scored(better.world, better.predict, held_out)[1]}
         if data is not None:
             result["refined"]["real"] = evaluate_real_frames(better, data, bop_results, "-refined")
+    judgement = None
     try:
         if (judgement := judge(subject.world, subject.predict)) is not None:
             result["photographs"] = judgement.summary
     except DataError as exc:  # photographs that have moved since; the scores need none
         warn(f"not judged by photographs: {exc}")
     if (path / CONFIG_FILE).exists():
-        _keep(path, result)
+        keep(path / EVALUATION_FILE, result)
         progress("the report")
         errors = scene_errors(subject.world, predicted, held_out.code)
         try:
-            write_report(path, subject, split, cache, errors, result)
+            write_report(path, subject, split, cache, errors, result, judgement)
         except ReportError as exc:
             warn(str(exc))
     return result
@@ -195,14 +202,3 @@ def _origin(path: Path, subject: Subject) -> dict[str, Any]:
         "commit": subject.commit,
         "machine": machine(),
     }
-
-
-def _keep(run: Path, result: dict[str, Any]) -> None:
-    """Keep the result in the run folder, for the card of a model exported from it."""
-    file = run / EVALUATION_FILE
-    draft = file.with_name(file.name + ".tmp")
-    try:
-        draft.write_text(json.dumps(result, indent=2), encoding="utf-8")
-        draft.replace(file)
-    except OSError as exc:
-        raise CheckpointError(f"cannot write {file}: {exc.strerror}; make the run folder writable") from exc

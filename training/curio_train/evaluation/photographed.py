@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from curio_train.evaluation.agreement import differing, draw, inlier_ratio, inside, overlap
+from curio_train.evaluation.closeups import closeups, outlined
 from curio_train.evaluation.subject import Predict
 from curio_train.metrics.images import blurred, dssim
 from curio_train.scene_code import CONFIDENCE, SceneCode
@@ -51,9 +52,9 @@ class Judgement:
     verdict: str
     """Whether to trust the model, and what to do if not."""
     columns: Mapping[str, Tensor]
-    """Photograph and re-rendering of each view by heading, [num, 3, height, width] in [0, 1], worst first."""
+    """Photographs, close-ups and re-renderings by heading, [num, 3, height, width] in [0, 1], worst first."""
     captions: Sequence[str]
-    """The figures of each row."""
+    """The file, in free space, and the figures of each row."""
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -76,7 +77,9 @@ def judge(world: World, predict: Predict) -> Judgement | None:
         return _on_plane(world, predict)
     if isinstance(world, TwoStageWorld) and isinstance(world.photographs, CapturePhotographs):
         photographs = world.photographs
-        return _in_space(world, predict, photographs.judged(_NUM_IN_SPACE), photographs.background_image())
+        paths, judged = photographs.judged(_NUM_IN_SPACE)
+        names = [path.name for path in paths]
+        return _in_space(world, predict, names, judged, photographs.background_image())
     return None
 
 
@@ -84,7 +87,7 @@ def _on_plane(world: TabletopWorld, predict: Predict) -> Judgement:
     views = [view for view in (world.photographs.own, world.photographs.second) if view is not None]
     code = _read(predict, views[0].photographs)
     drawn = [_drawn(world, number, code) for number in range(len(views))]
-    agreed, _ = _agreement(
+    agreed, *_ = _agreement(
         world, _certain(code), views[0].photographs.float() / 255, views[0].background_image.float() / 255
     )
     metrics = _means(agreed)
@@ -104,11 +107,13 @@ def _on_plane(world: TabletopWorld, predict: Predict) -> Judgement:
     return Judgement(metrics, verdict, columns, _captions(agreed | {"blurred DSSIM": worst}, order))
 
 
-def _in_space(world: World, predict: Predict, photographs: Tensor, background_image: Tensor | None) -> Judgement:
+def _in_space(
+    world: World, predict: Predict, names: Sequence[str], photographs: Tensor, background_image: Tensor | None
+) -> Judgement:
     code = dict(_read(predict, (photographs * 255).round().byte()))
     if CONFIDENCE in code:  # drawn however unsure: whether it is right is the question
         code[CONFIDENCE] = torch.ones_like(code[CONFIDENCE])
-    agreed, images = _agreement(world, code, photographs, background_image)
+    agreed, images, masks = _agreement(world, code, photographs, background_image)
     measure = "explained" if background_image is None else "overlap"
     order = agreed[measure].argsort()
     metrics = _means(agreed)
@@ -117,16 +122,23 @@ def _in_space(world: World, predict: Predict, photographs: Tensor, background_im
         0 if background_image is None else int((~differing(photographs, background_image).any(dim=2).any(dim=1)).sum())
     )
     verdict = _verdict_in_space(metrics["own_view_agreeing"], len(photographs), background_image is not None, num_empty)
-    columns = {"photograph": photographs[order], "what was found": images[order]}
-    return Judgement(metrics, verdict, columns, _captions(agreed, order))
+    seen, drawn, where = photographs[order], images[order], masks[order]
+    columns = {
+        "photograph": seen,
+        "close-up": closeups(seen, where),
+        "its contour": closeups(outlined(seen, where), where),
+        "what was found": closeups(drawn, where),
+    }
+    captions = [f"{names[row]}\n{text}" for row, text in zip(order.tolist(), _captions(agreed, order), strict=True)]
+    return Judgement(metrics, verdict, columns, captions)
 
 
 def _agreement(
     world: World, code: SceneCode, photographs: Tensor, background_image: Tensor | None
-) -> tuple[dict[str, Tensor], Tensor]:
-    """Numbers of each photograph by name, and what was found, drawn over the background image or the photographs."""
+) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """Numbers of each photograph by name; what was found, drawn over the background image or the photographs; masks."""
     found: dict[str, list[Tensor]] = {"inside": [], "explained" if background_image is None else "overlap": []}
-    images = []
+    images, masks = [], []
     for start in range(0, len(photographs), _DRAWN_AT_ONCE):
         some = slice(start, start + _DRAWN_AT_ONCE)
         seen, drawing = photographs[some], draw(world, {name: values[some] for name, values in code.items()})
@@ -137,7 +149,8 @@ def _agreement(
         else:
             found["overlap"].append(overlap(drawing.silhouette, differing(seen, background_image)))
         images.append(drawing.over(behind))
-    return {name: torch.cat(values) for name, values in found.items()}, torch.cat(images)
+        masks.append(drawing.silhouette)
+    return {name: torch.cat(values) for name, values in found.items()}, torch.cat(images), torch.cat(masks)
 
 
 def _certain(code: SceneCode) -> SceneCode:

@@ -17,8 +17,10 @@ from torch import Tensor
 from curio_train.errors import CheckpointError, DataError, ReportError
 from curio_train.evaluation import report_figures as figures
 from curio_train.evaluation.photographed import Judgement, judge
+from curio_train.evaluation.results import keep
 from curio_train.evaluation.subject import Subject, load_subject
-from curio_train.evaluation.tables import label
+from curio_train.evaluation.tables import apart, label
+from curio_train.export.card import JUDGEMENT_FILE
 from curio_train.learning.runs.checkpoint import CONFIG_FILE
 from curio_train.learning.runs.configuration import world_name
 from curio_train.learning.runs.progress import read_history, stage_pictures
@@ -39,7 +41,14 @@ def report_training(run: Path, cache: Path) -> None:
     Raises:
         CurioError: The report could not be made. The run is none the worse.
     """
-    write_report(run, load_subject(run), "train", cache)
+    subject = load_subject(run)
+    try:
+        judgement = judge(subject.world, subject.predict)
+        if judgement is not None:
+            keep(run / JUDGEMENT_FILE, {"images_seen": subject.images_seen, **judgement.summary})
+    except DataError as exc:
+        raise ReportError(f"{run / REPORT_FILE} could not be written ({exc}); the run itself is whole") from exc
+    write_report(run, subject, "train", cache, judgement=judgement)
 
 
 def write_report(
@@ -49,6 +58,7 @@ def write_report(
     cache: Path,
     errors: Mapping[str, Tensor] | None = None,
     evaluation: Mapping[str, Any] | None = None,
+    judgement: Judgement | None = None,
 ) -> None:
     """Draw and write the report.
 
@@ -60,12 +70,13 @@ def write_report(
         errors: Each single error by metric, see :func:`~curio_train.evaluation.scores.scene_errors`; without them the
             differences of images and re-renderings are shown.
         evaluation: What ``curio-eval`` found, if it did.
+        judgement: By photographs, if there are some.
 
     Raises:
         ReportError: Something about it failed.
     """
     try:
-        html = _page(run, subject, split, cache, errors, evaluation)
+        html = _page(run, subject, split, cache, errors, evaluation, judgement)
         draft = run / (REPORT_FILE + ".tmp")
         draft.write_text(html, encoding="utf-8")
         draft.replace(run / REPORT_FILE)
@@ -86,6 +97,7 @@ def _page(
     cache: Path,
     errors: Mapping[str, Tensor] | None,
     evaluation: Mapping[str, Any] | None,
+    judgement: Judgement | None,
 ) -> str:
     world, config = subject.world, subject.config
     source = world.source(split, config.seed, with_code=False, cache=cache)
@@ -94,11 +106,11 @@ def _page(
     rendered = world.render(code, batch.backgrounds).clamp(0, 1)
     columns = (batch.images, rendered, novel_view(world, code).clamp(0, 1))
     shown = errors or {"image_dssim": dssim(rendered, batch.images)}
-    made, judgement = run_sessions(run), judge(world, subject.predict)
+    made, parts = run_sessions(run), [kind.name for kind in world.objects]
     history = read_history(run)
     pages = Environment(loader=PackageLoader("curio_train.evaluation", ""), autoescape=True)
     return pages.get_template("report.html.jinja").render(
-        title=f"{world_name(config)}, {config.method}, seed {config.seed}",
+        title=f"{world_name(config)}: {', '.join(parts)}; {config.method}, seed {config.seed}",
         facts=_facts(subject, made),
         run_sessions=made,
         stages=[(f"{images:,}", figures.uri(path.read_bytes())) for images, path in stage_pictures(run)],
@@ -145,12 +157,15 @@ def _reliability(evaluation: Mapping[str, Any]) -> str | None:
     return figures.reliability(bins) if bins else None
 
 
-def _scores(evaluation: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Rows of metric, this network's figure, the untrained one's; real frames have only the first."""
-    untrained = evaluation.get("untrained", {})
-    rows = [(label(name), f"{value:.4g}", f"{untrained[name]:.4g}") for name, value in _metrics(evaluation).items()]
-    real = evaluation.get("real", {})
-    return rows + [(f"real frames: {label(name).strip()}", f"{v:.4g}", "") for name, v in _metrics(real).items()]
+def _scores(evaluation: Mapping[str, Any]) -> dict[str, list[tuple[str, str, str]]]:
+    """By statistic, rows of metric, this network's figure, the untrained one's; real frames have only the first."""
+    untrained, rows = evaluation.get("untrained", {}), dict[str, list[tuple[str, str, str]]]()
+    scored, real = _metrics(evaluation), _metrics(evaluation.get("real", {}))
+    for statistic, names in apart(scored).items():
+        rows[statistic] = [(label(name), f"{scored[name]:.4g}", f"{untrained[name]:.4g}") for name in names]
+    for statistic, names in apart(real).items():
+        rows[f"real frames: {statistic}"] = [(label(name), f"{real[name]:.4g}", "") for name in names]
+    return rows
 
 
 def _metrics(scored: Mapping[str, Any]) -> Mapping[str, float]:

@@ -26,7 +26,7 @@ def samples(columns: Sequence[Tensor], headings: Sequence[str] = HEADINGS, capti
         captions: One a row, written to its left, or none.
     """
     num = len(columns[0])
-    figure = Figure(figsize=(6, 2 * num), layout="constrained")
+    figure = Figure(figsize=(max(6, 2 * len(columns)), 2 * num), layout="constrained")
     panels = figure.subplots(num, len(columns), squeeze=False)
     for number, (heading, column) in enumerate(zip(headings, columns, strict=True)):
         panels[0, number].set_title(heading)

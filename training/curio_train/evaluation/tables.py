@@ -1,6 +1,6 @@
 """Results as tables for people."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rich.console import Console
@@ -54,6 +54,14 @@ def label(metric: str) -> str:
     return _LABELS.get(metric, metric)
 
 
+def apart(metrics: Iterable[str]) -> dict[str, list[str]]:
+    """Names of metrics by the statistic that they are: means and shares, or medians; no table has both."""
+    groups: dict[str, list[str]] = {"means and shares": [], "medians": []}
+    for name in metrics:
+        groups["medians" if name.endswith("_median") else "means and shares"].append(name)
+    return {statistic: names for statistic, names in groups.items() if names}
+
+
 def print_evaluation(result: Mapping[str, Any], console: Console) -> None:
     """The result of :func:`~curio_train.evaluation.evaluate.evaluate`."""
     objects, minutes = ", ".join(result["objects"]), result["training_seconds"] / 60
@@ -63,13 +71,10 @@ def print_evaluation(result: Mapping[str, Any], console: Console) -> None:
         markup=False,
         soft_wrap=True,
     )
-    table = Table(title=f"{result['num_images']} images of the {result['split']} split", title_justify="left")
-    table.add_column("metric")
-    table.add_column("this", justify="right")
-    table.add_column("untrained", justify="right")
     refined = result.get("refined")
-    _add_rows(table, result["metrics"], result["untrained"], *([refined["metrics"]] if refined else []))
-    console.print(table)
+    columns = {"this": result["metrics"], "untrained": result["untrained"]}
+    columns |= {"refined": refined["metrics"]} if refined else {}
+    _print_tables(f"{result['num_images']} images of the {result['split']} split", columns, console)
     if "real" in result:
         _print_real(result["real"], refined and refined["real"], console)
     if "photographs" in result:
@@ -77,32 +82,29 @@ def print_evaluation(result: Mapping[str, Any], console: Console) -> None:
 
 
 def _print_photographs(found: Mapping[str, Any], console: Console) -> None:
-    table = Table(title=f"{found['num_photographs']} photographs, without labels", title_justify="left")
-    table.add_column("metric")
-    table.add_column("this", justify="right")
-    for name, value in found["metrics"].items():
-        table.add_row(label(name), f"{value:.4g}")
-    console.print(table)
+    title = f"{found['num_photographs']} photographs, without labels"
+    _print_tables(title, {"this": found["metrics"]}, console)
     console.print(found["verdict"], markup=False)
 
 
-def _add_rows(table: Table, first: Mapping[str, float], *others: Mapping[str, float]) -> None:
-    """A row a metric; what has no column yet is of refined poses."""
-    if len(table.columns) < 2 + len(others):
-        table.add_column("refined", justify="right")
-    for name, value in first.items():
-        table.add_row(label(name), *(f"{found:.4g}" for found in (value, *(other[name] for other in others))))
+def _print_tables(title: str, columns: Mapping[str, Mapping[str, float]], console: Console) -> None:
+    """A table of each statistic, a row a metric of the first column."""
+    first = next(iter(columns.values()))
+    for statistic, names in apart(first).items():
+        table = Table(title=f"{title}: {statistic}", title_justify="left")
+        table.add_column("metric")
+        for heading in columns:
+            table.add_column(heading, justify="right")
+        for name in names:
+            table.add_row(label(name), *(f"{found[name]:.4g}" for found in columns.values()))
+        console.print(table)
 
 
 def _print_real(real: Mapping[str, Any], refined: Mapping[str, Any] | None, console: Console) -> None:
-    table = Table(
-        title=f"{real['num_targets']} real targets of {real['dataset']}, {real['split']}: {real['split_name']}",
-        title_justify="left",
-    )
-    table.add_column("metric")
-    table.add_column("this", justify="right")
-    _add_rows(table, *(found["metrics"] | _bins(found) for found in (real, refined) if found))
-    console.print(table)
+    title = f"{real['num_targets']} real targets of {real['dataset']}, {real['split']}: {real['split_name']}"
+    columns = {"this": real["metrics"] | _bins(real)}
+    columns |= {"refined": refined["metrics"] | _bins(refined)} if refined else {}
+    _print_tables(title, columns, console)
 
 
 def _bins(real: Mapping[str, Any]) -> dict[str, float]:

@@ -17,6 +17,9 @@ from curio_train.worlds.base import ObjectKind
 EVALUATION_FILE = "evaluation.json"
 """What ``curio-eval`` leaves in a run folder, and a card quotes."""
 
+JUDGEMENT_FILE = "judgement.json"
+"""What training leaves beside its report where there are photographs to judge by: figures and a verdict."""
+
 _SUPERVISION = {
     "label": "true scene codes of training images",
     "sleep": "codes of its own making, rendered; no label of the data",
@@ -59,8 +62,10 @@ def card(
         _table(("", ""), _origin(version, spec, made)),
         _table(("output", "shape", "unit", "frame"), _outputs(spec, shapes)),
         _table(("object", "diameter", "mesh SHA-256", "source and licence of the mesh"), _objects(spec, objects)),
-        _metrics(evaluation) if evaluation else "curio-eval had not scored it when it was exported.\n",
+        _metrics(evaluation) if evaluation else "curio-eval had not scored it on renderings when it was exported.\n",
     ]
+    if judgement := (evaluation or {}).get("photographs") or _read(made.run / JUDGEMENT_FILE, made.progress.all_images):
+        parts.append(_photographs(judgement))
     if evaluation and "real" in evaluation:
         parts.append(_real_frames(evaluation))
     return "\n".join(parts)
@@ -68,8 +73,12 @@ def card(
 
 def read_evaluation(run: Path, images: int) -> dict[str, Any] | None:
     """The result that curio-eval left in a run folder, if it is of the network that has seen ``images`` images."""
+    return _read(run / EVALUATION_FILE, images)
+
+
+def _read(file: Path, images: int) -> dict[str, Any] | None:
     try:
-        found = json.loads((run / EVALUATION_FILE).read_text(encoding="utf-8"))
+        found = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     return found if isinstance(found, dict) and found.get("images_seen") == images else None
@@ -129,23 +138,34 @@ def _objects(spec: ModelSpec, objects: Sequence[ObjectKind]) -> Iterable[tuple[s
 
 def _metrics(evaluation: Mapping[str, Any]) -> str:
     untrained = evaluation.get("untrained", {})
-    rows = [
-        (name, f"{value:.4g}", f"{untrained[name]:.4g}" if name in untrained else "–")
-        for name, value in evaluation["metrics"].items()
-    ]
     head = f"On {evaluation['num_images']} held-out images of the {evaluation['split']} split:\n"
-    return f"{head}\n{_table(('metric', 'this model', 'untrained network'), rows)}"
+    return f"{head}\n{_tables(('this model', 'untrained network'), evaluation['metrics'], untrained)}"
+
+
+def _photographs(judgement: Mapping[str, Any]) -> str:
+    """The verdict on unlabelled photographs, and its figures."""
+    head = f"In {judgement['num_photographs']} photographs, without labels: {judgement['verdict']}\n"
+    return f"{head}\n{_tables(('this model',), judgement['metrics'])}"
 
 
 def _real_frames(evaluation: Mapping[str, Any]) -> str:
     """Table of the scores on real frames of a data set, whose labels only score."""
     real, refined = evaluation["real"], evaluation.get("refined", {}).get("real", {}).get("metrics", {})
-    rows = [
-        (name, f"{value:.4g}", f"{refined[name]:.4g}" if name in refined else "–")
-        for name, value in real["metrics"].items()
-    ]
     head = f"On {real['num_targets']} targets in real frames of {real['dataset']} ({real['split_name']}):\n"
-    return f"{head}\n{_table(('metric', 'this model', 'after render-and-compare'), rows)}"
+    return f"{head}\n{_tables(('this model', 'after render-and-compare'), real['metrics'], refined)}"
+
+
+def _tables(headings: Sequence[str], first: Mapping[str, float], *others: Mapping[str, float]) -> str:
+    """A table of means and shares and one of medians, a row a metric."""
+    groups = [[name for name in first if name.endswith("_median") == medians] for medians in (False, True)]
+    tables = []
+    for statistic, names in zip(("mean or share", "median"), groups, strict=True):
+        rows = [
+            (name, f"{first[name]:.4g}", *(f"{other[name]:.4g}" if name in other else "–" for other in others))
+            for name in names
+        ]
+        tables += [_table((statistic, *headings), rows)] if rows else []
+    return "\n".join(tables)
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -61,13 +61,14 @@ class CapturePhotographs:
         """
         self._folder, self._background, self._intrinsics, self._camera = folder, background, intrinsics, camera
 
-    def judged(self, count: int) -> Tensor:
-        """At most ``count`` of those that the model never learns from, [num, 3, height, width] in [0, 1].
+    def judged(self, count: int) -> tuple[list[Path], Tensor]:
+        """At most ``count`` of those that the model never learns from: files, and [num, 3, height, width] in [0, 1].
 
         Raises:
             DataError: One cannot be read, or is not of the camera's size.
         """
-        return self._read(spread(self._split[0], count))
+        paths = spread(self._split[0], count)
+        return paths, self._read(paths)
 
     def unlabelled(self) -> UnlabelledPhotographs:
         """The others, for self-training.

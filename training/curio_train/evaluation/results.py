@@ -1,0 +1,22 @@
+"""Keeps what was found out about a run as JSON in its folder, where export and reports read it."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from curio_train.errors import CheckpointError
+
+
+def keep(file: Path, result: Mapping[str, Any]) -> None:
+    """Write a result whole or not at all.
+
+    Raises:
+        CheckpointError: The run folder cannot be written.
+    """
+    draft = file.with_name(file.name + ".tmp")
+    try:
+        draft.write_text(json.dumps(result, indent=2), encoding="utf-8")
+        draft.replace(file)
+    except OSError as exc:
+        raise CheckpointError(f"cannot write {file}: {exc.strerror}; make the run folder writable") from exc
