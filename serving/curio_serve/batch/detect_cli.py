@@ -69,6 +69,8 @@ class DetectArguments:
     """Turn images as EXIF says, and K with them. Otherwise pixels are taken as stored, to which K belongs."""
     jobs: int = num_cores()
     """Images worked on at the same time; by default the number of cores that there are for it."""
+    provider: str = "cpu"
+    """onnxruntime's execution providers by preference, with commas: cpu, openvino, cuda, tensorrt, coreml or others."""
     ray: str | None = None
     """Do it on a Ray cluster: HOST:PORT, auto for the one this machine is in, local for this machine's processors."""
     token_file: Path | None = None
@@ -220,15 +222,19 @@ def _estimator(arguments: DetectArguments, settings: "Settings") -> "Estimator":
     """The model on this machine or behind a server."""
     from curio_serve.batch.estimators import LocalEstimator, RemoteEstimator
     from curio_serve.models.model_folder import open_model
+    from curio_serve.models.runtime import Runtime, read_providers
 
     if os.path.exists(arguments.model):
-        return LocalEstimator(open_model(arguments.model), settings)
+        runtime = Runtime(read_providers(arguments.provider))
+        return LocalEstimator(open_model(arguments.model, runtime), settings)
     served = _SERVED_MODEL.fullmatch(arguments.model)
     if served is None:
         raise UsageError(
             f"MODEL {arguments.model}: no such folder or file, nor HOST:PORT/NAME of a server; expected a folder that "
             "curio-export wrote, such as models/ape"
         )
+    if arguments.provider != DetectArguments.provider:
+        raise UsageError(f"--provider {arguments.provider}: found a model on a server, which chooses its own")
     return RemoteEstimator(_client(arguments, served["address"]), served["model"], settings)
 
 
