@@ -12,8 +12,8 @@ from curio_proto.v1 import detector_pb2 as pb
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
 from curio_serve.errors import InternalError
 from curio_serve.models.batching import Batcher
-from curio_serve.models.model import Runtime
 from curio_serve.models.model_folder import load_version
+from curio_serve.models.runtime import Runtime
 
 
 class Network:

@@ -15,16 +15,16 @@ def test_defaults_listen_on_loopback_alone() -> None:
 
 def test_flags_win_over_environment_over_file(tmp_path: Path) -> None:
     file = tmp_path / "serve.toml"
-    file.write_text('models = "from_file"\nport = 1\nqueue = 1\nmax_pixels = 1000\nproviders = ["A", "B"]\n')
+    file.write_text('models = "from_file"\nport = 1\nqueue = 1\nmax_pixels = 1000\nprovider = "cuda,cpu"\n')
     environment = {"CURIO_SERVE_PORT": "2", "CURIO_SERVE_QUEUE": "2", "CURIO_SERVE_FULL_DECODE": "true", "HOME": "/x"}
     config = read_config(["--config", str(file), "--queue", "3"], environment)
     assert (config.max_pixels, config.port, config.queue) == (1000, 2, 3)
     assert config.models == Path("from_file")
-    assert config.providers == ("A", "B")
+    assert config.provider == "cuda,cpu"
     assert config.full_decode
     assert read_config(["given", "--config", str(file)], environment).models == Path("given")
     assert read_config([], {"CURIO_SERVE_CONFIG": str(file)}).port == 1
-    assert read_config([], {"CURIO_SERVE_PROVIDERS": "X,Y"}).providers == ("X", "Y")
+    assert read_config([], {"CURIO_SERVE_PROVIDER": "openvino,cpu"}).provider == "openvino,cpu"
 
 
 def test_what_is_dumped_can_be_read_again(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_a_taken_port_is_named(server: Any, models_dir: Path) -> None:
         (["{models}", "--tls-key", "{tmp}/k", "--tls-certificate", "{tmp}/c"], 2, "--tls-key {tmp}/k cannot be read"),
         (["{models}", "--tls-key", "{readme}", "--tls-certificate", "{readme}"], 2, "expected PEM files"),
         (["{models}", "--host", "203.0.113.7"], 1, "cannot listen on 203.0.113.7:0: Cannot assign requested address"),
-        (["{models}", "--providers", "NoSuchProvider"], 1, "no model could be loaded"),
+        (["{models}", "--provider", "nosuch"], 2, "has no provider 'nosuch'; it has cpu (CPUExecutionProvider)"),
         (["{models}", "--queue", "-3"], 2, "--queue is -3"),
     ],
 )

@@ -1,6 +1,8 @@
 """What curio-doctor says of this machine, and how it says it; planted faults are in test_doctor_faults.py."""
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from curio_serve.models.runtime import available_providers, short_name
 from curio_train.commands import doctor as doctor_command
 from curio_train.doctor.examine import Subjects, examine_files
 from curio_train.doctor.machine import examine_machine
@@ -118,3 +121,27 @@ def test_a_library_that_is_none_is_found_by_rendering(monkeypatch: pytest.Monkey
     assert findings["libLLVM"].state == "good"
     assert findings["rendering"].state == "bad"
     assert "DRJIT_LIBLLVM_PATH" in findings["rendering"].remedy
+
+
+def test_a_model_is_tried_on_every_provider(tmp_path: Path) -> None:
+    version = Path(shutil.copytree(Path(__file__).parents[2] / "models" / "ape", tmp_path / "ape")) / "1"
+    (model, *tried) = examine_files(Subjects(model=tmp_path / "ape"))
+    assert model.subject == "model"
+    assert [finding.subject for finding in tried] == [f"model on {short_name(name)}" for name in available_providers()]
+    assert {finding.state for finding in tried} == {"good"}
+    assert re.search(r" ms for the golden image \(CPUExecutionProvider\), .* off", tried[-1].text)
+
+    golden = dict(np.load(version / "golden.npz"))
+    np.savez(version / "golden.npz", **(golden | {"translation_m": golden["translation_m"] + 0.01}))
+    (_, *tried) = examine_files(Subjects(model=version))
+    assert (tried[-1].subject, tried[-1].state) == ("model on cpu", "bad")
+    assert tried[-1].text.endswith("0.01 off, where at most 0.001 is accepted")
+
+    (version / "golden.npz").write_bytes(b"no archive")
+    (_, *tried) = examine_files(Subjects(model=version / "model.onnx"))
+    assert "golden.npz is not an archive of arrays" in tried[-1].text
+
+    (version / "golden.npz").unlink()
+    assert [finding.text for finding in examine_files(Subjects(model=version))][1:] == [
+        "not compared: there is no golden.npz beside model.onnx"
+    ]

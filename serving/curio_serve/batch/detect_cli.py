@@ -69,6 +69,8 @@ class DetectArguments:
     """Turn images as EXIF says, and K with them. Otherwise pixels are taken as stored, to which K belongs."""
     jobs: int = num_cores()
     """Images worked on at the same time; by default the number of cores that there are for it."""
+    provider: str = "cpu"
+    """onnxruntime's execution providers by preference, with commas: cpu, openvino, cuda, tensorrt, coreml or others."""
     ray: str | None = None
     """Do it on a Ray cluster: HOST:PORT, auto for the one this machine is in, local for this machine's processors."""
     token_file: Path | None = None
@@ -235,11 +237,13 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
     from curio_serve.batch.estimators import LocalEstimator, RemoteEstimator
     from curio_serve.batch.named_models import SERVED_MODEL
     from curio_serve.models.model_folder import open_model
+    from curio_serve.models.runtime import Runtime, read_providers
 
     found: list[Estimator] = []
     for model in models:
         if os.path.exists(model):
-            found.append(LocalEstimator(open_model(model), settings))
+            runtime = Runtime(read_providers(arguments.provider))
+            found.append(LocalEstimator(open_model(model, runtime), settings))
             continue
         served = SERVED_MODEL.fullmatch(model)
         if served is None:
@@ -247,6 +251,8 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
                 f"MODEL {model}: no such folder or file, nor HOST:PORT/NAME of a server; expected a folder that "
                 "curio-export wrote, such as models/ape"
             )
+        if arguments.provider != DetectArguments.provider:
+            raise UsageError(f"--provider {arguments.provider}: found a model on a server, which chooses its own")
         found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
     return found
 

@@ -1,11 +1,7 @@
-"""Loads a model: opens an ONNX file with onnxruntime and checks its specification against its graph.
-
-The only file that imports onnxruntime, and that when a model is loaded.
-"""
+"""Loads a model: opens an ONNX file with onnxruntime and checks its specification against its graph."""
 
 import hashlib
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +15,7 @@ from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.view import CanonicalCamera
 from curio_serve.models.batching import Batcher
+from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime, open_session, runtime_errors
 from curio_serve.models.spec import read_spec
 
 if TYPE_CHECKING:
@@ -39,19 +36,6 @@ _OUTPUT_SHAPES: dict[str, tuple[tuple[int, ...], bool]] = {
 }
 # Outputs that the exporter derives from another field, so that the spec need not list them.
 _DERIVED = {"rotation", "rotation_6d"}
-
-
-@dataclass(frozen=True)
-class Runtime:
-    """The settings that networks run with."""
-
-    providers: tuple[str, ...] = ("CPUExecutionProvider",)
-    """onnxruntime's execution providers in order of preference."""
-    max_batch: int = 1
-    """Largest number of images of several calls in one run; 1: every call runs on its own."""
-
-
-DEFAULT_RUNTIME = Runtime()
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +112,7 @@ class Model:
     def _run(self, images: np.ndarray) -> Sequence[np.ndarray]:
         try:
             outputs: Sequence[np.ndarray] = self._session.run(None, {INPUT: images})
-        except _runtime_errors() as exc:
+        except runtime_errors() as exc:
             raise InternalError(f"model {self.label}: onnxruntime failed on a batch of {len(images)}: {exc}") from exc
         return outputs
 
@@ -166,42 +150,12 @@ def from_bytes(data: bytes, where: str, name: str = "", version: int = 0, runtim
         ModelError: Says how the content differs from what its specification or curio requires.
     """
     spec = read_spec(data, where)
-    session = _open(data, where, runtime.providers)
+    session = open_session(data, where, runtime.providers)
     name = name or spec.name or Path(where).stem
     model = Model(session, spec, name, version, hashlib.sha256(data).hexdigest(), runtime.max_batch)
     _check_graph(session, model)
     _check_outputs(model)
     return model
-
-
-def _open(data: bytes, where: str, providers: Sequence[str]) -> "onnxruntime.InferenceSession":
-    """A session with one thread a call: parallel calls share it, so that the weights are in memory once."""
-    # Before the import: unless told not to, onnxruntime from 1.29 on writes an identifier into the user's cache folder
-    # and uploads events to its makers (its Privacy.md).
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    import onnxruntime
-
-    missing = set(providers) - set(onnxruntime.get_available_providers())
-    if missing:
-        raise ModelError(
-            f"--providers: {sorted(missing)} not found; this onnxruntime has {onnxruntime.get_available_providers()}"
-        )
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    options.add_session_config_entry("session.load_model_format", "ONNX")
-    try:
-        return onnxruntime.InferenceSession(data, options, providers=list(providers))
-    except _runtime_errors() as exc:
-        raise ModelError(f"{where}: onnxruntime refuses the graph: {exc}") from exc
-
-
-def _runtime_errors() -> tuple[type[Exception], ...]:
-    """Onnxruntime's exceptions, which share no base."""
-    from onnxruntime.capi import onnxruntime_pybind11_state as runtime
-
-    names = ("Fail", "InvalidArgument", "InvalidGraph", "InvalidProtobuf", "NotImplemented", "NoModel", "EPFail")
-    return (runtime.RuntimeException, *(getattr(runtime, name) for name in names))
 
 
 def _check_graph(session: "onnxruntime.InferenceSession", model: Model) -> None:

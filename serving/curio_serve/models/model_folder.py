@@ -7,26 +7,22 @@ network gives those outputs on this machine.
 A version's folder is named 1 to 999999999 in ASCII digits without a leading zero; as in Triton, others are passed over.
 """
 
-import io
 import re
 import stat
-import zipfile
-import zlib
 from pathlib import Path
 
-import numpy as np
 from curio_proto.files.triton_config_pb2 import TritonConfig, TritonType
 from google.protobuf import text_format
 
-from curio_serve.errors import InternalError, ModelError
+from curio_serve.errors import ModelError
 from curio_serve.files import read_file
-from curio_serve.models.model import DEFAULT_RUNTIME, INPUT, Model, Runtime, load
+from curio_serve.models.golden import GOLDEN_FILE, check_golden
+from curio_serve.models.model import INPUT, Model, load
+from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime
 
 CONFIG_FILE = "config.pbtxt"
 MODEL_FILE = "model.onnx"
-GOLDEN_FILE = "golden.npz"
-_GOLDEN_TOLERANCE = 1e-3  # metres, image widths, entries of matrices; float16 weights on another processor stay below
-_MAX_TEXT_BYTES, _MAX_GOLDEN_BYTES = 1 << 20, 1 << 28
+_MAX_TEXT_BYTES = 1 << 20
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
@@ -71,32 +67,36 @@ def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME)
     try:
         _check_sum(folder, f"{version}/{MODEL_FILE}", model.sha256)
         _check_config(folder, model)
-        _check_golden(folder / str(version) / GOLDEN_FILE, model)
+        check_golden(folder / str(version) / GOLDEN_FILE, model)
     except OSError as exc:
         raise ModelError(f"{exc.filename} cannot be read: {exc.strerror}") from exc
     return model
 
 
-def open_model(path: str | Path) -> Model:
+def open_model(path: str | Path, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
     """Load the MODEL of a command line: a model's folder (latest version), a version's folder or an .onnx file.
+
+    Args:
+        path: What was typed.
+        runtime: How the network is run.
 
     Raises:
         ModelError: There is no model, or it cannot be used.
     """
     path = Path(path)
     if path.is_file():
-        return load(path)
+        return load(path, runtime=runtime)
     if not path.is_dir():
         raise ModelError(f"no model at {path}; expected a model folder, a version folder or an .onnx file")
     resolved = path.resolve()
     if (path / MODEL_FILE).is_file():
         if _VERSION.fullmatch(resolved.name):
-            return load_version(resolved.parent, int(resolved.name))
-        return load(path / MODEL_FILE)
+            return load_version(resolved.parent, int(resolved.name), runtime)
+        return load(path / MODEL_FILE, runtime=runtime)
     found = versions(path)
     if not found:
         raise ModelError(f"no model in {path}; expected {path}/<version>/{MODEL_FILE}, as curio-export writes it")
-    return load_version(resolved, found[-1])
+    return load_version(resolved, found[-1], runtime)
 
 
 def _check_sum(folder: Path, file: str, sha256: str) -> None:
@@ -142,33 +142,3 @@ def _check_config(folder: Path, model: Model) -> None:
     expected = {name: (TritonType.TYPE_FP32, list(shape)) for name, shape in model.output_shapes.items()}
     if outputs != expected:
         raise ModelError(f"{path}: outputs are {outputs}; the graph has {expected}")
-
-
-def _check_golden(path: Path, model: Model) -> None:
-    """Run the golden image, if the version has one, and compare the outputs with those stored beside it."""
-    if not path.exists():
-        return
-    content = read_file(path, _MAX_GOLDEN_BYTES)
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            expected = dict(file)
-    # zipfile raises RuntimeError for encrypted members and unknown methods; np.load returns a bare array as it is.
-    except (ValueError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as exc:
-        raise ModelError(f"{path} is not an archive of arrays: {exc}; export the model again") from exc
-    image, size = expected.pop(INPUT, None), (model.camera.height, model.camera.width, 3)
-    if image is None or image.shape != size or image.dtype != np.uint8 or not expected:
-        found = None if image is None else f"{image.dtype} {image.shape}"
-        raise ModelError(f"{path}: image is {found}, outputs {sorted(expected)}; expected uint8 {size} and an output")
-    try:
-        outputs = model.run(image[None])
-    except InternalError as exc:
-        raise ModelError(f"{path}: the golden image cannot pass the graph: {exc}") from exc
-    for name, value in expected.items():
-        if name not in outputs or outputs[name][0].shape != value.shape:
-            raise ModelError(f"{path}: {name} {value.shape} is no output of the graph, which has {model.output_shapes}")
-        off = float(np.abs(outputs[name][0] - value).max(initial=0))
-        if not off <= _GOLDEN_TOLERANCE:
-            raise ModelError(
-                f"{path}: the network's {name} is {off:.3g} off for the golden image; at most {_GOLDEN_TOLERANCE:g} is "
-                "accepted: this file, or this machine's runtime, does not compute what was exported"
-            )

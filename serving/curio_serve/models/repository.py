@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from curio_serve.errors import ModelError, ModelNotFound
-from curio_serve.models.model import DEFAULT_RUNTIME, Model, Runtime
-from curio_serve.models.model_folder import GOLDEN_FILE, MODEL_FILE, is_model_name, load_version, versions
+from curio_serve.models.golden import GOLDEN_FILE
+from curio_serve.models.model import Model
+from curio_serve.models.model_folder import MODEL_FILE, is_model_name, load_version, versions
+from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime
 
 Key = tuple[str, int]
 Signature = tuple[tuple[int, int, int], ...]

@@ -62,8 +62,8 @@ class ServeConfig:
     """Newest versions of each model kept loaded."""
     refresh_s: float = 5.0
     """Seconds between looks for new model versions; 0: never."""
-    providers: tuple[str, ...] = ("CPUExecutionProvider",)
-    """onnxruntime's execution providers, in order of preference."""
+    provider: str = "cpu"
+    """onnxruntime's execution providers by preference, with commas: cpu, openvino, cuda, tensorrt, coreml or others."""
     batch: int = 0
     """Most images of several calls in one run of a network; 0: 1 on the CPU, where batches gain nothing, else 8."""
     tls_certificate: Path | None = None
@@ -176,7 +176,7 @@ def _typed(variable: str, text: str, default: Any) -> Any:
         if text.lower() not in ("true", "false", "1", "0"):
             raise UsageError(f"{variable} is {text!r}; expected true or false")
         return text.lower() in ("true", "1")
-    return text.split(",") if isinstance(default, tuple) else text
+    return text
 
 
 def _arguments(name: str, value: Any, source: str) -> list[str]:

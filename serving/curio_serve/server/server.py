@@ -20,9 +20,9 @@ from curio_serve.api.pose_detector import Limits, PoseService
 from curio_serve.api.registration import register
 from curio_serve.cores import memory_limit, num_cores
 from curio_serve.errors import ModelError, Unavailable, UsageError
-from curio_serve.models.model import Runtime
 from curio_serve.models.model_check import ChildCheck
 from curio_serve.models.repository import Change, Repository
+from curio_serve.models.runtime import Runtime, on_processor, read_providers
 from curio_serve.server import memory
 from curio_serve.server.config import ServeConfig
 from curio_serve.server.metrics_port import MetricsPort
@@ -49,9 +49,9 @@ class PoseServer:
         registry = CollectorRegistry()
         self._registry = registry
         self._metrics = Metrics(registry)
-        on_cpu = config.providers == ("CPUExecutionProvider",)
-        batch = config.batch or (1 if on_cpu else _DEVICE_BATCH)
-        self._repository = Repository(config.models, config.versions, Runtime(config.providers, batch))
+        providers = read_providers(config.provider)
+        batch = config.batch or (1 if on_processor(providers) else _DEVICE_BATCH)
+        self._repository = Repository(config.models, config.versions, Runtime(providers, batch))
         # Calls that wait for a batch leave their core to others, which decode meanwhile.
         workers = config.workers or num_cores() + (batch if batch > 1 else 0)
         self._reception = Reception(_reception_limits(config))

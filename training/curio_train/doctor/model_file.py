@@ -8,6 +8,7 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_train.camera import Intrinsics
 from curio_train.doctor.finding import Finding
+from curio_train.doctor.providers import examine_providers
 from curio_train.errors import CurioError
 from curio_train.exported_model import ExportedModel, find_model
 from curio_train.meshes.meshes import METRES, Mesh
@@ -19,12 +20,14 @@ _OTHER_VIEW = 2.0
 def examine_model(path: Path, mesh: Mesh | None, camera: Intrinsics | None) -> Iterator[Finding]:
     """Whether the model can be run, and was trained for this mesh and such a camera."""
     try:
-        spec = ExportedModel.open(find_model(path)).spec
+        file = find_model(path)
+        spec = ExportedModel.open(file).spec
     except CurioError as exc:
         yield Finding("model", "bad", str(exc), fault="model unreadable")
         return
     names = ", ".join(kind.name for kind in spec.objects)
     yield Finding("model", "good", f"{path}: {spec.name} of the world {spec.world}, finds {names}")
+    yield from examine_providers(file)
     if mesh is not None:
         yield from _other_mesh(spec, mesh)
     if camera is not None and spec.camera.camera_matrix:

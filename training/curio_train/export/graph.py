@@ -13,7 +13,8 @@ import torch
 import torch.nn.functional as F
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec, ObjectModel, Symmetry
 from curio_proto.v1.model_spec_pb2 import Field as FieldSpec
-from curio_serve.models.model_folder import GOLDEN_FILE, MODEL_FILE
+from curio_serve.models.golden import GOLDEN_FILE
+from curio_serve.models.model_folder import MODEL_FILE
 from curio_serve.models.spec import SCHEMA_VERSION
 from jaxtyping import Bool
 from torch import Tensor, nn

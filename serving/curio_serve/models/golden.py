@@ -1,0 +1,98 @@
+"""A version's golden image: what the network said of it where it was exported, to be compared with what it says here.
+
+``golden.npz`` holds ``image``, uint8 [height, width, 3], and the outputs for it by name, without a batch.
+"""
+
+import io
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from curio_serve.errors import InternalError, ModelError
+from curio_serve.files import read_file
+from curio_serve.models.model import INPUT, Model
+
+GOLDEN_FILE = "golden.npz"
+GOLDEN_TOLERANCE = 1e-3
+"""Metres, image widths, entries of matrices; float16 weights on another processor stay below."""
+
+_MAX_BYTES = 1 << 28
+
+
+@dataclass(frozen=True, eq=False)
+class Golden:
+    """An image and its outputs."""
+
+    path: Path
+    """The file."""
+    image: np.ndarray
+    """uint8 RGB [height, width, 3] of the size of the model's camera."""
+    outputs: Mapping[str, np.ndarray]
+    """By name, without a batch; at least one."""
+
+    def differences(self, model: Model) -> dict[str, float]:
+        """Largest absolute difference of each stored output from what the model says; nan where either is not finite.
+
+        Raises:
+            ModelError: The image cannot pass the graph, or an output is none of the graph's.
+        """
+        try:
+            found = model.run(self.image[None])
+        except InternalError as exc:
+            raise ModelError(f"{self.path}: the golden image cannot pass the graph: {exc}") from exc
+        for name, value in self.outputs.items():
+            if name not in found or found[name][0].shape != value.shape:
+                raise ModelError(
+                    f"{self.path}: {name} {value.shape} is no output of the graph, which has {model.output_shapes}"
+                )
+        return {name: float(np.abs(found[name][0] - value).max(initial=0)) for name, value in self.outputs.items()}
+
+
+def read_golden(path: Path, model: Model) -> Golden:
+    """The golden image in a file.
+
+    Args:
+        path: The file.
+        model: That it is of.
+
+    Raises:
+        OSError: It cannot be read.
+        ModelError: It is not an archive of arrays, or has no image of the model's size, or no output.
+    """
+    content = read_file(path, _MAX_BYTES)
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            outputs = dict(file)
+    # zipfile raises RuntimeError for encrypted members and unknown methods; np.load returns a bare array as it is.
+    except (ValueError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as exc:
+        raise ModelError(f"{path} is not an archive of arrays: {exc}; export the model again") from exc
+    image, size = outputs.pop(INPUT, None), (model.camera.height, model.camera.width, 3)
+    if image is None or image.shape != size or image.dtype != np.uint8 or not outputs:
+        found = None if image is None else f"{image.dtype} {image.shape}"
+        raise ModelError(f"{path}: image is {found}, outputs {sorted(outputs)}; expected uint8 {size} and an output")
+    return Golden(path, image, outputs)
+
+
+def check_golden(path: Path, model: Model) -> None:
+    """Refuse a model that does not say of the golden image what was exported.
+
+    Args:
+        path: The file; a version without one is not checked.
+        model: To ask.
+
+    Raises:
+        OSError: The file cannot be read.
+        ModelError: It is damaged, or the answers differ.
+    """
+    if not path.exists():
+        return
+    for name, off in read_golden(path, model).differences(model).items():
+        if not off <= GOLDEN_TOLERANCE:
+            raise ModelError(
+                f"{path}: the network's {name} is {off:.3g} off for the golden image; at most {GOLDEN_TOLERANCE:g} is "
+                "accepted: this file, or this machine's runtime, does not compute what was exported"
+            )
