@@ -152,6 +152,7 @@ def test_short_messages_do_not_wait_behind_long_ones(
     monkeypatch.setattr(module, "_LONG_BYTES", 10)
     monkeypatch.setattr(module, "_HURRIED_S", 60.0)
     desk = make_desk(held_bytes=400)
+    monkeypatch.setattr(module, "_LONG_PART", 2)
     callers = [Caller(f"long {number}") for number in range(3)]
     for caller in callers:
         desk.know(caller.peer(), 100)

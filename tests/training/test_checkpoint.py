@@ -17,6 +17,7 @@ from curio_train.learning.loop import Outcome
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import load_config, refuse_other
 from curio_train.learning.runs.interruption import Interrupted, Interruption, interruptible
+from curio_train.learning.runs.provenance import SESSIONS, record_session, run_sessions
 from curio_train.learning.runs.session import learn
 from curio_train.learning.state import TrainState
 from curio_train.worlds.generated.circles import Circles
@@ -188,6 +189,34 @@ def test_files_that_are_pipes_or_endless_are_refused(tmp_path: Path, cache: Path
     os.mkfifo(tmp_path / "run/config.json")
     with pytest.raises(CheckpointError, match="not a regular file"):
         load_config(tmp_path / "run")
+
+
+def test_a_history_that_is_a_pipe_or_endless_is_refused(tmp_path: Path, cache: Path) -> None:
+    train(tmp_path / "run", cache)
+    file = tmp_path / "run/history.jsonl"
+    os.truncate(file, 50 << 30)
+    with pytest.raises(CheckpointError, match=r"history\.jsonl cannot be read .*at most"):
+        train(tmp_path / "run", cache, resume=True)
+    file.unlink()
+    os.mkfifo(file)
+    with pytest.raises(CheckpointError, match=r"history\.jsonl cannot be read .*not a regular file"):
+        train(tmp_path / "run", cache, resume=True)
+
+
+def test_sessions_that_are_a_pipe_or_endless_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / SESSIONS
+    file.touch()
+    os.truncate(file, 50 << 30)
+    with pytest.raises(CheckpointError, match="at most"):
+        run_sessions(tmp_path)
+    file.unlink()
+    os.mkfifo(file)
+    with pytest.raises(CheckpointError, match="not a regular file"):
+        run_sessions(tmp_path)
+    with pytest.raises(CheckpointError, match="not a regular file"):
+        record_session(tmp_path)
+    with pytest.raises(CheckpointError, match="not a regular file"), RunFolder(tmp_path, CONFIG).lock():
+        pass
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe}\n", b"[]}\n", b'{"images": 8}\n', b"[" * 100_000 + b"}\n"])

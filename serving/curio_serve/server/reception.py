@@ -4,7 +4,7 @@ gRPC tells the length of a message only once it is there. So a call reserves mem
 reads its own, keeps as much as its message takes, and gives that back when it ends. A call without memory waits; the
 connection comes first that would hold least, if its message is as long as its last ones.
 
-Long messages share one half of the memory. Each is copied while the interpreter is locked, so with many of them at a
+Long messages share a fourth of the memory. Each is copied while the interpreter is locked, so with many of them at a
 time every other call would wait for seconds; and calls with short messages shall not wait for memory.
 
 A stream may be idle for long, so it reserves nothing before a message is there. If the whole process takes too much
@@ -31,6 +31,7 @@ _HURRIED_S = 1.0
 _MOST_KNOWN = 4096
 # The shortest of the long messages. The first of a connection is taken for so long, and not for a long one.
 _LONG_BYTES = 1 << 20
+_LONG_PART = 4  # all long messages have a fourth of the memory, but always room for one
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,11 @@ class Reception:
 
     def _may_have(self, peer: str) -> bool:
         expected = self._expected(peer)
-        return expected <= _LONG_BYTES or not self._long_claims or self._long_claims + expected <= self._all_bytes // 2
+        return (
+            expected <= _LONG_BYTES
+            or not self._long_claims
+            or self._long_claims + expected <= self._all_bytes // _LONG_PART
+        )
 
     def num_behind(self, peer: str) -> int:
         """How many calls wait for memory that a further call of a connection would overtake."""

@@ -29,7 +29,7 @@ from torch import Tensor
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.learning.runs.configuration import CONFIG_FILE, MAX_JSON_BYTES, load_config, structured, to_json
-from curio_train.learning.runs.provenance import SESSIONS, last_session
+from curio_train.learning.runs.provenance import last_session, open_sessions
 from curio_train.learning.state import TrainingProgress, TrainState
 from curio_train.worlds.base import World
 
@@ -89,7 +89,7 @@ class RunFolder:
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            sessions = (self.path / SESSIONS).open("ab")
+            sessions = open_sessions(self.path)
         except OSError as exc:
             raise self._not_writable(exc) from exc
         with sessions:

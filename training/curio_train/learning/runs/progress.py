@@ -18,6 +18,7 @@ from typing import Any
 
 import cv2
 import torch
+from curio_serve.files import read_file
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Column
@@ -32,6 +33,7 @@ IMAGE_ERROR = "image_dssim"
 """Key of the image error in lines of the history."""
 
 _HISTORY, _STAGES = "history.jsonl", "stages"
+_MAX_HISTORY_BYTES = 1 << 28
 _STEPS_A_LINE = 20  # of history and curves
 _SECONDS_A_LINE = 10  # of the log where stderr is no terminal
 _BAR_WIDTH = 12
@@ -164,12 +166,12 @@ def read_history(run: Path) -> list[dict[str, Any]]:
     """
     file = run / _HISTORY
     try:
-        lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        lines = read_file(file, _MAX_HISTORY_BYTES).decode("utf-8").splitlines() if file.exists() else []
         rows = [json.loads(line) for line in lines if line.endswith("}")]
         if all(isinstance(row, dict) and type(row.get("step")) is int for row in rows):
             return rows
         reason = "a line without a step"
-    except (ValueError, RecursionError) as exc:
+    except (OSError, ValueError, RecursionError) as exc:
         reason = str(exc)
     raise CheckpointError(f"{file} cannot be read ({reason}); delete it to go on without the curves so far")
 

@@ -9,12 +9,15 @@ import subprocess
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import torch
+from curio_serve.files import check_regular, read_file
 
 from curio_train.errors import CheckpointError
 
 SESSIONS = "sittings.jsonl"
+_MAX_BYTES = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,18 @@ def this_session() -> RunSession:
     return RunSession(command, commit(), machine(), now)
 
 
+def open_sessions(run: Path) -> BinaryIO:
+    """The file of a run's sessions, to be added to.
+
+    Raises:
+        OSError: It cannot be opened, or is no regular file.
+    """
+    file = run / SESSIONS
+    if file.exists():
+        check_regular(file.stat(), file)
+    return file.open("ab")
+
+
 def record_session(run: Path) -> None:
     """Add this process to a run's sessions.
 
@@ -45,8 +60,8 @@ def record_session(run: Path) -> None:
         CheckpointError: The folder cannot be written.
     """
     try:
-        with (run / SESSIONS).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(asdict(this_session())) + "\n")
+        with open_sessions(run) as file:
+            file.write(json.dumps(asdict(this_session())).encode() + b"\n")
     except OSError as exc:
         raise CheckpointError(f"cannot write {run / SESSIONS}: {exc.strerror}; name another run folder: --out") from exc
 
@@ -58,7 +73,7 @@ def run_sessions(run: Path) -> list[RunSession]:
         CheckpointError: They cannot be read.
     """
     try:
-        lines = (run / SESSIONS).read_text(encoding="utf-8").splitlines()
+        lines = read_file(run / SESSIONS, _MAX_BYTES).decode("utf-8").splitlines()
         whole = [line for line in lines if line.endswith("}")]  # a kill may cut off the last one
         found = [RunSession(**json.loads(line)) for line in whole]
     except (OSError, ValueError, TypeError, RecursionError) as exc:
