@@ -2,11 +2,11 @@
 
 import os
 import re
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 
 from curio_serve.errors import UsageError
-from curio_serve.models.model_folder import CONFIG_FILE, MODEL_FILE, versions
+from curio_serve.models.model_folder import CONFIG_FILE, MODEL_FILE
 
 SERVED_MODEL = re.compile(r"(?P<address>(?:\[[^\]]+\]|[^/:\[\]]+):\d{1,5})/(?P<model>[^/]+(?:/\d+)?)")
 """``HOST:PORT/NAME`` or ``HOST:PORT/NAME/VERSION``."""
@@ -21,7 +21,6 @@ def split_models(first: str, rest: Sequence[str]) -> tuple[tuple[str, ...], tupl
 
     Raises:
         UsageError: A model is named twice.
-        ModelError: A folder cannot be read.
     """
     count = 0
     while count < len(rest) and _names_models(rest[count]):
@@ -35,15 +34,14 @@ def split_models(first: str, rest: Sequence[str]) -> tuple[tuple[str, ...], tupl
 
 
 def is_model(path: str) -> bool:
-    """Whether a path is a model's folder, a version's folder or an .onnx file.
-
-    Raises:
-        ModelError: The folder cannot be read.
-    """
+    """Whether a path is a model's folder, a version's folder or an .onnx file; a folder of a million images is none."""
     if not os.path.isdir(path):
         return path.endswith(".onnx") and os.path.isfile(path)
-    has_file = any(os.path.exists(os.path.join(path, name)) for name in (CONFIG_FILE, MODEL_FILE))
-    return has_file or bool(versions(Path(path)))
+    if any(os.path.exists(os.path.join(path, name)) for name in (CONFIG_FILE, MODEL_FILE)):
+        return True
+    return any(
+        folder.name.isdecimal() and os.path.exists(os.path.join(folder.path, MODEL_FILE)) for folder in _folders(path)
+    )
 
 
 def _names_models(argument: str) -> bool:
@@ -59,8 +57,11 @@ def _expanded(argument: str) -> list[str]:
 
 def _models_in(folder: str) -> list[str]:
     """Model folders in a folder, by name; nothing deeper is looked at."""
-    if not os.path.isdir(folder):
-        return []
-    with os.scandir(folder) as entries:
-        paths = sorted(entry.path for entry in entries if os.path.exists(os.path.join(entry.path, CONFIG_FILE)))
-    return [path for path in paths if is_model(path)]
+    found = (entry.path for entry in _folders(folder) if os.path.exists(os.path.join(entry.path, CONFIG_FILE)))
+    return sorted(found)
+
+
+def _folders(path: str) -> Iterator[os.DirEntry[str]]:
+    """The folders in a folder; none where it cannot be listed, which is told when its images are wanted."""
+    with suppress(OSError), os.scandir(path) as entries:
+        yield from (entry for entry in entries if entry.is_dir())
