@@ -99,7 +99,7 @@ def test_help(name: str, typed: Callable[[str], str]) -> None:
     compare(SNAPSHOTS / "help" / f"{name}.txt", typed(f"{HELP[name]} --help"))
 
 
-@pytest.mark.parametrize("command", sorted({line.split()[0] for line in HELP.values()} - {"curio-serve"}))
+@pytest.mark.parametrize("command", sorted({line.split()[0] for line in HELP.values()}))
 def test_version(command: str, typed: Callable[[str], str]) -> None:
     assert typed(f"{command} --version") == f"$ {command} --version\n{command} {version('curio-pose')}\n"
 
