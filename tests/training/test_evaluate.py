@@ -258,7 +258,7 @@ def test_refined_poses_stand_beside_those_as_read(data: Path, tmp_path: Path) ->
     assert "refined" not in console.export_text()
     print_evaluation(result | {"refined": {"metrics": {"add_recall": 0.75}, "real": better}}, console)
     rows = [[cell.strip() for cell in line.split("│")] for line in console.export_text().splitlines()]
-    assert ["ADD(-S) below 0.1 diameters, share", "0.25", "0.125", "0.75"] in [row[1:-1] for row in rows]
+    assert ["ADD(-S) below 0.1 diameters, fraction", "0.25", "0.125", "0.75"] in [row[1:-1] for row in rows]
     seen = next(row for row in rows if "40–60 % visible" in "".join(row))
     assert seen[2:4] == ["0", "1"]
 
@@ -273,7 +273,7 @@ def test_no_table_has_means_and_medians() -> None:
     console = Console(record=True, width=120, file=io.StringIO())
     print_evaluation(result, console)
     means, medians = console.export_text().split("5 images of the test split: ")[1:]
-    assert means.split("\n")[0].strip() == "means and shares"
+    assert means.split("\n")[0].strip() == "means and fractions"
     assert "rotation, degrees " in means
     assert "median" not in means
     assert medians.split("\n")[0].strip() == "medians"

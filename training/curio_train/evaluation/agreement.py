@@ -3,11 +3,12 @@
 Numbers of a photograph, each in [0, 1]; all images are compared behind a 9x9 Gaussian filter and after one gain a
 channel (exposure and white balance are not known):
 
-* **inside**: the share of the silhouette's pixels that differ by less than 0.15 in every channel;
+* **inside**: the fraction of the silhouette's pixels that differ by less than 0.15 in every channel;
 * **overlap**, with a background image: intersection over union of the silhouette and what differs from the background
 image and is no shadow;
 * **explained**, without one: of the difference, in and around the silhouette, between the photograph and what it shows
-  around it, the share that the part as drawn takes away. So a drawing in the colours of its surroundings says nothing.
+  around it, the fraction that the part as drawn takes away. So a drawing in the colours of what is around it says
+  nothing.
 
 Measured on 250 path-traced photographs of a bracket (256x192, its background image, a camera file two pixels off) with
 a model that had 36 % of ADD below 0.1 diameters once the camera's error was taken out. AUROC against that, and of right
@@ -47,7 +48,7 @@ class Drawing:
     over_black: Tensor
     """[num, 3, height, width], sRGB in [0, 1]."""
     through: Tensor
-    """Likewise, the share of what is behind that is seen."""
+    """Likewise, the fraction of what is behind that is seen."""
 
     @property
     def silhouette(self) -> Bool[Tensor, "num height width"]:

@@ -37,7 +37,7 @@ from curio_train.scene_code import CONFIDENCE, poses
 from curio_train.worlds.base import Camera
 
 VISIBLE = 0.8
-"""Targets of which at least this share is visible are scored once more, by themselves."""
+"""Targets of which at least this fraction is visible are scored once more, by themselves."""
 
 _BATCH = 16
 _VISIBILITY_BINS = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0))
@@ -195,7 +195,7 @@ def _row(estimate: Estimate, target: Annotation, points: np.ndarray, info: Model
 
 
 def _by_visibility(pairs: Pairs, points: np.ndarray, info: ModelInfo) -> list[dict[str, float]]:
-    """ADD(-S) recall in bins of the visible share; empty where the data set doesn't say it."""
+    """ADD(-S) recall in bins of the visible fraction; empty where the data set doesn't say it."""
     rows = []
     for low, high in _VISIBILITY_BINS:
         inside = [
@@ -207,8 +207,8 @@ def _by_visibility(pairs: Pairs, points: np.ndarray, info: ModelInfo) -> list[di
         if inside:
             estimates, truths = zip(*inside, strict=True)
             errors = add_errors(estimates, truths, points, info)
-            share = recall(errors, ADD_THRESHOLD)
-            rows.append({"from": low, "to": high, "num_targets": len(inside), "add_recall": share})
+            found = recall(errors, ADD_THRESHOLD)
+            rows.append({"from": low, "to": high, "num_targets": len(inside), "add_recall": found})
     return rows
 
 

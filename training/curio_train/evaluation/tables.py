@@ -19,7 +19,7 @@ _LABELS: Mapping[str, str] = {
     "rotation_deg": "rotation, degrees",
     "confidence_mse": "confidence, squared error",
     "light_deg": "light direction, degrees",
-    "add_recall": "ADD(-S) below 0.1 diameters, share",
+    "add_recall": "ADD(-S) below 0.1 diameters, fraction",
     "add_recall_low": "   95 % interval from",
     "add_recall_high": "   to",
     "add_recall_visible_80": "   of targets at least 80 % visible",
@@ -36,7 +36,7 @@ _LABELS: Mapping[str, str] = {
     "own_view_inside": "own camera, agreement inside the silhouette",
     "own_view_overlap": "   overlap with what differs from the background image",
     "own_view_explained": "   explained of what stands out",
-    "own_view_agreeing": "   photographs that agree, share",
+    "own_view_agreeing": "   photographs that agree, fraction",
     "own_view_dssim": "own camera, DSSIM",
     "own_view_dssim_blurred": "   both blurred",
     "own_view_plate_dssim": "   of the empty background image",
@@ -45,7 +45,7 @@ _LABELS: Mapping[str, str] = {
     "second_view_dssim_blurred": "   both blurred",
     "second_view_plate_dssim": "   of the empty background image",
     "second_view_plate_dssim_blurred": "   of the empty background image, both blurred",
-    "better_than_plate": "nearer to the photograph than the background image, share",
+    "better_than_plate": "nearer to the photograph than the background image, fraction",
 }
 
 
@@ -55,10 +55,10 @@ def label(metric: str) -> str:
 
 
 def apart(metrics: Iterable[str]) -> dict[str, list[str]]:
-    """Names of metrics by the statistic that they are: means and shares, or medians; no table has both."""
-    groups: dict[str, list[str]] = {"means and shares": [], "medians": []}
+    """Names of metrics by the statistic that they are: means and fractions, or medians; no table has both."""
+    groups: dict[str, list[str]] = {"means and fractions": [], "medians": []}
     for name in metrics:
-        groups["medians" if name.endswith("_median") else "means and shares"].append(name)
+        groups["medians" if name.endswith("_median") else "means and fractions"].append(name)
     return {statistic: names for statistic, names in groups.items() if names}
 
 
@@ -108,7 +108,7 @@ def _print_real(real: Mapping[str, Any], refined: Mapping[str, Any] | None, cons
 
 
 def _bins(real: Mapping[str, Any]) -> dict[str, float]:
-    """Recall in bins of the visible share, by their names for people."""
+    """Recall in bins of the visible fraction, by their names for people."""
     return {
         f"ADD(-S), {100 * row['from']:.0f}–{100 * row['to']:.0f} % visible, {row['num_targets']} targets": row[
             "add_recall"

@@ -156,10 +156,10 @@ def _real_frames(evaluation: Mapping[str, Any]) -> str:
 
 
 def _tables(headings: Sequence[str], first: Mapping[str, float], *others: Mapping[str, float]) -> str:
-    """A table of means and shares and one of medians, a row a metric."""
+    """A table of means and fractions and one of medians, a row a metric."""
     groups = [[name for name in first if name.endswith("_median") == medians] for medians in (False, True)]
     tables = []
-    for statistic, names in zip(("mean or share", "median"), groups, strict=True):
+    for statistic, names in zip(("mean or fraction", "median"), groups, strict=True):
         rows = [
             (name, f"{first[name]:.4g}", *(f"{other[name]:.4g}" if name in other else "–" for other in others))
             for name in names

@@ -15,7 +15,7 @@ from curio_train.meshes.inset import inset
 from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.templates.bank import NUM_POINTS, RANK, Bank
-from curio_train.templates.drawing import LOOKS, CropEasel, Easel
+from curio_train.templates.drawing import APPEARANCES, CropTemplateRenderer, TemplateRenderer
 from curio_train.templates.geometry import (
     CROP_PX,
     FILL,
@@ -109,8 +109,8 @@ def _fill_localiser(localiser: Localiser, trunk: Trunk, geometry: Geometry, mesh
     for depth in geometry.depths_m:
         cells = geometry.kernel_cells(depth)
         side = (cells + 2 * _PAD_CELLS - 1) * COARSE_STRIDE + 1
-        easel = Easel(mesh, depth, geometry.focal_px / FRAME_STRIDE, side)
-        drawn = [easel.draw(some) for some in rotations.split(_BATCH)]
+        renderer = TemplateRenderer(mesh, depth, geometry.focal_px / FRAME_STRIDE, side)
+        drawn = [renderer.draw(some) for some in rotations.split(_BATCH)]
         kernel = slice(_PAD_CELLS, _PAD_CELLS + cells)
         seen = torch.cat([_features(trunk, some.over(0, torch.tensor(0.5)))[1] for some in drawn])
         alpha = torch.cat([some.alpha for some in drawn])
@@ -141,12 +141,12 @@ def _fill_bank(bank: Bank, trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: 
     """Descriptors averaged over lamps and backgrounds: what changes with either counts less."""
     depth, random = geometry.typical_m, np.random.default_rng(_SEED)
     focal_px = FILL * CROP_PX * depth / geometry.diameter_m
-    easel = CropEasel(mesh, depth, geometry.focal_px, focal_px, CROP_PX)
+    renderer = CropTemplateRenderer(mesh, depth, geometry.focal_px, focal_px, CROP_PX)
     fine, coarse, alphas = [], [], []  # features of every look, batch after batch
     for rotations in bank.rotations.split(_BATCH):
-        drawn = easel.draw(rotations)
-        behind = [crops[torch.from_numpy(random.integers(0, len(crops), len(rotations)))] for _ in LOOKS]
-        seen = [_features(trunk, drawn.over(n, behind[n], exposure)) for n, (_, exposure) in enumerate(LOOKS)]
+        drawn = renderer.draw(rotations)
+        behind = [crops[torch.from_numpy(random.integers(0, len(crops), len(rotations)))] for _ in APPEARANCES]
+        seen = [_features(trunk, drawn.over(n, behind[n], exposure)) for n, (_, exposure) in enumerate(APPEARANCES)]
         fine.append(torch.stack([one for one, _ in seen]))
         coarse.append(torch.stack([one for _, one in seen]))
         alphas.append(drawn.alpha)
@@ -154,13 +154,13 @@ def _fill_bank(bank: Bank, trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: 
     alpha, of_coarse = torch.cat(alphas), torch.cat(coarse, dim=1)
     covered = alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE]
     bank.coarse.compress(bank.coarse.whiten(coarse_background), of_coarse[0], covered)
-    filters, weights = _low_rank(_mean_cosine(_sum(bank.coarse(look) for look in of_coarse), covered), RANK)
+    filters, weights = _low_rank(_mean_cosine(_sum(bank.coarse(seen) for seen in of_coarse), covered), RANK)
     bank.filters.copy_(filters)
     bank.weights.copy_(weights)
     inside = _inside(alpha)
     of_object = torch.cat([some[0] for some in fine]).movedim(1, 0)[:, inside].mean(dim=1)
     bank.fine.mean.copy_((fine_background.mean(dim=(0, 2, 3)) + of_object) / 2)
-    described = torch.cat([F.normalize(_sum(bank.fine(look) for look in some), dim=1) for some in fine])
+    described = torch.cat([F.normalize(_sum(bank.fine(seen) for seen in some), dim=1) for some in fine])
     points = _surface_points(mesh, bank.rotations, depth, focal_px)
     _store_points(bank, inside, described, points / geometry.diameter_m)
 
@@ -170,8 +170,8 @@ def _features(trunk: Trunk, pictures: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat(fine), torch.cat(coarse)
 
 
-def _sum(of_looks: Iterable[Tensor]) -> Tensor:
-    return torch.stack(list(of_looks)).sum(dim=0)
+def _sum(of_appearances: Iterable[Tensor]) -> Tensor:
+    return torch.stack(list(of_appearances)).sum(dim=0)
 
 
 def _inside(alpha: Float[Tensor, "templates 1 side side"]) -> Bool[Tensor, "templates cells cells"]:

@@ -14,7 +14,7 @@ from curio_train.geometry import Pose
 from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.scene_code import poses
-from curio_train.templates.network import Evidence, TemplateNetwork
+from curio_train.templates.network import CalibrationFeatures, TemplateNetwork
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _NUM_FRAMES, _BATCH_SIZE = 160, 2  # larger batches take longer a frame
@@ -35,24 +35,24 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -
     steps = _NUM_FRAMES // _BATCH_SIZE
     found: list[Pose] = []
     true: list[Pose] = []
-    full: list[Evidence] = []
-    empty: list[Evidence] = []
+    full: list[CalibrationFeatures] = []
+    empty: list[CalibrationFeatures] = []
     for step in range(steps):
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
-        code, evidence = network.read(world.augment(batch.images, (0, step)).clamp(0, 1))
+        code, features = network.read(world.augment(batch.images, (0, step)).clamp(0, 1))
         found, true = found + poses(code), true + poses(batch.code)
-        full.append(evidence)
+        full.append(features)
         behind = source.backgrounds(steps + step, _BATCH_SIZE)
         assert behind is not None  # these worlds always have some
         empty.append(network.read(world.augment(behind, (1, step)).clamp(0, 1))[1])
 
     errors_m = map(add_or_add_s_m, found, true, repeat(points), repeat(kind.info))
     right = [error_m < ADD_THRESHOLD * kind.diameter_m for error_m in errors_m]
-    network.rightness.copy_(_fit([evidence.right for evidence in full], right))
+    network.pose_correct.copy_(_fit([features.right for features in full], right))
     there = [True] * len(right) + [False] * len(right)
-    network.presence.copy_(_fit([evidence.there for evidence in (*full, *empty)], there))
+    network.presence.copy_(_fit([features.there for features in (*full, *empty)], there))
 
 
-def _fit(evidence: list[Tensor], is_so: list[bool]) -> Tensor:
-    return torch.tensor(fit_calibration(torch.cat(evidence).numpy(), is_so))
+def _fit(features: list[Tensor], is_so: list[bool]) -> Tensor:
+    return torch.tensor(fit_calibration(torch.cat(features).numpy(), is_so))

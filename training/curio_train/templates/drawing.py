@@ -10,7 +10,7 @@ from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.renderer import Renderer
 from curio_train.worlds.single_object.viewpoints import AMBIENT
 
-LOOKS = (((0.0, -0.7, -0.7), 1.0), ((0.7, -0.5, -0.5), 1.6), ((-0.7, -0.5, -0.5), 1.2))
+APPEARANCES = (((0.0, -0.7, -0.7), 1.0), ((0.7, -0.5, -0.5), 1.6), ((-0.7, -0.5, -0.5), 1.2))
 """Lamps, and what colours are multiplied by: descriptors are means over these and over as many backgrounds."""
 
 _BORDER_PX = 4
@@ -32,7 +32,7 @@ class Drawn:
         return (exposure * self.colors[number] + (1 - self.alpha) * backgrounds).clamp(0, 1)
 
 
-class Easel:
+class TemplateRenderer:
     """Draws an object on the optical axis of a camera whose principal point is the picture's middle."""
 
     def __init__(self, mesh: Mesh, depth_m: float, focal_px: float, side: int) -> None:
@@ -47,9 +47,9 @@ class Easel:
         self._position, self._side = torch.tensor([0.0, 0.0, depth_m]), side
 
     def draw(self, rotations: Float[Tensor, "templates 3 3"], num_lamps: int = 1) -> Drawn:
-        """Seen with rotations cam_from_obj, under the first of :data:`LOOKS`."""
-        over_black = [self._draw(rotations, lamp, 0.0) for lamp, _ in LOOKS[:num_lamps]]
-        over_white = self._draw(rotations, LOOKS[0][0], 1.0)
+        """Seen with rotations cam_from_obj, under the first of :data:`APPEARANCES`."""
+        over_black = [self._draw(rotations, lamp, 0.0) for lamp, _ in APPEARANCES[:num_lamps]]
+        over_white = self._draw(rotations, APPEARANCES[0][0], 1.0)
         alpha = 1 - (over_white - over_black[0]).mean(dim=1, keepdim=True)
         return Drawn(torch.cat([*over_black, alpha], dim=1))
 
@@ -64,7 +64,7 @@ class Easel:
         )
 
 
-class CropEasel:
+class CropTemplateRenderer:
     """Draws an object as a crop of a frame shows it: no sharper than the frame is."""
 
     def __init__(self, mesh: Mesh, depth_m: float, frame_focal_px: float, crop_focal_px: float, side: int) -> None:
@@ -73,15 +73,15 @@ class CropEasel:
         Raises:
             RendererError: The mesh cannot be rendered.
         """
-        share = min(1.0, frame_focal_px / crop_focal_px)  # frame pixels a crop pixel
-        frame_side = 2 * int(np.ceil(side * share / 2)) + 2 * _BORDER_PX
-        self._easel = Easel(mesh, depth_m, share * crop_focal_px, frame_side)
-        steps = (torch.arange(2 * side) - (2 * side - 1) / 2) * share / frame_side
+        scale = min(1.0, frame_focal_px / crop_focal_px)  # frame pixels a crop pixel
+        frame_side = 2 * int(np.ceil(side * scale / 2)) + 2 * _BORDER_PX
+        self._renderer_of_frames = TemplateRenderer(mesh, depth_m, scale * crop_focal_px, frame_side)
+        steps = (torch.arange(2 * side) - (2 * side - 1) / 2) * scale / frame_side
         self._grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1)[None]
 
     def draw(self, rotations: Float[Tensor, "templates 3 3"]) -> Drawn:
-        """Seen with rotations cam_from_obj, under all of :data:`LOOKS`."""
-        drawn = self._easel.draw(rotations, len(LOOKS))
+        """Seen with rotations cam_from_obj, under all of :data:`APPEARANCES`."""
+        drawn = self._renderer_of_frames.draw(rotations, len(APPEARANCES))
         stacked = torch.cat([*drawn.colors, drawn.alpha], dim=1)
         grid = self._grid.expand(len(rotations), -1, -1, -1)
         return Drawn(F.avg_pool2d(F.grid_sample(stacked, grid, align_corners=False), 2))

@@ -33,7 +33,7 @@ _SHARPNESS = 20.0  # of the neighbours' weights, a unit of score
 _SUPPRESSED = -10.0
 
 
-class Evidence(NamedTuple):
+class CalibrationFeatures(NamedTuple):
     """Calibration features: the inputs of the two logits whose probabilities make up the confidence."""
 
     right: Float[Tensor, "batch 2"]
@@ -66,7 +66,7 @@ class TemplateNetwork(nn.Module):
     """All templates."""
     geometry: Geometry
     """Of frames and object."""
-    rightness: Tensor
+    pose_correct: Tensor
     """Weights [2] and offset of the pose-correct logit; calibrated on renderings."""
     presence: Tensor
     """Weights [2] and offset of the presence logit; calibrated on renderings."""
@@ -83,7 +83,7 @@ class TemplateNetwork(nn.Module):
         super().__init__()
         self.trunk, self.localiser, self.bank = Trunk(), Localiser(geometry), Bank()
         self.geometry, self._steps = geometry, steps
-        self.register_buffer("rightness", torch.tensor([1.0, 0.0, 0.0]))
+        self.register_buffer("pose_correct", torch.tensor([1.0, 0.0, 0.0]))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]))
         self.register_buffer("_matrix", torch.from_numpy(geometry.matrix).float()[None], persistent=False)
         self.register_buffer("_lamp", torch.tensor(LAMP), persistent=False)
@@ -92,22 +92,22 @@ class TemplateNetwork(nn.Module):
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
-        code, evidence = self.read(images)
-        sure = _probability(evidence.right, self.rightness) * _probability(evidence.there, self.presence)
+        code, features = self.read(images)
+        sure = _probability(features.right, self.pose_correct) * _probability(features.there, self.presence)
         return code | {CONFIDENCE: sure[:, None, None]}
 
-    def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], Evidence]:
+    def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code without its confidence, and what that is made of."""
         best = self._best(self._aligned(images, self._hypotheses(images)), images.shape[0])
         last, spread = self._averaged(images, best)
-        evidence = Evidence(
+        features = CalibrationFeatures(
             torch.stack([10 * last.score, -100 * spread], dim=1), torch.stack([10 * last.score, last.place], dim=1)
         )
         return {
             TRANSLATION: last.position_m[:, None],
             ROTATION_6D: rotation_6d_from_matrix(last.rotation)[:, None],
             LIGHT: self._lamp.expand(images.shape[0], 3),
-        }, evidence
+        }, features
 
     def _hypotheses(self, images: Float[Tensor, "batch 3 height width"]) -> Poses:
         """The best match, the best of those that differ from it, and so on; those of one image after the other."""
@@ -215,6 +215,6 @@ def _shifts() -> Float[Tensor, "shifts 2"]:
     return torch.stack([across, down], dim=-1).flatten(0, 1).float()
 
 
-def _probability(evidence: Float[Tensor, "batch 2"], weights: Float[Tensor, " 3"]) -> Float[Tensor, " batch"]:
+def _probability(features: Float[Tensor, "batch 2"], weights: Float[Tensor, " 3"]) -> Float[Tensor, " batch"]:
     """Sigmoid of the weighted sum of calibration features; the last weight is the offset."""
-    return torch.sigmoid(evidence @ weights[:-1] + weights[-1])
+    return torch.sigmoid(features @ weights[:-1] + weights[-1])
