@@ -16,7 +16,7 @@ class StageNetwork(nn.Module, ABC):
 
     @abstractmethod
     def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """From float32 features: raw values before ``Layout.activate`` (none without ``has_raw_values``), and the code."""
+        """From float32 features: raw values for ``Layout.activate`` (none without ``has_raw_values``), and the code."""
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Scene codes, in physical units, of sRGB images in [0, 1]."""
