@@ -6,6 +6,7 @@ deviation s = f r / z in pixels and the sum 2 pi s² over them, so z = f r sqrt(
 """
 
 import hashlib
+import json
 import signal
 import subprocess
 import sys

@@ -98,7 +98,7 @@ class Estimator(ABC):
             if self.settings.overlays is not None:
                 self._draw(self.settings.overlays, image, data, seen)
         except _OF_ONE_IMAGE as exc:
-            return ImageResult(image.name, self.name, self.version, error=str(exc))
+            return ImageResult(image.name, self.name, self.version, error=str(exc), recorded=image.recorded)
         return ImageResult(
             image.name,
             self.name,
@@ -109,6 +109,7 @@ class Estimator(ABC):
             seen.results,
             seen.decode_ms,
             seen.inference_ms,
+            recorded=image.recorded,
         )
 
     def overlay(self, pixels: np.ndarray) -> tuple[np.ndarray, list[Detection]]:
@@ -131,8 +132,12 @@ class Estimator(ABC):
         """Detects in a video's frame or in the bytes of an image file; the camera is that of the stored pixels."""
 
     def _camera(self, image: SourceImage) -> PinholeCamera | None:
-        if self.canonical.matrix is None or self.settings.cameras is None:
+        if self.canonical.matrix is None:
             return None
+        if self.settings.cameras is None:
+            if image.no_camera and not self.canonical.is_default:
+                raise CameraError(image.no_camera)
+            return image.camera
         return self.settings.cameras.camera_for(image.relative_name)
 
     def _frame(

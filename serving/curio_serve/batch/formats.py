@@ -15,6 +15,7 @@ from pathlib import PurePath
 
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
 
+from curio_serve.batch.sources import RecordedAt
 from curio_serve.errors import UsageError
 
 # The LineMOD classes under the object ids that BOP's data sets LM and LM-O give them.
@@ -60,6 +61,8 @@ class ImageResult:
     """Pixels to detections."""
     error: str = ""
     """Why there is no answer."""
+    recorded: RecordedAt | None = None
+    """For an image of a robot's recording."""
 
     @property
     def detections(self) -> list[Detection]:
