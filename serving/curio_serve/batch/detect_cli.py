@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
     from curio_serve.batch.estimators import Estimator, Settings
     from curio_serve.batch.formats import ImageLines, ResultFormat
+    from curio_serve.batch.recorded_poses import Detection3DArrays, PoseRecording
+    from curio_serve.batch.recordings import Recording
+    from curio_serve.batch.result_file import ResultFile
     from curio_serve.batch.sources import SourceImage
     from curio_serve.client import PoseClient
 
@@ -41,7 +44,8 @@ class DetectArguments:
     """Model folder (its latest version), version folder, .onnx file, or folder of models; if no such path, a server's
     HOST:PORT/NAME."""
     images: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="IMAGES...")]
-    """Files, folders (and those below; of a BOP scene its photographs), globs, videos, or - for a list on stdin."""
+    """Files, folders (and those below; of a BOP scene its photographs), globs, videos, recordings (MCAP with ROS 2
+    messages), or - for a list on stdin."""
     video: str | None = None
     """Show detections live in the browser instead: a camera's number, a video file, or a URL such as rtsp://…."""
     host: str = "127.0.0.1"
@@ -50,8 +54,13 @@ class DetectArguments:
     """Port that --video listens on."""
     camera: Path | None = None
     """Intrinsics: camera JSON, BOP's camera.json or scene_camera.json, OpenCV YAML. 2D worlds need none."""
+    topic: str | None = None
+    """Topic of a recording's images. None: the only one that there is."""
+    info_topic: str | None = None
+    """Topic of their CameraInfo, which says K unless --camera does. None: camera_info beside the images."""
     out: Path | None = None
-    """Result file. One that exists is gone on with, where it is of the same model and images. None: stdout."""
+    """Result file. One that exists is gone on with, where it is of the same model and images. None: stdout. FILE.mcap,
+    for recordings: vision_msgs/Detection3DArray."""
     overwrite: bool = False
     """Replace the result file instead."""
     format: Literal["jsonl", "csv", "bop"] = "jsonl"
@@ -118,8 +127,7 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.cluster import over_cluster
     from curio_serve.batch.parallel import in_order
     from curio_serve.batch.progress import Progress
-    from curio_serve.batch.result_file import ResultFile
-    from curio_serve.batch.sources import PassedOver, check_arguments, images
+    from curio_serve.batch.sources import PassedOver, Topics, check_arguments, images
     from curio_serve.models.model_check import ChildCheck
 
     models, arguments = _models_first(arguments)
@@ -131,15 +139,15 @@ def run(arguments: DetectArguments) -> int:
     for model in models:
         if os.path.exists(model):
             ChildCheck()(Path(model))
-    estimators = _estimators(arguments, models, settings)
+    estimators, recordings = _estimators(arguments, models, settings), _recordings(arguments)
     for estimator in estimators:
-        _check_camera(arguments, estimator)
+        _check_camera(arguments, estimator, recordings)
     if arguments.video is not None:
         return _live(arguments, estimators)
     form = _format(arguments, estimators)
-    names, passed_over = [(estimator.name, estimator.version) for estimator in estimators], PassedOver()
-    with ResultFile(arguments.out, form, names, overwrite=arguments.overwrite) as output:
-        remaining = output.unanswered(images(arguments.images, passed_over))
+    passed_over, topics = PassedOver(), Topics(arguments.topic, arguments.info_topic)
+    with _output(arguments, form, estimators) as output:
+        remaining = output.unanswered(images(arguments.images, passed_over, topics))
         if arguments.ray is None:
             results = in_order(partial(_answer, estimators, form), remaining, arguments.jobs)
         else:  # other nodes have another working folder
@@ -265,7 +273,9 @@ def _answering(
     return partial(_answer, estimators, _format(arguments, estimators))
 
 
-def _answer(estimators: "Sequence[Estimator]", form: "ResultFormat", image: "SourceImage") -> "ImageLines":
+def _answer(
+    estimators: "Sequence[Estimator]", form: "ResultFormat | Detection3DArrays", image: "SourceImage"
+) -> "ImageLines":
     """Answer an image and format its lines, both in the worker: one thread for all lines would be too slow."""
     from curio_serve.batch.estimators import answers
 
@@ -289,18 +299,62 @@ def _client(arguments: DetectArguments, address: str) -> "PoseClient":
     return PoseClient(address, timeout_s=60.0, max_attempts=50, tls=tls, token=token)
 
 
-def _check_camera(arguments: DetectArguments, estimator: "Estimator") -> None:
+def _recordings(arguments: DetectArguments) -> "list[Recording]":
+    """The recordings among the images, each looked at before any work."""
+    from curio_serve.batch.sources import STANDARD_INPUT, Topics, is_recording
+
+    if not any(map(is_recording, arguments.images)):
+        if (arguments.topic or arguments.info_topic) and STANDARD_INPUT not in arguments.images:
+            raise UsageError("--topic and --info-topic are for recordings; found no .mcap among the images")
+        return []
+    from curio_serve.batch.recordings import Recording  # of an extra
+
+    topics = Topics(arguments.topic, arguments.info_topic)
+    return [Recording(path, topics) for path in arguments.images if is_recording(path) and os.path.exists(path)]
+
+
+def _output(
+    arguments: DetectArguments, form: "ResultFormat | Detection3DArrays", estimators: "Sequence[Estimator]"
+) -> "ResultFile | PoseRecording":
+    from curio_serve.batch.formats import ResultFormat
+    from curio_serve.batch.result_file import ResultFile
+
+    if isinstance(form, ResultFormat):
+        names = [(estimator.name, estimator.version) for estimator in estimators]
+        return ResultFile(arguments.out, form, names, overwrite=arguments.overwrite)
+    from curio_serve.batch.recorded_poses import PoseRecording  # of an extra
+
+    assert arguments.out is not None
+    return PoseRecording(arguments.out, overwrite=arguments.overwrite)
+
+
+def _check_camera(arguments: DetectArguments, estimator: "Estimator", recordings: "list[Recording]") -> None:
     canonical = estimator.canonical
-    if arguments.camera is None and canonical.matrix is not None and not canonical.is_default:
+    if arguments.camera is not None or canonical.matrix is None or canonical.is_default:
+        return
+    for recording in recordings:
+        recording.refuse_without_info()
+    if len(recordings) < len(arguments.images):
         raise UsageError(
             f"model {estimator.name} needs the intrinsics of the camera that took the images; give --camera FILE "
             "(camera JSON, BOP's camera.json or scene_camera.json, or OpenCV YAML)"
         )
 
 
-def _format(arguments: DetectArguments, estimators: "Sequence[Estimator]") -> "ResultFormat":
+def _format(arguments: DetectArguments, estimators: "Sequence[Estimator]") -> "ResultFormat | Detection3DArrays":
     from curio_serve.batch.formats import Bop, Csv, JsonLines, bop_object_ids
+    from curio_serve.batch.sources import is_recording
 
+    if arguments.out is not None and is_recording(str(arguments.out)):
+        are_flat = any(not estimator.spec.camera.camera_matrix for estimator in estimators)
+        if arguments.format != "jsonl" or not all(map(is_recording, arguments.images)) or are_flat:
+            raise UsageError(
+                f"--out {arguments.out} writes vision_msgs/Detection3DArray: for poses in space, images of recordings "
+                "(.mcap) alone, and no --format"
+            )
+        from curio_serve.batch.recorded_poses import Detection3DArrays
+
+        return Detection3DArrays([kind for estimator in estimators for kind in estimator.spec.objects])
     if arguments.format == "jsonl":
         return JsonLines()
     if arguments.format == "csv":
@@ -315,6 +369,8 @@ def _format(arguments: DetectArguments, estimators: "Sequence[Estimator]") -> "R
 def _how_to_go_on(arguments: DetectArguments) -> str:
     if arguments.out is None:
         return "Standard output cannot be gone on with; give --out FILE to be able to."
+    if arguments.out.suffix.lower() == ".mcap":
+        return f"{arguments.out} holds the answers so far; a recording cannot be gone on with, --overwrite replaces it."
     command = [part for part in sys.argv[1:] if part not in ("--overwrite", "--no-overwrite")]
     return f"{arguments.out} holds complete images; to go on: {shlex.join(['curio-detect', *command])}"
 

@@ -116,11 +116,12 @@ class Estimator(ABC):
             seen.decode_ms,
             seen.inference_ms,
             is_turned=is_turned and not self.settings.apply_exif_rotation,
+            recorded=image.recorded,
         )
 
     def failed(self, image: SourceImage, exc: Exception) -> ImageResult:
         """An image without an answer."""
-        return ImageResult(image.name, self.name, self.version, error=str(exc))
+        return ImageResult(image.name, self.name, self.version, error=str(exc), recorded=image.recorded)
 
     def overlay(self, pixels: np.ndarray) -> tuple[np.ndarray, list[Detection]]:
         """A video's frame with its detections drawn in, and the detections, most confident first.
@@ -142,8 +143,12 @@ class Estimator(ABC):
         """Detects in a video's frame or in the bytes of an image file; the camera is that of the stored pixels."""
 
     def _camera(self, image: SourceImage) -> PinholeCamera | None:
-        if self.canonical.matrix is None or self.settings.cameras is None:
+        if self.canonical.matrix is None:
             return None
+        if self.settings.cameras is None:
+            if image.no_camera and not self.canonical.is_default:
+                raise CameraError(image.no_camera)
+            return image.camera
         return self.settings.cameras.camera_for(image.relative_name)
 
     def _frame(

@@ -16,6 +16,7 @@ from pathlib import PurePath
 
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
 
+from curio_serve.batch.sources import RecordedAt
 from curio_serve.bop import LINEMOD_IDS
 from curio_serve.errors import UsageError
 
@@ -45,6 +46,8 @@ class ImageResult:
     """Why there is no answer."""
     is_turned: bool = False
     """EXIF asks for a rotation that was not applied."""
+    recorded: RecordedAt | None = None
+    """For an image of a robot's recording."""
 
     @property
     def detections(self) -> list[Detection]:

@@ -1,4 +1,4 @@
-"""From what a command line names (files, folders, globs, videos, a list on standard input) to images, one at a time.
+"""From what a command line names (files, folders, globs, videos, recordings, a list) to images, one at a time.
 
 The order is the order of the arguments, and inside a folder that of the names. Nothing here grows with the number of
 images: a folder of a million is listed in batches, and a video is read as it is used.
@@ -18,11 +18,13 @@ import numpy as np
 
 from curio_serve.errors import ImageError, UsageError
 from curio_serve.files import check_regular, read_file
+from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.image import MAX_FILE_BYTES
 from curio_serve.models.model_folder import CONFIG_FILE
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v"})
+RECORDING_SUFFIX = ".mcap"
 STANDARD_INPUT = "-"
 
 _NAMED = 3  # files passed over that are named; the others are counted
@@ -34,17 +36,49 @@ Pixels: TypeAlias = np.ndarray
 
 
 @dataclass(frozen=True)
+class Topics:
+    """What to read of a recording."""
+
+    image: str | None = None
+    """Topic of the images; None: the only one there is."""
+    info: str | None = None
+    """Topic of their CameraInfo; None: by ROS's naming, beside the images."""
+
+
+@dataclass(frozen=True)
+class RecordedAt:
+    """Where and when a robot's recording has an image."""
+
+    topic: str
+    """Topic of the image."""
+    stamp_ns: int
+    """The camera's own, of the image's header, since the epoch."""
+    log_time_ns: int
+    """When the image was recorded."""
+    frame_id: str
+    """Of the camera's optical frame."""
+
+
+@dataclass(frozen=True)
 class SourceImage:
     """An image that is going to be looked at."""
 
     name: str
-    """Its path as given; a video's frames are ``clip.mp4#0``, ``clip.mp4#1`` and so on."""
+    """Its path as given; a video's frames are ``clip.mp4#0`` and so on, a recording's ``run.mcap#/topic@SECONDS``."""
     path: str
     """The file it comes from."""
     video_frame: int | None = None
     """Its number in a video; None for an image file."""
     pixels: Pixels | None = None
-    """Uint8 RGB [height, width, 3] of a video's frame."""
+    """Uint8 RGB [height, width, 3] of a video's frame or a recording's raw image."""
+    data: bytes | None = None
+    """Content of a recording's compressed image."""
+    camera: PinholeCamera | None = None
+    """Its own camera, which a recording knows."""
+    no_camera: str = ""
+    """Why a recording does not."""
+    recorded: RecordedAt | None = None
+    """For an image of a recording."""
     error: str = ""
     """Why a video has no frames to give, or a folder no images."""
 
@@ -56,6 +90,8 @@ class SourceImage:
         """
         if self.error:
             raise ImageError(self.error)
+        if self.data is not None:
+            return self.data
         try:
             return read_file(self.path, MAX_FILE_BYTES)
         except (OSError, ValueError) as exc:  # ValueError: a null byte in the name
@@ -65,7 +101,14 @@ class SourceImage:
     @property
     def relative_name(self) -> str:
         """The path in which a file of its own, such as a drawing, may be kept apart from all others'."""
+        if self.recorded is not None:
+            return os.path.join(self.path, self.recorded.topic.strip("/"), f"{self.recorded.stamp_ns:019d}.jpg")
         return self.path if self.video_frame is None else os.path.join(self.path, f"{self.video_frame:06d}.jpg")
+
+
+def is_recording(path: str) -> bool:
+    """Whether a path names a recording, by its suffix."""
+    return PurePath(path).suffix.lower() == RECORDING_SUFFIX
 
 
 class PassedOver:
@@ -116,23 +159,28 @@ def check_arguments(arguments: Sequence[str]) -> None:
             raise UsageError(f"{argument}: no such file or folder, and no file matches it; check the path")
 
 
-def images(arguments: Sequence[str], passed_over: PassedOver) -> Iterator[SourceImage]:
+def images(
+    arguments: Sequence[str],
+    passed_over: PassedOver,
+    topics: Topics = Topics(),
+) -> Iterator[SourceImage]:
     """Every image that the arguments name, in order; a folder that cannot be listed is one image with that error.
 
     Args:
         arguments: As on the command line.
         passed_over: Counts what is no image.
+        topics: What to read of recordings.
     """
     for argument in arguments:
         if argument == STANDARD_INPUT:
             for line in sys.stdin.buffer:
                 if path := os.fsdecode(line.rstrip(b"\r\n")):
-                    yield from _images_at(path, passed_over)
+                    yield from _images_at(path, passed_over, topics)
         elif os.path.exists(argument):
-            yield from _images_at(argument, passed_over)
+            yield from _images_at(argument, passed_over, topics)
         else:
             for path in sorted(glob.iglob(argument, recursive=True)):
-                yield from _images_at(path, passed_over)
+                yield from _images_at(path, passed_over, topics)
 
 
 def common_folder(arguments: Sequence[str]) -> Path:
@@ -152,7 +200,7 @@ def _has_match(pattern: str) -> bool:
     return glob.has_magic(pattern) and next(glob.iglob(pattern, recursive=True), None) is not None
 
 
-def _images_at(path: str, passed_over: PassedOver) -> Iterator[SourceImage]:
+def _images_at(path: str, passed_over: PassedOver, topics: Topics) -> Iterator[SourceImage]:
     if os.path.isdir(path):
         found = _images_below(path, passed_over)
         first = next(found, None)
@@ -163,6 +211,8 @@ def _images_at(path: str, passed_over: PassedOver) -> Iterator[SourceImage]:
             yield from found
     elif PurePath(path).suffix.lower() in VIDEO_SUFFIXES:
         yield from _video_frames(path)
+    elif is_recording(path):
+        yield from _recorded_images(path, topics)
     else:
         yield SourceImage(path, path)
 
@@ -208,6 +258,17 @@ def _leads_to_folder(entry: os.DirEntry[str]) -> bool:
         return entry.is_dir()
     except OSError:  # a link in a circle: an image that cannot be read
         return False
+
+
+def _recorded_images(path: str, topics: Topics) -> Iterator[SourceImage]:
+    from curio_serve.batch.recordings import Recording  # of an extra
+
+    try:
+        recording = Recording(path, topics)
+    except UsageError as exc:
+        yield SourceImage(path, path, error=str(exc))
+        return
+    yield from recording.images()
 
 
 def _video_frames(path: str) -> Iterator[SourceImage]:

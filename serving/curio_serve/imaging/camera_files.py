@@ -87,7 +87,7 @@ def _from_json(path: Path, content: Any) -> CameraFile:
         distortion = _distortion(content.get("distortion"))
         return CameraFile(path, PinholeCamera(_matrix(content["camera_matrix"]), distortion, size), {})
     if isinstance(content, dict) and (names := content.keys() & {"k", "K"}):
-        return CameraFile(path, _from_camera_info(content, names.pop()), {})
+        return CameraFile(path, camera_of_info(content, names.pop()), {})
     if isinstance(content, dict) and {"fx", "fy", "cx", "cy"} <= content.keys():
         fx, fy, cx, cy = (float(content[name]) for name in ("fx", "fy", "cx", "cy"))
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -123,7 +123,7 @@ def _size(width: Any, height: Any) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _from_camera_info(content: Mapping[str, Any], name: str) -> PinholeCamera:
+def camera_of_info(content: Mapping[str, Any], name: str) -> PinholeCamera:
     """The camera of a ROS CameraInfo message, whose matrix is called ``k`` or ``K``.
 
     Raises:
@@ -145,7 +145,7 @@ def _from_yaml(text: str) -> PinholeCamera:
         for name in ("k", "K"):
             if not storage.getNode(name).empty():
                 wanted = (name, "d", "D", "distortion_model", "width", "height")
-                return _from_camera_info({key: _plain(storage.getNode(key)) for key in wanted}, name)
+                return camera_of_info({key: _plain(storage.getNode(key)) for key in wanted}, name)
         matrix = _yaml_matrix(storage.getNode("camera_matrix"))
         if matrix is None:
             raise CameraError("no matrix camera_matrix; expected a file of OpenCV's or ROS's calibration")
