@@ -173,6 +173,15 @@ def _work(monkeypatch: pytest.MonkeyPatch, queue: WorkQueue, seconds: float) -> 
             now += seconds
 
 
+@pytest.mark.parametrize("remaining_s", [None, 9.223372035e18, math.inf])
+def test_calls_without_a_deadline_wait(gate: threading.Event, make_bench: MakeBench, remaining_s: float | None) -> None:
+    bench = make_bench(1, 1)
+    first = bench.hold(gate)
+    second = bench.hold(gate, Caller(remaining_s))
+    gate.set()
+    assert [first.result(30), second.result(30)] == ["done", "done"]
+
+
 def test_a_reservation_keeps_a_place(gate: threading.Event, make_bench: MakeBench) -> None:
     bench = make_bench(1, 1)
     with bench.queue.reserve(Caller()), bench.queue.reserve(Caller()) as second:

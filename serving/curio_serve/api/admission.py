@@ -28,7 +28,7 @@ class Call(Protocol):
     """The part of gRPC's servicer context that admission uses."""
 
     def time_remaining(self) -> float | None:
-        """Seconds until the caller's deadline; None without one."""
+        """Seconds until the caller's deadline; None or 9.2e18 without one."""
 
     def is_active(self) -> bool:
         """Whether the call has not ended."""
@@ -52,6 +52,9 @@ class Place:
 
     def sleep(self, limit_s: float | None) -> bool:
         """Sleep until woken; False if the limit passed first."""
+        # A call without a deadline has centuries left, which gRPC says in seconds and no lock accepts.
+        if limit_s is not None and limit_s > threading.TIMEOUT_MAX:
+            limit_s = None
         try:
             self._wakes.get(timeout=limit_s)
         except queue.Empty:
