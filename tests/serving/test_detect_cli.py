@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import onnx
 import pytest
-from curio_serve.batch.detect_cli import DetectArguments, run
+from curio_serve.batch.arguments import DetectArguments
+from curio_serve.batch.detect_cli import run
 from curio_serve.errors import CurioError, ModelError, UsageError
 from onnx import helper, numpy_helper
 from PIL import Image

@@ -13,7 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from curio_serve.batch.detect_cli import DetectArguments, run
+from curio_serve.batch.arguments import DetectArguments
+from curio_serve.batch.detect_cli import run
 from curio_serve.errors import ModelNotFound, TokenError, Unavailable, UsageError
 
 K = [[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]]

@@ -6,7 +6,8 @@ from typing import Any
 
 import onnx
 import pytest
-from curio_serve.batch.detect_cli import DetectArguments, run
+from curio_serve.batch.arguments import DetectArguments
+from curio_serve.batch.detect_cli import run
 from curio_serve.errors import ModelError, UsageError
 from curio_serve.models.runtime import (
     CPU,

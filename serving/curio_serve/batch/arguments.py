@@ -1,0 +1,72 @@
+"""The arguments of ``curio-detect``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from curio_serve.cores import num_cores
+
+
+@dataclass(frozen=True)
+class DetectArguments:
+    """Find a model's objects in images and write one JSON object an image, in the order of the images.
+
+    Several models may stand before the images, or a folder of models: each image then has a line of each model.
+
+    Poses are cam_from_obj in metres, in OpenCV's camera frame (x right, y down, z forward). An image that cannot be
+    read gets a line with its error, stops nothing, and makes the exit status 1. After a stop of any kind, run the same
+    command again: it goes on after the last complete image.
+    """
+
+    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
+    """Model folder (its latest version), version folder, .onnx file, or folder of models; if no such path, a server's
+    HOST:PORT/NAME."""
+    images: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="IMAGES...")]
+    """Files, folders (and those below; of a BOP scene its photographs), globs, videos, recordings (MCAP with ROS 2
+    messages), or - for a list on stdin."""
+    video: str | None = None
+    """Show detections live in the browser instead: a camera's number, a video file, or a URL such as rtsp://…."""
+    host: str = "127.0.0.1"
+    """Address that --video listens on; whoever reaches it sees the frames."""
+    port: int = 8080
+    """Port that --video listens on."""
+    camera: Path | None = None
+    """Intrinsics: camera JSON, BOP's camera.json or scene_camera.json, OpenCV YAML. 2D worlds need none."""
+    topic: str | None = None
+    """Topic of a recording's images. None: the only one that there is."""
+    info_topic: str | None = None
+    """Topic of their CameraInfo, which says K unless --camera does. None: camera_info beside the images."""
+    out: Path | None = None
+    """Result file. One that exists is gone on with, where it is of the same model and images. None: stdout. FILE.mcap,
+    for recordings: vision_msgs/Detection3DArray."""
+    overwrite: bool = False
+    """Replace the result file instead."""
+    format: Literal["jsonl", "csv", "bop"] = "jsonl"
+    """JSON Lines; CSV, a row a detection; BOP's results in millimetres, for images <scene>/rgb/<image>.png."""
+    obj_id: int | None = None
+    """Object id in BOP's results. None: that of the LineMOD class the object is named after."""
+    overlays: Path | None = None
+    """Folder for pictures with boxes and axes drawn in, laid out like the images. An exported model holds no mesh,
+    and a box looks the same after half a turn: curio-render --mesh --over-photograph draws the mesh."""
+    min_confidence: float = 0.0
+    """Leave out detections below, 0 to 1."""
+    max_detections: int | None = None
+    """Keep that many of an image, the most confident. None: all."""
+    exif_rotation: bool = False
+    """Turn images as EXIF says, and K with them. Otherwise pixels are taken as stored, to which K belongs."""
+    jobs: int = num_cores()
+    """Images worked on at the same time; by default the number of cores that there are for it."""
+    provider: str = "cpu"
+    """onnxruntime's execution providers by preference, with commas: cpu, openvino, cuda, tensorrt, coreml or others."""
+    ray: str | None = None
+    """Do it on a Ray cluster: HOST:PORT, auto for the one this machine is in, local for this machine's processors."""
+    token_file: Path | None = None
+    """File with the bearer token that the server asks for."""
+    server_ca: Path | None = None
+    """Authority (PEM) that signed the server's certificate; turns TLS on."""
+    tls_certificate: Path | None = None
+    """Our own certificate (PEM), for a server that asks for one."""
+    tls_key: Path | None = None
+    """Key of our certificate (PEM)."""
