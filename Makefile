@@ -1,8 +1,11 @@
-# setup · demo · test · check · bench · results · proto · docs: each brings the environment up to date first, which costs nothing when it is.
+# setup · demo · test · check · bench · results · proto · docs · dist: each brings the environment up to date first, which costs nothing when it is.
 
 PYTHON ?= python3
 # Any pip requirement, also with options: TORCH="torch==2.13.0 --index-url …" for a build without CUDA.
 TORCH ?= torch==2.13.0
+
+# Interpreters that make dist installs the wheel for; those that are not there are left out.
+PYTHONS ?= python3.11 python3.12 python3.13
 
 BIN := .venv/bin
 READY := .venv/.ready
@@ -14,7 +17,7 @@ BENCHMARKS := $(filter-out benchmarks/screenshot.py benchmarks/demo.py benchmark
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
-.PHONY: setup demo test check bench results proto docs
+.PHONY: setup demo test check bench results proto docs dist
 
 setup: $(READY)
 
@@ -53,6 +56,8 @@ check: $(READY)
 	@$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	# Serving runs on other systems, too: a name that only POSIX has is an error here.
+	for system in win32 darwin; do $(BIN)/mypy --package curio_serve --platform $$system; done
 	$(BIN)/lint-imports
 	fresh=$$(mktemp -d); trap 'rm -r "$$fresh"' EXIT
 	$(PROTOC) --python_out="$$fresh" --pyi_out="$$fresh" --grpc_python_out="$$fresh" $(PROTOS)
@@ -79,3 +84,19 @@ results: $(READY)
 docs: $(READY)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	echo "docs: build/site/index.html"
+
+# Source distribution and wheel in dist/, the wheel built from the former; checked, then installed afresh and tried.
+dist: $(READY)
+	@rm -rf dist
+	$(BIN)/python -m build --outdir dist . > /dev/null
+	$(BIN)/twine check --strict dist/*
+	fresh=$$(mktemp -d); trap 'rm -r "$$fresh"' EXIT
+	for python in $(PYTHONS); do
+		"$$python" -c "" 2> /dev/null || { echo "dist: $$python is not here, so the wheel was not tried with it"; continue; }
+		"$$python" -m venv --clear "$$fresh/venv"
+		"$$fresh/venv/bin/pip" install --quiet dist/*.whl
+		"$$fresh/venv/bin/pip" check
+		"$$fresh/venv/bin/curio-serve" --help > /dev/null
+		"$$fresh/venv/bin/curio-detect" models/ape samples/ --camera samples/camera.json --out "$$fresh/poses.jsonl" --overwrite
+		echo "dist: $$("$$python" --version): installed and tried, $$("$$fresh/venv/bin/pip" list 2> /dev/null | tail -n +3 | wc -l) packages, pip among them"
+	done

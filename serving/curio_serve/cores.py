@@ -1,7 +1,8 @@
 """How many cores and how much memory this process may use."""
 
-import os
 from pathlib import Path
+
+from curio_serve.systems import usable_cores
 
 _CGROUP = Path("/sys/fs/cgroup")
 # Quota and period in microseconds, as cgroup v2 and v1 give a container its own.
@@ -16,7 +17,7 @@ def num_cores(cgroup: Path = _CGROUP) -> int:
     Args:
         cgroup: Where control groups are mounted.
     """
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     quota = _quota(cgroup)
     return cores if quota is None else max(1, min(cores, round(quota)))
 

@@ -7,6 +7,8 @@ import stat
 from pathlib import Path
 from typing import Any
 
+from curio_serve.systems import READ_FLAGS
+
 _MAX_GIVEN_BYTES = 4 << 20
 
 
@@ -21,7 +23,7 @@ def read_file(path: str | Path, max_bytes: int) -> bytes:
         OSError: It cannot be read, is no regular file, or is larger; ``strerror`` says which.
         ValueError: The path has a null byte in it.
     """
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+    with open(os.open(path, READ_FLAGS), "rb") as file:
         check_regular(os.fstat(file.fileno()), path, max_bytes)
         return file.read(max_bytes)
 

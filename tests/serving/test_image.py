@@ -91,6 +91,10 @@ def test_a_thumbnails_end_is_not_the_pictures_end() -> None:
     [
         (b"", "empty"),
         (b"GIF89a" + bytes(100), "not a JPEG, PNG or WebP"),
+        (
+            bytes.fromhex("00000024") + b"ftypheic" + bytes(100),
+            "HEIC picture, .*: convert it, for example by heif-convert",
+        ),
         (b"hello world, this is text", "not a JPEG, PNG or WebP"),
         (b"\xff\xd8\xff", "ends inside its header"),
         (b"\xff\xd8\xff\xd9", "no picture data"),

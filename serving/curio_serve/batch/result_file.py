@@ -6,7 +6,6 @@ beginning of that list, in order. The torn end is cut off and the rest of the im
 is the one that an uninterrupted run would have written. Neither the file nor the list is ever held in memory.
 """
 
-import fcntl
 import os
 import stat
 from collections.abc import Iterator, Sequence
@@ -17,6 +16,7 @@ from typing import BinaryIO, Protocol, TypeVar
 from curio_serve.batch.formats import ImageLines, Line, ResultFormat
 from curio_serve.errors import OutputError, UsageError
 from curio_serve.files import direct
+from curio_serve.systems import APPEND_FLAGS, lock
 
 
 class Named(Protocol):
@@ -206,14 +206,10 @@ def _open_locked(path: Path) -> int:
     try:
         path = direct(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+        descriptor = os.open(path, APPEND_FLAGS, 0o666)
     except OSError as exc:
         raise OutputError(f"--out {path}: cannot be opened for writing: {exc.strerror}") from exc
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as exc:
+    if not lock(descriptor):
         os.close(descriptor)
-        raise OutputError(f"--out {path}: another process is writing it") from exc
-    except OSError:
-        pass  # no locks on this file system: writing works all the same
+        raise OutputError(f"--out {path}: another process is writing it")
     return descriptor

@@ -184,9 +184,16 @@ def images(
 
 
 def common_folder(arguments: Sequence[str]) -> Path:
-    """The deepest folder that holds everything the arguments name: below it, relative paths are distinct."""
+    """The deepest folder that holds everything the arguments name: below it, relative paths are distinct.
+
+    Raises:
+        UsageError: They lie on several of Windows' drives.
+    """
     folders = [os.getcwd() if a == STANDARD_INPUT else _folder_of(os.path.abspath(a)) for a in arguments]
-    return Path(os.path.commonpath(folders))
+    try:
+        return Path(os.path.commonpath(folders))
+    except ValueError as exc:
+        raise UsageError(f"the images lie on several drives: {', '.join(folders)}; a call takes those of one") from exc
 
 
 def _folder_of(path: str) -> str:

@@ -21,6 +21,7 @@ MAX_JPEG_SCANS = 64
 # A block of 8x8 samples takes at least a Huffman code of one bit for its mean, and, unless the picture is progressive,
 # another one for the rest. With arithmetic codes it may take less.
 _HUFFMAN_BITS = {0xC0: 2, 0xC1: 2, 0xC2: 1}
+_HEIC = (b"ftypheic", b"ftypheix", b"ftyphevc", b"ftypmif1", b"ftypmsf1")  # ISO 23008-12
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,11 @@ def read_header(data: bytes) -> Header:
             return _read_webp(data)
     except (struct.error, IndexError) as exc:
         raise ImageError(f"the image ends inside its header ({len(data)} bytes); send the whole file") from exc
+    if data[4:12] in _HEIC:
+        raise ImageError(
+            "a HEIC picture, as telephones take them; expected JPEG, PNG or WebP: convert it, for example by "
+            "heif-convert or ImageMagick"
+        )
     raise ImageError(
         f"not a JPEG, PNG or WebP image: it starts with {data[:8].hex(' ')}; convert it or send raw pixels"
     )

@@ -7,12 +7,12 @@
 exhausts the runtime ends this process and not theirs. Exit status 0: fit; 1: refused, the last line on stderr says why.
 """
 
-import resource
 import subprocess
 import sys
 from pathlib import Path
 
 from curio_serve.errors import ModelError
+from curio_serve.systems import limit_this_process
 
 MAX_MEMORY_BYTES = 4 << 30
 MAX_CPU_S = 30
@@ -65,9 +65,7 @@ class ChildCheck:
 
 def main() -> int:
     """Check the model that the arguments name."""
-    resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
-    resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_S, MAX_CPU_S))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    limit_this_process(MAX_MEMORY_BYTES, MAX_CPU_S)
     # After the limits, so that they hold for the libraries too.
     from curio_serve.models.model_folder import load_version, open_model
 

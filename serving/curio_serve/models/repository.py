@@ -16,7 +16,7 @@ from curio_serve.models.model_folder import MODEL_FILE, is_model_name, load_vers
 from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime
 
 Key = tuple[str, int]
-Signature = tuple[tuple[int, int, int], ...]
+Signature = tuple[tuple[int, int, int, int], ...]
 _FOLDER = 0  # in place of a version: the model's folder itself
 
 
@@ -166,8 +166,9 @@ def _signature(folder: Path, version: int) -> Signature:
         try:
             stat = file.stat()
         except OSError:
-            signature.append((0, 0, 0))
+            signature.append((0, 0, 0, 0))
         else:
-            # When it was last changed in any way: another owner or mode may be what makes it fit to be read.
-            signature.append((stat.st_ctime_ns, stat.st_size, stat.st_ino))
+            # When it was last changed in any way, as another owner or mode may be what makes it fit to be read; on
+            # Windows that is when it was made.
+            signature.append((stat.st_ctime_ns, stat.st_mtime_ns, stat.st_size, stat.st_ino))
     return tuple(signature)

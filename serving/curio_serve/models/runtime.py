@@ -44,7 +44,7 @@ DEFAULT_RUNTIME = Runtime()
 
 def available_providers() -> list[str]:
     """The providers of the installed onnxruntime that can compute a network here, in its own order and names."""
-    return [name for name in _onnxruntime().get_available_providers() if name != _NOT_LOCAL]
+    return [name for name in load_onnxruntime().get_available_providers() if name != _NOT_LOCAL]
 
 
 def short_name(provider: str) -> str:
@@ -68,7 +68,7 @@ def read_providers(text: str) -> tuple[str, ...]:
     names = [short_name(name.strip()) for name in text.split(",")]
     for name in names:
         if name not in found:
-            version = _onnxruntime().__version__
+            version = load_onnxruntime().__version__
             package = f". For {name}: {_PACKAGES[name]}" if name in _PACKAGES else ""
             raise UsageError(
                 f"--provider {text}: onnxruntime {version}, as it is installed here, has no provider {name!r}; it has "
@@ -93,7 +93,7 @@ def open_session(data: bytes, where: str, providers: Sequence[str]) -> "onnxrunt
     Raises:
         ModelError: onnxruntime refuses the graph, or cannot start a provider.
     """
-    onnxruntime = _onnxruntime()
+    onnxruntime = load_onnxruntime()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
@@ -120,7 +120,8 @@ def runtime_errors() -> tuple[type[Exception], ...]:
     return (ValueError, RuntimeError, runtime.RuntimeException, *(getattr(runtime, name) for name in names))
 
 
-def _onnxruntime() -> ModuleType:
+def load_onnxruntime() -> ModuleType:
+    """The package, with its telemetry off."""
     # Before the import: unless told not to, onnxruntime from 1.29 on writes an identifier into the user's cache folder
     # and uploads events to its makers (its Privacy.md).
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -1,8 +1,9 @@
 """Measures this process's memory, and has freed memory returned to the operating system."""
 
-import ctypes
-import resource
+import mmap
 from pathlib import Path
+
+from curio_serve.systems import c_function
 
 _STATM = Path("/proc/self/statm")
 # glibc's <malloc.h>
@@ -11,8 +12,11 @@ _LARGE_BYTES, _NUM_ARENAS = 1 << 20, 4
 
 
 def resident_bytes() -> int:
-    """Resident memory of this process."""
-    return int(_STATM.read_text().split()[1]) * resource.getpagesize()
+    """Resident memory of this process; 0 where the system does not tell, and containers have no limit either."""
+    try:
+        return int(_STATM.read_text().split()[1]) * mmap.PAGESIZE
+    except OSError:
+        return 0
 
 
 def bound_heaps() -> None:
@@ -21,7 +25,7 @@ def bound_heaps() -> None:
     By itself glibc learns from the first message of 30 MB to take such buffers from its heaps, of which there are many
     when threads are, and keeps what is freed there.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    mallopt = c_function("mallopt")
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
         mallopt(_M_ARENA_MAX, _NUM_ARENAS)
@@ -29,6 +33,6 @@ def bound_heaps() -> None:
 
 def give_back() -> None:
     """Return freed memory, which glibc keeps where it was freed in pieces."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    trim = c_function("malloc_trim")
     if trim is not None:
         trim(0)

@@ -1,5 +1,6 @@
 """Serves the metrics over HTTP, at one path and within a time limit."""
 
+import os
 import socket
 import threading
 from contextlib import suppress
@@ -13,6 +14,9 @@ _LIMIT_S = 10.0
 
 class MetricsPort(ThreadingHTTPServer):
     """Answers scrapes, each on a thread of its own, from :meth:`start` on."""
+
+    # On Windows this would let two servers have one port.
+    allow_reuse_address = os.name == "posix"
 
     def __init__(self, host: str, port: int, registry: CollectorRegistry) -> None:
         """Open the port.

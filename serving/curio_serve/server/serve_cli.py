@@ -7,6 +7,7 @@ import sys
 
 from curio_serve.errors import CurioError
 from curio_serve.server.config import ServeConfig, read_config, to_toml
+from curio_serve.systems import STOP_SIGNALS
 from curio_serve.telemetry import log, start_logging
 from curio_serve.version import answer_version
 
@@ -37,7 +38,7 @@ def _serve(config: ServeConfig) -> None:
     lines = start_logging(config.log_level)
     try:
         server = PoseServer(config)
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        for number in STOP_SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup sets it
                 signal.signal(number, lambda _number, _frame: server.stop())
         address, *metrics = server.start()

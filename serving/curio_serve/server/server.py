@@ -39,6 +39,7 @@ _SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.Heal
 
 _MEMORY_USED = 0.8  # of a container's memory, beyond which streams are ended
 _DEVICE_BATCH = 8  # of a GPU provider
+_HEARING_S = 1.0
 
 
 class PoseServer:
@@ -156,7 +157,9 @@ class PoseServer:
         watcher = threading.Thread(target=self._watch, name="curio-watch")
         watcher.start()
         try:
-            self._stopped.wait()
+            # Not for ever at once: on Windows no signal is heard meanwhile.
+            while not self._stopped.wait(_HEARING_S):
+                pass
         finally:
             self._stopped.set()
             self._drain()

@@ -12,10 +12,12 @@ from curio_train.geometry import Pose, rotation_angle_deg
 from curio_train.metrics.assignment import each_parameter_error, scene_error
 from curio_train.metrics.images import dssim
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, recall, symmetry_poses
-from curio_train.scene_code import TRANSLATION, SceneCode, index
+from curio_train.scene_code import TRANSLATION, SceneCode, index, poses
 from curio_train.worlds.base import World, novel_view
+from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _MM = 1000.0
+_MOST_TURNED_DEG = 10.0
 _BATCH_SIZE = 50
 
 
@@ -60,6 +62,23 @@ def novel_view_dssim(world: World, predicted: SceneCode, true: SceneCode) -> Flo
     starts = range(0, len(true[TRANSLATION]), _BATCH_SIZE)
     batches = [[index(code, slice(start, start + _BATCH_SIZE)) for code in (predicted, true)] for start in starts]
     return torch.cat([dssim(*(novel_view(world, code).clamp(0, 1) for code in pair)) for pair in batches])
+
+
+def accuracy(world: World, predicted: SceneCode, true: SceneCode) -> float:
+    """Fraction of objects that are right.
+
+    Of one object with a mesh: ADD(-S) is below a tenth of the diameter. In other worlds: the position is off by less
+    than a tenth of the smallest diameter, and the rotation, where there is one, by less than 10 degrees.
+    """
+    if isinstance(world, SingleObjectWorld):
+        kind = world.objects[0]
+        errors = add_errors(poses(predicted), poses(true), world.object.mesh.vertices_m, kind.info)
+        return recall(errors, ADD_THRESHOLD)
+    found = each_parameter_error(world.layout, predicted, true, [kind.slots for kind in world.objects])
+    right = found["position"] < ADD_THRESHOLD * min(kind.diameter_m for kind in world.objects)
+    if "rotation_deg" in found:
+        right &= found["rotation_deg"] < _MOST_TURNED_DEG
+    return float(right.float().mean())
 
 
 def add_errors(estimates: Sequence[Pose], truths: Sequence[Pose], points: np.ndarray, info: ModelInfo) -> list[float]:

@@ -94,12 +94,17 @@ def _from_model(file: Path, data: Path | None) -> Subject:
     model = ExportedModel.open(file)
     config = _config_of(model, file, data)
     world = build(config.world)
+    spec = model.spec
+    return Subject(config, world, model_reader(model, world), spec.images_seen, spec.training_seconds, spec.commit)
+
+
+def model_reader(model: ExportedModel, world: World) -> Predict:
+    """Reads images by an exported model of the world."""
 
     def predict(images: Tensor) -> dict[str, Tensor]:
         return world.outputs.to_code(model(images.permute(0, 2, 3, 1).contiguous()))
 
-    spec = model.spec
-    return Subject(config, world, predict, spec.images_seen, spec.training_seconds, spec.commit)
+    return predict
 
 
 def _config_of(model: ExportedModel, file: Path, data: Path | None) -> RunConfig:

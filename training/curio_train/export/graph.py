@@ -3,12 +3,13 @@
 import copy
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import onnx
 import torch
 import torch.nn.functional as F
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec, ObjectModel, Symmetry
@@ -47,6 +48,20 @@ _LEAST_STABLE = 0.25  # of the check images
 
 
 @dataclass(frozen=True)
+class Reduced:
+    """A graph that computes with fewer bits."""
+
+    model: onnx.ModelProto
+    """The graph, with the same inputs and outputs."""
+    weights: str
+    """How weights are stored, and what that costs, for the card."""
+
+
+Reduce = Callable[[World, onnx.ModelProto], Reduced]
+"""Makes it of a world's float32 graph, or raises ExportError where that costs too much."""
+
+
+@dataclass(frozen=True)
 class Exported:
     """The result of an export."""
 
@@ -55,9 +70,11 @@ class Exported:
     parity_error: float
     """Largest absolute difference between the network, its weights rounded as stored, and onnxruntime."""
     rounding_error: float
-    """Largest absolute difference between that network and the one that was trained; 0 in float32."""
+    """Largest absolute difference between what was written and the network that was trained; 0 in float32."""
     num_bytes: int
     """Of model.onnx."""
+    weights: str
+    """How weights are stored, and what that costs."""
 
 
 class Graph(nn.Module):
@@ -81,7 +98,9 @@ class Graph(nn.Module):
         return self._world.outputs.from_code(self.network(pixels))
 
 
-def export(run: Path, out: Path, name: str | None = None, *, half: bool = False) -> Exported:
+def export(
+    run: Path, out: Path, name: str | None = None, *, half: bool = False, reduce: Reduce | None = None
+) -> Exported:
     """Write the network of a run as the next version of a model.
 
     Args:
@@ -89,11 +108,13 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
         out: Folder of models.
         name: Of the model; the world's choice unless given (a LineMOD model is named after its class).
         half: Store weights as float16, half as large; they are computed with in float32.
+        reduce: Applied to the float32 graph once that agrees with torch; not together with ``half``.
 
     Raises:
         UsageError: The name cannot be a model's, or the folder is something else.
         CheckpointError: The run is missing, damaged or without a checkpoint.
-        ExportError: torch and onnxruntime disagree, or the model cannot be written; nothing is left behind.
+        ExportError: torch and onnxruntime disagree, ``reduce`` costs too much, or the model cannot be written; nothing
+            is left behind.
     """
     folder = RunFolder.open(run)
     world = build(folder.config.world)
@@ -124,20 +145,30 @@ def export(run: Path, out: Path, name: str | None = None, *, half: bool = False)
     )
     put_spec(model, spec)
 
-    found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
-    answers, found = ({name: v[known] for name, v in of.items()} for of in (expected if half else learned, found))
-    spec.parity_max_abs_error = refuse_disparity(answers, found)
+    images = images[known]
+    found, weights = (
+        ExportedModel(model.SerializeToString(), "the exported graph")(images),
+        _weights(half, rounding_error),
+    )
+    parity_error = refuse_disparity({name: v[known] for name, v in (expected if half else learned).items()}, found)
+    if reduce is not None:
+        exact, reduced = found, reduce(world, model)
+        model, weights = reduced.model, reduced.weights
+        put_spec(model, spec)
+        found = ExportedModel(model.SerializeToString(), "the reduced graph")(images)
+        rounding_error = largest_difference(exact, found)
+    spec.parity_max_abs_error = parity_error if reduce is None else rounding_error
     put_spec(model, spec)
     version = target.next_version()
-    made = Provenance(run, folder.config, sessions, state.progress, _weights(half, rounding_error))
+    made = Provenance(run, folder.config, sessions, state.progress, weights)
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),
-        GOLDEN_FILE: _golden(images[known], found),
+        GOLDEN_FILE: _golden(images, found),
         WEIGHTS_FILE: weights_file(state, folder.config, half=half),
     }
     path = target.add(version, files, config, text)
-    return Exported(path, spec.parity_max_abs_error, rounding_error, model.ByteSize())
+    return Exported(path, parity_error, rounding_error, model.ByteSize(), weights)
 
 
 def _golden(images: Tensor, outputs: Mapping[str, Tensor]) -> bytes:

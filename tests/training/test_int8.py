@@ -1,0 +1,98 @@
+"""``curio-export --int8``: smaller, told on the card, and refused where it costs accuracy."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from curio_serve.models.model_folder import load_version
+from curio_train.commands import export as export_command
+from curio_train.errors import ExportError
+from curio_train.evaluation import int8 as reduction
+from curio_train.evaluation.scores import accuracy
+from curio_train.export.graph import Exported, Graph, export
+from curio_train.export.int8 import to_int8
+from curio_train.export.onnx import to_onnx
+from curio_train.scene_code import TRANSLATION
+from curio_train.worlds.generated.circles import Circles
+
+
+@pytest.fixture(autouse=True)
+def _few_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """8 images to calibrate with and 50 to judge by instead of 64 and 500."""
+    monkeypatch.setattr(reduction, "NUM_CALIBRATION", 8)
+    monkeypatch.setattr(reduction, "NUM_HELD_OUT", 50)
+
+
+@pytest.fixture
+def models(circles_models: tuple[Exported, Exported], tmp_path: Path) -> Path:
+    return Path(shutil.copytree(circles_models[0].path.parents[1], tmp_path / "models"))
+
+
+def test_a_version_in_int8(circles_run: Path, models: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        export_command.export([str(circles_run), "--out", str(models), "--int8", "--cache", str(tmp_path / "cache")])
+    assert not exit_.value.code
+    path = models / "circles" / "3"
+    size, float_size = ((models / "circles" / n / "model.onnx").stat().st_size for n in ("3", "1"))
+    assert size < 0.5 * float_size
+    types = {node.op_type for node in onnx.load(path / "model.onnx").graph.node}
+    assert {"QuantizeLinear", "DequantizeLinear"} <= types
+    told = "accuracy on 50 held-out renderings 0.0% in int8, 0.0% in float32"
+    assert told in capsys.readouterr().out
+    assert f"| weights | int8 convolutions, else float32; {told} |" in (models / "circles" / "CARD.md").read_text()
+
+    served = load_version(models / "circles", 3)
+    assert served.spec.world == "circles"
+    original = load_version(models / "circles", 1)
+    images = np.random.default_rng(0).integers(0, 256, (4, 128, 128, 3), dtype=np.uint8)
+    off = np.abs(served.run(images)[TRANSLATION] - original.run(images)[TRANSLATION]).max()
+    assert 0 < off < 0.05
+    assert 1e-6 < served.spec.parity_max_abs_error < 0.05
+
+
+def test_what_costs_more_than_a_point_is_refused_with_both_figures(
+    circles_run: Path, models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The network has learned nothing, so an accuracy that falls is made by demanding that it rises."""
+    monkeypatch.setattr(reduction, "LARGEST_LOSS", -0.01)
+    before = sorted(models.rglob("*"))
+    words = r"in int8, 0\.0% in float32: int8 costs more than -1 point; nothing was written\. Export with --half"
+    with pytest.raises(ExportError, match=words):
+        export(circles_run, models, reduce=reduction.int8(tmp_path / "cache"))
+    assert sorted(models.rglob("*")) == before
+
+
+def test_half_and_int8_exclude_each_other(circles_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        export_command.export([str(circles_run), "--half", "--int8"])
+    assert exit_.value.code == 2
+    assert "give one of them" in capsys.readouterr().err
+
+
+class _Linear(torch.nn.Module):
+    """A network without an activation."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cells = torch.nn.Conv2d(3, 3, 3)
+
+    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {TRANSLATION: self.cells(images).mean(dim=(2, 3))[:, None]}
+
+
+def test_a_network_without_anything_to_quantise_is_refused() -> None:
+    model = to_onnx(Graph(_Linear(), Circles()), 128, 128, [TRANSLATION])
+    with pytest.raises(ExportError, match="no convolution before an activation"):
+        to_int8(model, torch.zeros(2, 3, 128, 128, dtype=torch.uint8))
+
+
+@pytest.mark.parametrize(("off", "expected"), [(0.0, 1.0), (0.019, 1.0), (0.021, 0.75), (1.0, 0.75)])
+def test_accuracy_is_the_share_within_a_tenth_of_the_diameter(off: float, expected: float) -> None:
+    world = Circles()
+    true = world.sample(4, (0,))
+    predicted = {name: values.clone() for name, values in true.items()}
+    predicted[TRANSLATION][0, 0, 0] += off
+    assert accuracy(world, predicted, true) == expected

@@ -1,0 +1,88 @@
+"""Quantises an exported graph: int8 convolutions by onnxruntime's own quantiser, as QDQ nodes.
+
+Weights have a scale a channel and seven bits, so that sums never saturate and processors with and without VNNI compute
+the same. Convolutions whose output is no activation's input give the answer itself and stay in float32, as all else.
+"""
+
+import logging
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import onnx
+from curio_serve.models.model import INPUT
+from curio_serve.models.runtime import load_onnxruntime
+from torch import Tensor
+
+from curio_train.errors import ExportError
+
+_NUM_A_RUN = 8
+
+
+def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
+    """The model with convolutions that compute in int8.
+
+    Args:
+        model: In float32; stays as it is.
+        images: For the ranges of the activations, uint8 [num_images, 3, height, width].
+
+    Raises:
+        ExportError: There is no convolution to quantise.
+    """
+    load_onnxruntime()  # first, because it turns telemetry off
+    from onnxruntime import quantization
+
+    kept = _answering(model)
+    if len(kept) == sum(node.op_type == "Conv" for node in model.graph.node):
+        raise ExportError("the network has no convolution before an activation to quantise; export without --int8")
+
+    class Reader(quantization.CalibrationDataReader):
+        def __init__(self) -> None:
+            pixels = images.permute(0, 2, 3, 1).contiguous().numpy()
+            self._feeds = iter(np.array_split(pixels, -(-len(pixels) // _NUM_A_RUN)))
+
+        def get_next(self) -> dict[str, np.ndarray] | None:
+            batch = next(self._feeds, None)
+            return None if batch is None else {INPUT: batch}
+
+    with tempfile.TemporaryDirectory() as folder, _quiet():
+        source, target = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
+        onnx.save(model, source)  # of a model in memory the quantiser takes the weights away
+        quantization.quantize_static(
+            source,
+            target,
+            Reader(),
+            quant_format=quantization.QuantFormat.QDQ,
+            op_types_to_quantize=["Conv"],
+            nodes_to_exclude=kept,
+            per_channel=True,
+            reduce_range=True,
+            activation_type=quantization.QuantType.QUInt8,
+            weight_type=quantization.QuantType.QInt8,
+        )
+        quantised = onnx.load(target)
+    onnx.checker.check_model(quantised)
+    return quantised
+
+
+def _answering(model: onnx.ModelProto) -> list[str]:
+    """Names of the convolutions that no rectifier follows, at once or after the sum of a residual block."""
+    rectified: set[str] = set()
+    for node in reversed(model.graph.node):  # which are in the order of computation
+        if node.op_type == "Relu" or (node.op_type == "Add" and node.output[0] in rectified):
+            rectified.update(node.input)
+    return [node.name for node in model.graph.node if node.op_type == "Conv" and node.output[0] not in rectified]
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the quantiser's advice to preprocess, which folded graphs do not need."""
+    logger = logging.getLogger()
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
