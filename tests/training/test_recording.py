@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from curio_train.drawing.album import draw
+from curio_train.drawing.album import MeshFiles, draw
 from curio_train.drawing.pictures import RenderOptions
 from curio_train.errors import DataError
 from curio_train.meshes.shapes import box
@@ -45,7 +45,7 @@ def record(lines: list[str], mesh: Path, folder: Path) -> dict[str, list[dict[st
     """Rows of each entity of the recording of these lines."""
     results = folder / "poses.jsonl"
     results.write_text("\n".join(lines))
-    (path,) = draw(results, folder / "out", [str(mesh)], "m", None, RenderOptions(), "rrd")
+    (path,) = draw(results, folder / "out", MeshFiles((str(mesh),), "m"), None, RenderOptions(), "rrd")
     assert path == folder / "out" / "poses.rrd"
     batches = [(chunk.entity_path, chunk.to_record_batch()) for chunk in RrdReader(path).stream()]
     clock = {"log_time", "RecordingInfo:start_time"}  # finer than Python's time

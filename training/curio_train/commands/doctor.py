@@ -19,9 +19,11 @@ class DoctorCommand:
     """Check the mesh, camera file, photographs and model that are named; without any, this machine."""
 
     mesh: Path | None = None
-    """Mesh file: PLY, OBJ, STL, glTF or OFF."""
+    """Mesh file: PLY, OBJ, STL, glTF, OFF, STEP or IGES."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
     """Unit of its coordinates; the file's own, or metres, unless given."""
+    body: str | None = None
+    """Name of the one body of a STEP or IGES file to take, in its own frame; all of them, as placed, unless given."""
     camera: Path | None = None
     """Camera JSON, or BOP's camera.json."""
     photos: Path | None = None
@@ -55,5 +57,5 @@ def _examine(command: DoctorCommand) -> int:
         console.print(str(finding), markup=False)
         status = max(status, finding.state == "bad")
     if command.symmetries is not None and command.mesh is not None:
-        save_symmetries(command.mesh, command.mesh_unit, command.symmetries)
+        save_symmetries(command.mesh, command.mesh_unit, command.body, command.symmetries)
     return status

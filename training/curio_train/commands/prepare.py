@@ -3,13 +3,15 @@
 What is found out here is written into the run's configuration, so that a run keeps it whatever becomes of the files.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from curio_train.commands.linemod_data import with_linemod
 from curio_train.config import NetworkConfig, RunConfig
-from curio_train.errors import UsageError
+from curio_train.errors import DataError, UsageError
+from curio_train.learning.runs.configuration import CONFIG_FILE
 from curio_train.worlds.options import CaptureOptions, LinemodOptions
 
 
@@ -46,6 +48,42 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
     return config
 
 
+def with_kept_meshes(config: RunConfig, run: Path) -> RunConfig:
+    """Write the triangles of CAD files into the run's folder, and let the configuration name those.
+
+    What the run learns, and every later look at it, then depends neither on the CAD file nor on its tessellator.
+
+    Args:
+        config: As :func:`prepared`.
+        run: The folder of the new run; nothing is written into one that holds a run.
+
+    Raises:
+        DataError: The folder cannot be written.
+        MeshError: A CAD file cannot be read.
+    """
+    options = config.world
+    if not isinstance(options, CaptureOptions) or (run / CONFIG_FILE).exists():
+        return config
+    from curio_train.meshes.cad import CAD_SUFFIXES
+    from curio_train.meshes.meshes import load_mesh, to_ply
+
+    kept = list(options.mesh)
+    for i, file in enumerate(options.mesh):
+        if file.suffix.lower() not in CAD_SUFFIXES:
+            continue
+        kept[i] = Path(os.path.abspath(run)) / "meshes" / f"{file.stem}.ply"
+        try:
+            kept[i].parent.mkdir(parents=True, exist_ok=True)
+            draft = kept[i].with_suffix(f".{os.getpid()}.tmp")  # torchrun's processes each write it
+            draft.write_bytes(to_ply(load_mesh(file, options.mesh_unit, options.body)))
+            draft.replace(kept[i])
+        except OSError as exc:
+            raise DataError(f"{kept[i]} cannot be written ({exc.strerror}); choose another --out") from exc
+    if kept == list(options.mesh):
+        return config
+    return replace(config, world=replace(options, mesh=tuple(kept), body=None))
+
+
 def _usual_network(config: RunConfig, options: CaptureOptions) -> NetworkConfig:
     """Parts on a plane are read by the dense decoder, unless the call, the paper, or wake–sleep wants it otherwise."""
     if options.plane is None or config.network.reading is not None:
@@ -78,7 +116,7 @@ def _with_paint(options: CaptureOptions, tell: Callable[[str], None]) -> Capture
 
     if options.plane is not None or options.paint is not None:
         return options
-    if not is_unpainted(load_mesh(options.mesh[0], options.mesh_unit)):
+    if not is_unpainted(load_mesh(options.mesh[0], options.mesh_unit, options.body)):
         return options
     anyway = "it is learned in any colour, which takes longer; --paint '#8a6f4c' says which it has"
     if options.background is None:

@@ -27,6 +27,8 @@ class RenderCommand:
     """Mesh file of the objects, or NAME=FILE for each kind of them; a code's world brings its own."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
     """Unit of their coordinates; the file's own, or metres, unless given."""
+    body: str | None = None
+    """Name of the one body of a STEP or IGES file to take, in its own frame; all of them, as placed, unless given."""
     world: str | None = None
     """Generated world that detections are of: its meshes, light and ground."""
     height: int | None = None
@@ -48,14 +50,13 @@ def render(arguments: Sequence[str] | None = None) -> None:
 
 
 def _render(command: RenderCommand) -> int:
-    from curio_train.drawing.album import draw
+    from curio_train.drawing.album import MeshFiles, draw
     from curio_train.drawing.pictures import RenderOptions
 
     options = RenderOptions(
         command.height, command.turn_deg, command.over_photograph, command.path_traced, command.samples
     )
-    for path in draw(
-        command.scenes, command.out, command.mesh, command.mesh_unit, command.world, options, command.format
-    ):
+    meshes = MeshFiles(command.mesh, command.mesh_unit, command.body)
+    for path in draw(command.scenes, command.out, meshes, command.world, options, command.format):
         print(path)
     return 0

@@ -158,7 +158,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_serve.files import direct
 
     from curio_train.commands.finish import end
-    from curio_train.commands.prepare import prepared
+    from curio_train.commands.prepare import prepared, with_kept_meshes
     from curio_train.learning.loop import Outcome
     from curio_train.learning.runs.session import learn
     from curio_train.learning.runs.without_training import draw_templates
@@ -170,6 +170,8 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         or (session.out and direct(session.out))
         or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
     )
+    if not session.resume:
+        config = with_kept_meshes(config, path)
     if config.terms.templates:
         seconds = draw_templates(config, path, session.cache).seconds
         print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")

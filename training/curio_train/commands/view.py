@@ -31,6 +31,8 @@ class ViewCommand:
     """Mesh file of the objects, or NAME=FILE for each kind of them."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
     """Unit of their coordinates; the file's own, or metres, unless given."""
+    body: str | None = None
+    """Name of the one body of a STEP or IGES file to take, in its own frame; all of them, as placed, unless given."""
     out: Path = Path("edited.jsonl")
     """File that the button "save the code" appends to."""
     host: str = "127.0.0.1"
@@ -50,12 +52,12 @@ def view(arguments: Sequence[str] | None = None) -> None:
 def _view(command: ViewCommand) -> int:
     if find_spec("viser") is None:
         raise UsageError("curio-view needs the extra view: pip install 'curio-pose[train,view]'")
+    from curio_train.drawing.album import MeshFiles
     from curio_train.viewing.pages import Opening, newer_pages, open_pages
     from curio_train.viewing.viewer import Viewer
 
-    opening = Opening(
-        command.what, command.mesh, command.mesh_unit, command.model, command.camera, command.cache.expanduser()
-    )
+    meshes = MeshFiles(command.mesh, command.mesh_unit, command.body)
+    opening = Opening(command.what, meshes, command.model, command.camera, command.cache.expanduser())
     viewer = Viewer(open_pages(opening), command.out, command.host, command.port, newer_pages(opening))
     try:
         tell(f"curio-view: http://{command.host}:{command.port}, {_reach(command.host)}; Ctrl-C ends it")

@@ -26,6 +26,8 @@ class Subjects:
     """A mesh file."""
     mesh_unit: Unit | None = None
     """Of its coordinates; the file's own unless given."""
+    body: str | None = None
+    """The one body of a CAD file to look at; all unless given."""
     camera: Path | None = None
     """Camera JSON, or BOP's ``camera.json``."""
     photos: Path | None = None
@@ -55,7 +57,7 @@ def examine_files(subjects: Subjects) -> Iterator[Finding]:
     mesh: Mesh | None = None
     camera: Intrinsics | None = None
     if subjects.mesh is not None:
-        mesh, findings = examine_mesh(subjects.mesh, subjects.mesh_unit)
+        mesh, findings = examine_mesh(subjects.mesh, subjects.mesh_unit, subjects.body)
         yield from findings
     if subjects.camera is not None:
         camera, findings = examine_camera(subjects.camera)
@@ -73,14 +75,14 @@ def examine_files(subjects: Subjects) -> Iterator[Finding]:
         yield from examine_model(subjects.model, mesh, camera)
 
 
-def save_symmetries(mesh: Path, unit: Unit | None, out: Path) -> None:
+def save_symmetries(mesh: Path, unit: Unit | None, body: str | None, out: Path) -> None:
     """Write a mesh's size and symmetries as an entry of BOP's ``models_info.json`` (millimetres), under the number 1.
 
     Raises:
         MeshError: It cannot be read.
         DataError: The file cannot be written.
     """
-    loaded = load_mesh(mesh, unit)
+    loaded = load_mesh(mesh, unit, body)
     low, high = loaded.box_corners_m[0] * 1000, loaded.box_corners_m[-1] * 1000
     entry: dict[str, object] = {"diameter": loaded.diameter_m * 1000}
     for axis, start, size in zip("xyz", low, high - low, strict=True):
@@ -109,8 +111,9 @@ def refuse_unfit(options: CaptureOptions, *, self_training: bool = True) -> list
         DataError: Something is certain not to work; says everything that is.
     """
     first, *others = options.mesh
-    subjects = [Subjects(first, options.mesh_unit, options.camera, options.photos, options.background)]
-    subjects += [Subjects(mesh, options.mesh_unit) for mesh in others]
+    unit, body = options.mesh_unit, options.body
+    subjects = [Subjects(first, unit, body, options.camera, options.photos, options.background)]
+    subjects += [Subjects(mesh, unit, body) for mesh in others]
     found = [finding for subject in subjects for finding in examine_files(subject)]
     found = [finding for finding in found if finding.state != "good" and finding.fault != _HARMLESS]
     if not self_training and options.plane is None:

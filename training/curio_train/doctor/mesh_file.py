@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from curio_train.doctor.finding import Finding, Sureness
 from curio_train.errors import CurioError
+from curio_train.meshes.cad import named
 from curio_train.meshes.meshes import METRES, Mesh, Unit, load_mesh
 from curio_train.meshes.symmetries import Symmetries, find_symmetries
 
@@ -19,20 +20,27 @@ _FARTHEST_CENTRE = 0.5  # of the diameter: then the origin lies outside most sha
 _MOST_FACES = 500_000
 
 
-def examine_mesh(path: Path, unit: Unit | None) -> tuple[Mesh | None, list[Finding]]:
+def examine_mesh(path: Path, unit: Unit | None, body: str | None = None) -> tuple[Mesh | None, list[Finding]]:
     """The mesh, where it can be trained on, and everything remarkable about it."""
     try:
-        mesh = load_mesh(path, unit)
+        mesh = load_mesh(path, unit, body)
     except CurioError as exc:
         fault = "mesh size" if "found a diameter" in str(exc) else "mesh unreadable"
         return None, [Finding("mesh", "bad", str(exc), fault=fault)]
     extent = " x ".join(f"{size * 1000:.4g}" for size in np.ptp(mesh.vertices_m, axis=0))
     text = f"{path}: {len(mesh.faces):,} faces, {extent} mm, diameter {mesh.diameter_m * 1000:.4g} mm"
-    findings = [Finding("mesh", "good", text), *_size(mesh, unit), *_origin(mesh), *_colours(mesh)]
+    findings = [Finding("mesh", "good", text), *_bodies(mesh), *_size(mesh, unit), *_origin(mesh), *_colours(mesh)]
     surface = list(examine_surface(mesh))
     if any(finding.fault == "stray parts" for finding in surface):
         return mesh, [*findings, *surface]  # its diameter is not the object's, and every tolerance is a fraction of it
     return mesh, [*findings, *surface, _symmetries(find_symmetries(mesh))]
+
+
+def _bodies(mesh: Mesh) -> Iterator[Finding]:
+    if len(mesh.bodies) > 1:
+        text = f"{len(mesh.bodies)} bodies were merged into one object: {named(mesh.bodies)}"
+        remedy = "If the object is only one of them, name it with --body"
+        yield Finding("mesh bodies", "warning", text, remedy, "possible", fault="several bodies")
 
 
 def _size(mesh: Mesh, unit: Unit | None) -> Iterator[Finding]:

@@ -1,7 +1,8 @@
 """A file of scenes to a folder of pictures, or of files for 3D applications."""
 
 import importlib.util
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -19,11 +20,22 @@ _PACKAGES = {"usd": "pxr", "rrd": "rerun"}
 _EXTRAS = {"usd": "usd", "rrd": "rerun"}
 
 
+@dataclass(frozen=True)
+class MeshFiles:
+    """The meshes of objects, as on the command line."""
+
+    files: tuple[str, ...] = ()
+    """FILE or NAME=FILE."""
+    unit: Unit | None = None
+    """Of their coordinates; the files' own unless given."""
+    body: str | None = None
+    """The one body of a CAD file to take; all unless given."""
+
+
 def draw(
     scenes: Path,
     out: Path,
-    meshes: Sequence[str],
-    mesh_unit: Unit | None,
+    meshes: MeshFiles,
     world: str | None,
     options: RenderOptions,
     form: Format = "png",
@@ -33,8 +45,7 @@ def draw(
     Args:
         scenes: See :func:`~curio_train.drawing.scenes.read_scenes`.
         out: Folder; made where it is missing.
-        meshes: FILE or NAME=FILE, as on the command line.
-        mesh_unit: Of their coordinates; the file's own unless given.
+        meshes: Of the objects.
         world: Generated world that brings meshes, light and ground; a code names its own.
         options: How to draw pictures.
         form: ``png``: pictures. ``glb`` and ``usd``: objects, light and camera in three dimensions. ``rrd``: one Rerun
@@ -46,11 +57,11 @@ def draw(
         MeshError: A mesh.
         RendererError: No usable libLLVM.
     """
-    if meshes and world:
+    if meshes.files and world:
         raise UsageError("--mesh and --world exclude each other: a world brings its own meshes")
     if form in _PACKAGES and importlib.util.find_spec(_PACKAGES[form]) is None:
         raise UsageError(f"--format {form} needs the extra {_EXTRAS[form]}: pip install 'curio-pose[{_EXTRAS[form]}]'")
-    given = SceneContext.of_world(mesh_world(world)) if world else scene_context(meshes, mesh_unit)
+    given = SceneContext.of_world(mesh_world(world)) if world else scene_context(meshes)
     drawn = _with_context(scenes, given)
     if form == "rrd":
         yield _recorded(out / f"{scenes.stem}.rrd", drawn)
@@ -96,17 +107,21 @@ def scenes_of(file: Path) -> Iterator[Scene]:
     return iter([from_glb(file)]) if file.suffix == ".glb" else read_scenes(file)
 
 
-def scene_context(meshes: Sequence[str], mesh_unit: Unit | None) -> SceneContext | None:
-    """The meshes of objects, given as FILE or NAME=FILE; None if none is given.
+def scene_context(meshes: MeshFiles) -> SceneContext | None:
+    """The meshes of objects; None if none is given.
 
     Raises:
-        UsageError: Two of them have the same name.
+        UsageError: Two of them have the same name, or there is one body for several.
         MeshError: A mesh cannot be read.
     """
-    files = {name if divided else "": Path(file if divided else name) for name, divided, file in map(_parts, meshes)}
-    if len(files) < len(meshes):
-        raise UsageError(f"--mesh {' '.join(meshes)}: expected one FILE, or NAME=FILE with different names")
-    return SceneContext({name: load_mesh(file, mesh_unit) for name, file in files.items()}) if files else None
+    parts = map(_parts, meshes.files)
+    files = {name if divided else "": Path(file if divided else name) for name, divided, file in parts}
+    if len(files) < len(meshes.files):
+        raise UsageError(f"--mesh {' '.join(meshes.files)}: expected one FILE, or NAME=FILE with different names")
+    if meshes.body is not None and len(files) != 1:
+        raise UsageError(f"--body {meshes.body}: expected one --mesh with it, found {len(files)}")
+    loaded = {name: load_mesh(file, meshes.unit, meshes.body) for name, file in files.items()}
+    return SceneContext(loaded) if loaded else None
 
 
 def _parts(text: str) -> tuple[str, str, str]:

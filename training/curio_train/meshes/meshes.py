@@ -3,6 +3,7 @@
 Units are settled here, once: nothing behind :func:`load_mesh` knows millimetres.
 """
 
+import dataclasses
 import hashlib
 import io
 from collections.abc import Mapping
@@ -16,14 +17,15 @@ import numpy as np
 import trimesh
 from curio_serve.files import read_file
 
-from curio_train.errors import MeshError
+from curio_train.errors import MeshError, UsageError
+from curio_train.meshes.cad import CAD_SUFFIXES, read_cad
 from curio_train.meshes.extent import box_corners, diameter
 
 Unit = Literal["m", "cm", "mm", "inch"]
 METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 SMALLEST_M, LARGEST_M = 0.001, 20.0
 MAX_BYTES = 1 << 28  # of a mesh, a material or a texture; in memory a mesh takes eight times that
-SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
+SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off", *CAD_SUFFIXES)
 
 # What trimesh's readers let through on damaged files, found by feeding them such.
 _READER_ERRORS = (
@@ -49,7 +51,9 @@ class Mesh:
     texture: np.ndarray | None = None
     """[height, width, 3] uint8 sRGB, or None."""
     sha256: str = field(default="")
-    """Of the file's bytes; of the arrays' bytes for a generated shape."""
+    """Of the file's bytes; of the arrays' bytes for a generated shape, and of :func:`to_ply`'s for a CAD file."""
+    bodies: tuple[str, ...] = ()
+    """Names of the bodies of a CAD file that it was merged from."""
 
     def __post_init__(self) -> None:
         """Name generated shapes after their content."""
@@ -68,8 +72,8 @@ class Mesh:
         return box_corners(self.vertices_m)
 
 
-def load_mesh(path: Path, unit: Unit | None = None) -> Mesh:
-    """Read a PLY, OBJ, STL, glTF or OFF file; the parts of a glTF scene become one mesh.
+def load_mesh(path: Path, unit: Unit | None = None, body: str | None = None) -> Mesh:
+    """Read a PLY, OBJ, STL, glTF, OFF, STEP or IGES file; parts of a scene and bodies of an assembly become one mesh.
 
     Faces without area are kept: they are part of the file and the renderer passes over them. A colour or factor that
     a material has beside its texture is not applied.
@@ -77,12 +81,18 @@ def load_mesh(path: Path, unit: Unit | None = None) -> Mesh:
     Args:
         path: The file.
         unit: Of its coordinates (``--mesh-unit``). Default: the file's own where it names one (glTF is always in
-            metres), else metres. BOP's PLY files are in "mm" and don't say so.
+            metres), else metres. BOP's PLY files are in "mm" and don't say so. CAD files always name theirs.
+        body: Name of the one body of a CAD file to take (``--body``), in its own frame. Default: all of them.
 
     Raises:
+        UsageError: A unit for a CAD file, a body of a file of another kind, or the extra ``cad`` is not installed.
         MeshError: Missing, empty, no mesh, without faces, broken coordinates or indices, or of impossible size.
     """
     content = _read(path)
+    if path.suffix.lower() in CAD_SUFFIXES:
+        return _from_cad(path, content, unit, body)
+    if body is not None:
+        raise UsageError(f"--body {body}: {path} is no CAD file; expected one of {' '.join(CAD_SUFFIXES)}")
     loaded = _parse(path, content)
     if path.suffix.lower() == ".stl":
         loaded.merge_vertices()  # STL repeats the corners of every triangle
@@ -100,6 +110,46 @@ def load_mesh(path: Path, unit: Unit | None = None) -> Mesh:
     )
     _check_size(path, mesh, read_unit, given=unit is not None)
     return mesh
+
+
+def to_ply(mesh: Mesh) -> bytes:
+    """A PLY file that :func:`load_mesh` reads back to the last bit: vertices in metres, their colours, and faces.
+
+    A texture is left out.
+    """
+    coordinates = [(axis, "<f8") for axis in "xyz"]
+    channels = [] if mesh.vertex_colors_srgb is None else [(name, "u1") for name in ("red", "green", "blue")]
+    vertices = np.zeros(len(mesh.vertices_m), coordinates + channels)
+    for (name, _), values in zip(coordinates, mesh.vertices_m.T, strict=True):
+        vertices[name] = values
+    if mesh.vertex_colors_srgb is not None:
+        for (name, _), values in zip(channels, mesh.vertex_colors_srgb.T, strict=True):
+            vertices[name] = np.round(values * 255)
+    faces = np.zeros(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    header = [
+        *("ply", "format binary_little_endian 1.0", "comment coordinates in metres", f"element vertex {len(vertices)}"),
+        *(f"property double {name}" for name, _ in coordinates),
+        *(f"property uchar {name}" for name, _ in channels),
+        *(f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"),
+    ]
+    return ("\n".join(header) + "\n").encode() + vertices.tobytes() + faces.tobytes()
+
+
+def _from_cad(path: Path, content: bytes, unit: Unit | None, body: str | None) -> Mesh:
+    if unit is not None:
+        raise UsageError(f"--mesh-unit {unit}: {path} is a CAD file, which names its own unit; leave it out")
+    try:
+        merged, bodies = read_cad(path, content, body)
+    except _READER_ERRORS as exc:
+        raise MeshError(f"{path}: what OpenCASCADE made of it is no mesh ({exc}); export it again") from exc
+    _check(path, merged)
+    colors, _, _ = _appearance(path, merged)
+    mesh = Mesh(
+        np.asarray(merged.vertices, np.float64), np.asarray(merged.faces, np.int64), colors, sha256="-", bodies=bodies
+    )
+    _check_size(path, mesh, "m", given=False)
+    return dataclasses.replace(mesh, sha256=hashlib.sha256(to_ply(mesh)).hexdigest())
 
 
 def _read(path: Path) -> bytes:
@@ -177,6 +227,8 @@ def _check_size(path: Path, mesh: Mesh, unit: str, *, given: bool) -> None:
     found = f"{mesh.diameter_m / METRES[unit]:.6g} {unit} = {mesh.diameter_m:.6g} m"
     source = f"--mesh-unit {unit}" if given else f"read as {unit}; the file names no other unit"
     remedy = f"set --mesh-unit to {' or '.join(fitting)}" if fitting else "rescale the mesh"
+    if path.suffix.lower() in CAD_SUFFIXES:
+        source, remedy = "in the file's own unit", "export it again in its true unit"
     raise MeshError(
         f"{path}: found a diameter of {found} ({source}), expected {SMALLEST_M:g} to {LARGEST_M:g} m; {remedy}"
     )

@@ -5,21 +5,20 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from curio_train.data.photographs import read_photograph
-from curio_train.drawing.album import scene_context, scenes_of
+from curio_train.drawing.album import MeshFiles, scene_context, scenes_of
 from curio_train.drawing.pictures import LIGHT, SceneContext
 from curio_train.drawing.scenes import Scene, mesh_world, scene_of_code
 from curio_train.errors import CurioError, DataError, UsageError
 from curio_train.evaluation.subject import load_subject
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE
-from curio_train.meshes.meshes import Unit
 from curio_train.scene_code import index
 from curio_train.worlds import WORLDS
 from curio_train.worlds.base import World
@@ -59,10 +58,8 @@ class Opening:
 
     path: str
     """A result file, a photograph or a folder of them, a run folder, or the name of a generated world."""
-    meshes: tuple[str, ...] = ()
-    """FILE or NAME=FILE, of the objects in a result file."""
-    mesh_unit: Unit | None = None
-    """Of their coordinates; the file's own unless given."""
+    meshes: MeshFiles = field(default_factory=MeshFiles)
+    """Of the objects in a result file."""
     model: str | None = None
     """Model folder or server address that reads photographs."""
     camera: Path | None = None
@@ -153,7 +150,7 @@ def _context(path: Path, world: World) -> SceneContext:
 
 def _of_results(path: Path, opening: Opening) -> list[Page]:
     pages = []
-    given = scene_context(opening.meshes, opening.mesh_unit)
+    given = scene_context(opening.meshes)
     for scene in scenes_of(path):
         context = SceneContext.of_world(mesh_world(scene.world)) if scene.world else given
         if context is None:

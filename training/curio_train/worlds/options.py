@@ -112,7 +112,7 @@ class CaptureOptions(WorldOptions):
     default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     mesh: tuple[Path, ...]
-    """Mesh file: STL, OBJ, PLY, GLB, glTF or OFF; with --plane one for each kind of part."""
+    """Mesh file: STL, OBJ, PLY, GLB, glTF, OFF, STEP or IGES; with --plane one for each kind of part."""
     camera: Path
     """Camera file of the photographs: camera JSON, or BOP's camera.json."""
     photos: Path
@@ -121,6 +121,8 @@ class CaptureOptions(WorldOptions):
     it estimates there itself (--self-training); with --plane from the beginning."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
     """Unit of the mesh file's coordinates; the file's own, or metres, unless given."""
+    body: str | None = None
+    """Name of the one body of a STEP or IGES file to take, in its own frame; all of them, as placed, unless given."""
     background: Path | None = None
     """Photograph of the empty scene, taken as the others were."""
     backgrounds: Path | None = None
@@ -168,6 +170,8 @@ class CaptureOptions(WorldOptions):
             raise UsageError(
                 f"found --near-m {self.near_m:g} and --far-m {self.far_m:g}, expected 0 < near < far, in metres"
             )
+        if self.body is not None and isinstance(self.mesh, tuple) and len(self.mesh) != 1:
+            raise UsageError(f"--body {self.body}: expected one --mesh with it, found {len(self.mesh)}")
         if self.plane is None:
             self._check_without_plane()
         else:

@@ -112,7 +112,7 @@ def build(options: CaptureOptions) -> World:
     if options.plane is not None:
         return build_tabletop(options)
     (file,) = options.mesh
-    mesh, camera = load_mesh(file, options.mesh_unit), load_intrinsics(options.camera)
+    mesh, camera = load_mesh(file, options.mesh_unit, options.body), load_intrinsics(options.camera)
     _refuse_collision(options, mesh)
     if options.paint is not None and not is_unpainted(mesh):
         raise UsageError(f"--paint {options.paint}: {file} has colours of its own; leave it out")

@@ -52,7 +52,7 @@ def build_tabletop(options: CaptureOptions) -> TabletopWorld:
     count_ranges, intrinsics = options.count_ranges, load_intrinsics(options.camera)
     cameras = CameraPoseFile.read(options.plane)
     parts = [
-        _part(load_mesh(file, options.mesh_unit), file.stem, options, *counts)
+        _part(load_mesh(file, options.mesh_unit, options.body), file.stem, options, *counts)
         for file, counts in zip(options.mesh, count_ranges, strict=True)
     ]
     setup = SceneSetup(
