@@ -182,4 +182,4 @@ def test_a_folder_that_cannot_be_made(capsys, lines: Path, egg: Path, tmp_path: 
     (tmp_path / "taken").write_text("a file")
     status, _, err = run(capsys, lines, "--mesh", egg, "--out", tmp_path / "taken")
     assert status == 1
-    assert "the file cannot be written" in err
+    assert "the folder cannot be made" in err
