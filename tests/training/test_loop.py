@@ -1,5 +1,6 @@
 """The loop: every method learns, accumulates, clips, stops, and sees no label it should not see."""
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
