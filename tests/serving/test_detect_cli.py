@@ -25,6 +25,8 @@ def command(*arguments: str | Path) -> list[str]:
 
 def detect(model: Path, *sources: Path | str, **flags: Any) -> int:
     """In this process; returns the exit status."""
+    if flags.get("out") is not None:
+        flags["out"] = str(flags["out"])
     return run(DetectArguments(str(model), tuple(map(str, sources)), **flags))
 
 
@@ -64,7 +66,7 @@ def test_wrong_calls_are_refused_before_anything_is_written(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "flat").symlink_to(models_dir / "flat")
     (tmp_path / "pinhole").symlink_to(models_dir / "pinhole")
-    call = {"model": "flat", "images": ("frames",), "out": Path("out"), **changes}
+    call = {"model": "flat", "images": ("frames",), "out": "out", **changes}
     with pytest.raises(UsageError, match=told):
         run(DetectArguments(**call))
     assert not (tmp_path / "out").exists()

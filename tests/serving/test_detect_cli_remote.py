@@ -21,6 +21,8 @@ K = [[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]]
 
 
 def detect(model: Path | str, *sources: Path, **flags: Any) -> int:
+    if flags.get("out") is not None:
+        flags["out"] = str(flags["out"])
     return run(DetectArguments(str(model), tuple(map(str, sources)), **flags))
 
 

@@ -22,6 +22,8 @@ def detect(request: pytest.FixtureRequest, models_dir: Path) -> Callable[..., in
     where = models_dir if request.param == "local" else request.getfixturevalue("server").address
 
     def call(model: str, *images: Path | str, **flags: Any) -> int:
+        if flags.get("out") is not None:
+            flags["out"] = str(flags["out"])
         return run(DetectArguments(f"{where}/{model}", tuple(map(str, images)), **flags))
 
     return call

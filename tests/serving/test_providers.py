@@ -76,7 +76,7 @@ def test_server_and_command_line_refuse_alike(models_dir: Path, frames: Path) ->
 def test_the_command_line_detects_with_the_provider(models_dir: Path, frames: Path, tmp_path: Path) -> None:
     outs = [tmp_path / "default.jsonl", tmp_path / "named.jsonl"]
     for out, flags in zip(outs, ({}, {"provider": "CPUExecutionProvider"}), strict=True):
-        assert run(DetectArguments(str(models_dir / "flat"), (str(frames),), out=out, **flags)) == 0
+        assert run(DetectArguments(str(models_dir / "flat"), (str(frames),), out=str(out), **flags)) == 0
     found = [[line.split('"milliseconds"')[0] for line in out.read_text().splitlines()] for out in outs]
     assert found[0] == found[1]
     assert len(found[0]) == 6

@@ -87,6 +87,8 @@ def spots(spot_image: Callable[..., np.ndarray]) -> list[np.ndarray]:
 
 
 def detect(model: Path, *sources: Path, **flags: Any) -> int:
+    if flags.get("out") is not None:
+        flags["out"] = str(flags["out"])
     return run(DetectArguments(str(model), tuple(map(str, sources)), **flags))
 
 

@@ -25,7 +25,7 @@ class DetectArguments:
     HOST:PORT/NAME."""
     images: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="IMAGES...")]
     """Files, folders (and those below; of a BOP scene its photographs), globs, videos, recordings (MCAP with ROS 2
-    messages), or - for a list on stdin."""
+    messages), URLs (s3://…, gs://…, https://…; .txt: a list of images), or - for a list on stdin."""
     video: str | None = None
     """Show detections live in the browser instead: a camera's number, a video file, or a URL such as rtsp://…."""
     host: str = "127.0.0.1"
@@ -38,9 +38,9 @@ class DetectArguments:
     """Topic of a recording's images. None: the only one that there is."""
     info_topic: str | None = None
     """Topic of their CameraInfo, which says K unless --camera does. None: camera_info beside the images."""
-    out: Path | None = None
+    out: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """Result file. One that exists is gone on with, where it is of the same model and images. None: stdout. FILE.mcap,
-    for recordings: vision_msgs/Detection3DArray."""
+    for recordings: vision_msgs/Detection3DArray. s3://… and gs://…: a folder of parts."""
     overwrite: bool = False
     """Replace the result file instead."""
     format: Literal["jsonl", "csv", "bop"] = "jsonl"

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import cv2
 
 from curio_serve.batch.formats import ImageLines
+from curio_serve.batch.remote_files import is_url
 from curio_serve.batch.sources import SourceImage
 from curio_serve.errors import CurioError, Unavailable, UsageError
 
@@ -93,8 +94,7 @@ def _check_reachable(address: str) -> None:
 
 def _answers(ray: Any, open_answering: Opening, portion: list[SourceImage]) -> Iterator[ImageLines]:
     num_blocks = max(1, len(portion) // _IMAGES_A_BLOCK)
-    # other nodes have another working folder
-    rows = [{"image": pickle.dumps(replace(image, path=os.path.abspath(image.path)))} for image in portion]
+    rows = [{"image": pickle.dumps(_for_other_nodes(image))} for image in portion]
     num_actors = max(1, int(ray.cluster_resources().get("CPU", 1)))
     answered = ray.data.from_items(rows, override_num_blocks=num_blocks).map(
         _Worker,
@@ -106,3 +106,8 @@ def _answers(ray: Any, open_answering: Opening, portion: list[SourceImage]) -> I
         if isinstance(answer, CurioError):
             raise answer
         yield answer
+
+
+def _for_other_nodes(image: SourceImage) -> SourceImage:
+    """The image by a path that does not depend on the working folder, which is another one there."""
+    return image if is_url(image.path) else replace(image, path=os.path.abspath(image.path))

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from curio_serve.batch.recorded_poses import Detection3DArrays, PoseRecording
     from curio_serve.batch.recordings import Recording
     from curio_serve.batch.result_file import ResultFile
+    from curio_serve.batch.result_parts import ResultParts
     from curio_serve.batch.sources import SourceImage
     from curio_serve.client import PoseClient
 
@@ -64,7 +65,9 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.cluster import over_cluster
     from curio_serve.batch.parallel import in_order
     from curio_serve.batch.progress import Progress
-    from curio_serve.batch.sources import PassedOver, Topics, check_arguments, images
+    from curio_serve.batch.read_ahead import read_ahead
+    from curio_serve.batch.remote_files import is_url
+    from curio_serve.batch.sources import STANDARD_INPUT, PassedOver, Topics, check_arguments, images
     from curio_serve.models.model_check import ChildCheck
 
     models, arguments = _models_first(arguments)
@@ -86,7 +89,9 @@ def run(arguments: DetectArguments) -> int:
     with _output(arguments, form, estimators) as output:
         remaining = output.unanswered(images(arguments.images, passed_over, topics))
         if arguments.ray is None:
-            results = in_order(partial(_answer, estimators, form), remaining, arguments.jobs)
+            may_be_remote = any(name == STANDARD_INPUT or is_url(name) for name in arguments.images)
+            content = read_ahead(remaining) if may_be_remote else remaining
+            results = in_order(partial(_answer, estimators, form), content, arguments.jobs)
         else:  # other nodes have another working folder
             there = [os.path.abspath(model) if os.path.exists(model) else model for model in models]
             results = over_cluster(arguments.ray, partial(_answering, arguments, there, settings), remaining)
@@ -164,10 +169,13 @@ def _settings(arguments: DetectArguments) -> "Settings":
 
 def _check_overlays(folder: Path, images: tuple[str, ...]) -> None:
     """Refuse drawings that would land on the images, or be taken for images by this run or the next."""
+    from curio_serve.batch.remote_files import is_url
     from curio_serve.batch.sources import common_folder
 
     target = Path(os.path.abspath(folder))
     for argument in images:
+        if is_url(argument):
+            continue
         source = common_folder([argument])
         if target == source or (not os.path.isfile(argument) and argument != "-" and target.is_relative_to(source)):
             raise UsageError(f"--overlays {folder} lies within the images' own folder {source}; choose one outside it")
@@ -252,17 +260,22 @@ def _recordings(arguments: DetectArguments) -> "list[Recording]":
 
 def _output(
     arguments: DetectArguments, form: "ResultFormat | Detection3DArrays", estimators: "Sequence[Estimator]"
-) -> "ResultFile | PoseRecording":
+) -> "ResultFile | ResultParts | PoseRecording":
     from curio_serve.batch.formats import ResultFormat
+    from curio_serve.batch.remote_files import is_url
     from curio_serve.batch.result_file import ResultFile
+    from curio_serve.batch.result_parts import ResultParts
 
     if isinstance(form, ResultFormat):
         names = [(estimator.name, estimator.version) for estimator in estimators]
-        return ResultFile(arguments.out, form, names, overwrite=arguments.overwrite)
+        if arguments.out is not None and is_url(arguments.out):
+            return ResultParts(arguments.out, form, names, overwrite=arguments.overwrite)
+        path = None if arguments.out is None else Path(arguments.out)
+        return ResultFile(path, form, names, overwrite=arguments.overwrite)
     from curio_serve.batch.recorded_poses import PoseRecording  # of an extra
 
     assert arguments.out is not None
-    return PoseRecording(arguments.out, overwrite=arguments.overwrite)
+    return PoseRecording(Path(arguments.out), overwrite=arguments.overwrite)
 
 
 def _check_camera(arguments: DetectArguments, estimator: "Estimator", recordings: "list[Recording]") -> None:
@@ -282,7 +295,7 @@ def _format(arguments: DetectArguments, estimators: "Sequence[Estimator]") -> "R
     from curio_serve.batch.formats import Bop, Csv, JsonLines, bop_object_ids
     from curio_serve.batch.sources import is_recording
 
-    if arguments.out is not None and is_recording(str(arguments.out)):
+    if arguments.out is not None and is_recording(arguments.out):
         are_flat = any(not estimator.spec.camera.camera_matrix for estimator in estimators)
         if arguments.format != "jsonl" or not all(map(is_recording, arguments.images)) or are_flat:
             raise UsageError(
@@ -306,7 +319,7 @@ def _format(arguments: DetectArguments, estimators: "Sequence[Estimator]") -> "R
 def _how_to_go_on(arguments: DetectArguments) -> str:
     if arguments.out is None:
         return "Standard output cannot be gone on with; give --out FILE to be able to."
-    if arguments.out.suffix.lower() == ".mcap":
+    if arguments.out.lower().endswith(".mcap"):
         return f"{arguments.out} holds the answers so far; a recording cannot be gone on with, --overwrite replaces it."
     command = [part for part in sys.argv[1:] if part not in ("--overwrite", "--no-overwrite")]
     return f"{arguments.out} holds complete images; to go on: {shlex.join(['curio-detect', *command])}"

@@ -16,6 +16,7 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
+from curio_serve.batch.remote_files import files_of, is_store, is_url, path_of
 from curio_serve.errors import ImageError, UsageError
 from curio_serve.files import check_regular, read_file
 from curio_serve.imaging.camera import PinholeCamera
@@ -25,6 +26,7 @@ from curio_serve.models.model_folder import CONFIG_FILE
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v"})
 RECORDING_SUFFIX = ".mcap"
+LIST_SUFFIX = ".txt"  # of a URL: names of images
 STANDARD_INPUT = "-"
 
 _NAMED = 3  # files passed over that are named; the others are counted
@@ -87,11 +89,14 @@ class SourceImage:
 
         Raises:
             ImageError: The file cannot be read, is no regular file or too large, or there is none.
+            Unavailable: The object store that it lies in does not answer.
         """
         if self.error:
             raise ImageError(self.error)
         if self.data is not None:
             return self.data
+        if is_url(self.path):
+            return files_of(self.path).read(self.path, MAX_FILE_BYTES)
         try:
             return read_file(self.path, MAX_FILE_BYTES)
         except (OSError, ValueError) as exc:  # ValueError: a null byte in the name
@@ -103,6 +108,8 @@ class SourceImage:
         """The path in which a file of its own, such as a drawing, may be kept apart from all others'."""
         if self.recorded is not None:
             return os.path.join(self.path, self.recorded.topic.strip("/"), f"{self.recorded.stamp_ns:019d}.jpg")
+        if is_url(self.path):
+            return path_of(self.path)
         return self.path if self.video_frame is None else os.path.join(self.path, f"{self.video_frame:06d}.jpg")
 
 
@@ -147,10 +154,15 @@ def check_arguments(arguments: Sequence[str]) -> None:
         UsageError: Says which argument.
     """
     if not arguments:
-        raise UsageError("no images given; expected files, folders, globs, videos, or - for a list on standard input")
+        raise UsageError(
+            "no images given; expected files, folders, globs, videos, URLs, or - for a list on standard input"
+        )
     if arguments.count(STANDARD_INPUT) > 1:
         raise UsageError("- was given twice; standard input can be read once")
     for argument in arguments:
+        if is_url(argument):
+            files_of(argument)
+            continue
         if os.path.exists(os.path.join(argument, CONFIG_FILE)):
             raise UsageError(
                 f"{argument} is a model and stands after the images; name all models before the first image"
@@ -176,7 +188,7 @@ def images(
             for line in sys.stdin.buffer:
                 if path := os.fsdecode(line.rstrip(b"\r\n")):
                     yield from _images_at(path, passed_over, topics)
-        elif os.path.exists(argument):
+        elif is_url(argument) or os.path.exists(argument):
             yield from _images_at(argument, passed_over, topics)
         else:
             for path in sorted(glob.iglob(argument, recursive=True)):
@@ -189,7 +201,7 @@ def common_folder(arguments: Sequence[str]) -> Path:
     Raises:
         UsageError: They lie on several of Windows' drives.
     """
-    folders = [os.getcwd() if a == STANDARD_INPUT else _folder_of(os.path.abspath(a)) for a in arguments]
+    folders = [os.getcwd() if a == STANDARD_INPUT or is_url(a) else _folder_of(os.path.abspath(a)) for a in arguments]
     try:
         return Path(os.path.commonpath(folders))
     except ValueError as exc:
@@ -208,20 +220,47 @@ def _has_match(pattern: str) -> bool:
 
 
 def _images_at(path: str, passed_over: PassedOver, topics: Topics) -> Iterator[SourceImage]:
-    if os.path.isdir(path):
-        found = _images_below(path, passed_over)
+    is_folder = _is_remote_folder(path) if is_url(path) else os.path.isdir(path)
+    if is_folder:
+        found = _remote_images(path, passed_over) if is_url(path) else _images_below(path, passed_over)
         first = next(found, None)
         if first is None:
             passed_over.empty_folder(path)
         else:
             yield first
             yield from found
+    elif is_url(path):
+        is_list = _url_suffix(path) == LIST_SUFFIX
+        yield from map(_remote_image, files_of(path).names_in_list(path) if is_list else [path])
     elif PurePath(path).suffix.lower() in VIDEO_SUFFIXES:
         yield from _video_frames(path)
     elif is_recording(path):
         yield from _recorded_images(path, topics)
     else:
         yield SourceImage(path, path)
+
+
+def _is_remote_folder(url: str) -> bool:
+    return is_store(url) and (url.endswith("/") or not _url_suffix(url))
+
+
+def _url_suffix(url: str) -> str:
+    return PurePath(path_of(url)).suffix.lower() if "/" in path_of(url) else ""
+
+
+def _remote_image(url: str) -> SourceImage:
+    if _url_suffix(url) in VIDEO_SUFFIXES | {RECORDING_SUFFIX}:
+        return SourceImage(url, url, error="cannot be read: videos and recordings are read from files; download it")
+    return SourceImage(url, url)
+
+
+def _remote_images(folder: str, passed_over: PassedOver) -> Iterator[SourceImage]:
+    """Image objects of a folder in a store and of those below it, in the order of their keys."""
+    for url in files_of(folder).below(folder.rstrip("/") + "/"):
+        if _url_suffix(url) in IMAGE_SUFFIXES:
+            yield SourceImage(url, url)
+        else:
+            passed_over.file(url)
 
 
 def _images_below(folder: str, passed_over: PassedOver) -> Iterator[SourceImage]:
