@@ -1,0 +1,251 @@
+"""Many images from an object store over a Ray cluster: images a second by workers, and memory over time.
+
+    python benchmarks/scale.py [--json] [--num-files 1000] [--repeats 100] [--minutes 70] [--out FILE]
+
+An S3 server (moto) and the cluster run on this machine, on loopback. The shipped frames of samples/, brightened each in
+its own way, are the files; a list names all of them again and again. Workers are first timed on --num-timed images.
+Then curio-detect --ray answers the whole list, and one worker is killed on the way. Every ten seconds the figures so
+far are written. After --minutes the run is stopped, and the figures are those of the images that it answered.
+"""
+
+import json
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import boto3
+import cv2
+import numpy as np
+import tyro
+from curio_train.learning.runs.provenance import commit, machine
+
+_SAMPLES, _MODEL = Path("samples"), Path("models/ape")
+_NUM_SETTLED = 5000  # images after which memory is taken as the measure
+_SAMPLE_S = 10.0
+_START_S = 60.0
+_MEBIBYTE = 1 << 20
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is measured."""
+
+    json: bool = False
+    """Print the figures as one JSON object on the last line."""
+    num_files: int = 1000
+    """Files in the store."""
+    repeats: int = 100
+    """How often the list names each."""
+    num_timed: int = 1000
+    """Images for the figures of one worker and of two."""
+    minutes: float = 70.0
+    """For the whole list; the run is then stopped."""
+    out: Path = Path("docs/results/scale.json")
+    """Figures so far, while it runs."""
+
+
+def free_port() -> int:
+    """A port of loopback that nobody listens on."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        return int(listening.getsockname()[1])
+
+
+@contextmanager
+def process(*command: str | Path, port: int | None = None) -> Iterator["subprocess.Popen[bytes]"]:
+    """A process in a group of its own, which ends with the block; with a port, once it listens there."""
+    errors = subprocess.DEVNULL if port is not None else None  # servers tell each request
+    call = [*map(str, command)]
+    started = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True)
+    try:
+        if port is not None:
+            _wait_for_port(port)
+        yield started
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(started.pid, signal.SIGTERM)
+        try:
+            started.wait(30)
+        except subprocess.TimeoutExpired:
+            os.killpg(started.pid, signal.SIGKILL)
+            started.wait()
+
+
+def _wait_for_port(port: int) -> None:
+    end = time.monotonic() + _START_S
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=1).close()
+            return
+        except OSError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.2)
+
+
+def fill(options: Options) -> None:
+    """The files and two lists of them: of all, and of those that are timed."""
+    client = boto3.client("s3")
+    client.create_bucket(Bucket="scale")
+    frames = [cv2.imread(str(path)) for path in sorted(_SAMPLES.glob("*.jpg"))]
+    names = [f"{number:06d}.jpg" for number in range(options.num_files)]
+    for number, name in enumerate(names):
+        frame = frames[number % len(frames)]
+        assert frame is not None
+        brighter = np.clip(frame * (0.8 + 0.4 * number / len(names)), 0, 255).astype(np.uint8)
+        client.put_object(Bucket="scale", Key=name, Body=cv2.imencode(".jpg", brighter)[1].tobytes())
+    lists = {"all.txt": names * options.repeats, "timed.txt": (names * options.repeats)[: options.num_timed]}
+    for key, listed in lists.items():
+        client.put_object(Bucket="scale", Key=key, Body="\n".join(listed).encode())
+
+
+@contextmanager
+def detecting(source: str, out: Path, num_workers: int) -> Iterator[tuple["subprocess.Popen[bytes]", int]]:
+    """``curio-detect --ray`` with so many workers, and the process that holds its cluster."""
+    port = free_port()
+    ray = [Path(sys.executable).with_name("ray"), "start", "--head", "--block", f"--port={port}"]
+    ray += ["--node-ip-address=127.0.0.1", f"--num-cpus={num_workers}", "--include-dashboard=false"]
+    program = "from curio_serve.batch.detect_cli import main; main()"
+    detect: list[str | Path] = [sys.executable, "-c", program, _MODEL, source, "--camera", _SAMPLES / "camera.json"]
+    detect += ["--ray", f"127.0.0.1:{port}", "--out", out]
+    with process(*ray, port=port) as cluster, process(*detect) as run:
+        yield run, cluster.pid
+
+
+def count(out: Path) -> int:
+    """Complete lines so far."""
+    return out.read_bytes().count(b"\n") if out.exists() else 0
+
+
+def images_per_second(num_workers: int, folder: Path) -> float:
+    """From the first block of answers to the last, so that the start of the workers does not count."""
+    out = folder / f"timed-{num_workers}.jsonl"
+    with detecting("s3://scale/timed.txt", out, num_workers) as (run, _):
+        counts: dict[int, float] = {}
+        while run.poll() is None:
+            counts.setdefault(count(out), time.monotonic())
+            time.sleep(0.05)
+    (first, started), *_, (last, ended) = [item for item in counts.items() if item[0]]
+    return (last - first) / (ended - started)
+
+
+def tree(*roots: int) -> list[int]:
+    """The processes and all below them."""
+    children: dict[int, list[int]] = {}
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError, ValueError):
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            children.setdefault(parent, []).append(int(entry.name))
+    found = list(roots)
+    for number in found:
+        found += children.get(number, [])
+    return found
+
+
+def resident_mib(processes: list[int]) -> float:
+    """Resident memory, what a process shares with others counted in each."""
+    pages = 0
+    for number in processes:
+        with suppress(OSError):
+            pages += int(Path(f"/proc/{number}/statm").read_text().split()[1])
+    return round(pages * os.sysconf("SC_PAGE_SIZE") / _MEBIBYTE, 1)
+
+
+def kill_worker(processes: list[int]) -> bool:
+    """Kill one of the actors that hold the model."""
+    for number in processes:
+        with suppress(OSError):
+            if b"MapWorker" in Path(f"/proc/{number}/cmdline").read_bytes():
+                os.kill(number, signal.SIGKILL)
+                return True
+    return False
+
+
+def whole_list(options: Options, folder: Path, figures: dict[str, Any]) -> None:
+    """Answers the list, with a worker killed once memory has settled; adds to the figures and writes them."""
+    out = folder / "all.jsonl"
+    memory: list[dict[str, float]] = []
+    started, end = time.monotonic(), time.monotonic() + 60 * options.minutes
+    is_killed = False
+    with detecting("s3://scale/all.txt", out, 2) as (run, cluster):
+        while run.poll() is None and time.monotonic() < end:
+            time.sleep(_SAMPLE_S)
+            if not (num_rows := count(out)):
+                continue
+            processes = tree(cluster, run.pid)
+            sample = {"seconds": round(time.monotonic() - started, 1), "rows": num_rows}
+            memory.append(sample | {"all_mib": resident_mib(processes), "command_mib": resident_mib([run.pid])})
+            if not is_killed and num_rows > min(_NUM_SETTLED, options.num_files * options.repeats / 4):
+                is_killed = kill_worker(processes)
+                figures["killed_after_rows"] = num_rows
+            figures |= {"rows": num_rows, "memory": memory}
+            write(options, figures)
+        is_finished = run.poll() is not None
+        if not is_finished:
+            run.send_signal(signal.SIGTERM)
+            run.wait()
+    figures |= check(out, options) | {"is_finished": is_finished, "worker_killed": is_killed}
+    figures["seconds"] = round(time.monotonic() - started, 1)
+    settled = [sample for sample in memory if sample["rows"] >= _NUM_SETTLED]
+    if settled:
+        for key in ("all_mib", "command_mib"):
+            later = [sample[key] for sample in settled]
+            figures[f"most_{key}_over_that_after_{_NUM_SETTLED}"] = round(max(later) / later[0], 3)
+    write(options, figures)
+
+
+def check(out: Path, options: Options) -> dict[str, int]:
+    """Whether each image of the list, as far as it was answered, has its one row in its place."""
+    with out.open("rb") as lines:
+        names = [json.loads(line)["image"] for line in lines]
+    listed = [f"s3://scale/{number:06d}.jpg" for number in range(options.num_files)] * options.repeats
+    too_many = Counter(names) - Counter(listed[: len(names)])
+    wrong = sum(found != expected for found, expected in zip(names, listed, strict=False))
+    return {"rows": len(names), "rows_of_the_list": len(listed), "rows_wrong": wrong + too_many.total()}
+
+
+def write(options: Options, figures: dict[str, Any]) -> None:
+    """The figures so far."""
+    options.out.write_text(json.dumps(figures) + "\n")
+
+
+def main(options: Options) -> None:
+    port = free_port()
+    os.environ |= {
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
+        "AWS_ACCESS_KEY_ID": "id",
+        "AWS_SECRET_ACCESS_KEY": "key",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_AUTH_MODE": "token",  # the cluster answers to this run alone
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+    }
+    figures: dict[str, Any] = {"machine": machine(), "commit": commit(), "model": str(_MODEL)}
+    figures["load_average_before"] = round(os.getloadavg()[0], 1)
+    moto = Path(sys.executable).with_name("moto_server")
+    with tempfile.TemporaryDirectory() as name, process(moto, "-H", "127.0.0.1", "-p", str(port), port=port):
+        fill(options)
+        figures["images_per_second"] = {}
+        for num_workers in (1, 2):
+            figures["images_per_second"][str(num_workers)] = round(images_per_second(num_workers, Path(name)), 2)
+            write(options, figures)
+        whole_list(options, Path(name), figures)
+    if options.json:
+        print(json.dumps(figures))
+        return
+    print(f"images a second by workers: {figures['images_per_second']}")
+    print(f"rows {figures['rows']} of {figures['rows_of_the_list']}, {figures['rows_wrong']} of them wrong")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
