@@ -113,7 +113,7 @@ def fill(options: Options) -> None:
 def detecting(source: str, out: Path, num_workers: int) -> Iterator[tuple["subprocess.Popen[bytes]", int]]:
     """``curio-detect --ray`` with so many workers, and the process that holds its cluster."""
     port = free_port()
-    ray = [Path(sys.executable).with_name("ray"), "start", "--head", "--block", f"--port={port}"]
+    ray: list[str | Path] = [Path(sys.executable).with_name("ray"), "start", "--head", "--block", f"--port={port}"]
     ray += ["--node-ip-address=127.0.0.1", f"--num-cpus={num_workers}", "--include-dashboard=false"]
     program = "from curio_serve.batch.detect_cli import main; main()"
     detect: list[str | Path] = [sys.executable, "-c", program, _MODEL, source, "--camera", _SAMPLES / "camera.json"]

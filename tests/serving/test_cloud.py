@@ -8,8 +8,10 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -320,3 +322,41 @@ def test_without_the_extra_it_says_what_to_install_and_files_do_without(models_d
     assert "pip install 'curio-pose[cloud]'" in done.stderr
     done = subprocess.run([sys.executable, "-c", blocked, arguments[0], "samples"], capture_output=True, text=True)
     assert len(done.stdout.splitlines()) == 4, done.stderr
+
+
+def workers_below(root: int) -> list[int]:
+    """Ray's actors that hold the model, among the processes below one."""
+    parents, workers = {}, []
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError, ValueError):
+            parents[int(entry.name)] = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            if b"MapWorker" in (entry / "cmdline").read_bytes():
+                workers.append(int(entry.name))
+
+    def is_below(number: int) -> bool:
+        return number == root or (number in parents and is_below(parents[number]))
+
+    return [number for number in workers if is_below(number)]
+
+
+@needs_ray
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are found in /proc")
+def test_a_killed_worker_loses_no_image_of_a_cluster_and_answers_none_twice(
+    models_dir: Path, bucket: Any, tmp_path: Path
+) -> None:
+    names = [f"day/{number // 20}/{number:04d}.png" for number in range(40)] * 50
+    bucket.put_object(Key="list.txt", Body="\n".join(names).encode())
+    out = tmp_path / "poses.jsonl"
+    call = command(models_dir / "flat", "s3://pictures/list.txt", "--out", out, "--ray", "local")
+    with subprocess.Popen(call, stderr=subprocess.PIPE, text=True) as run:
+        while not out.exists() or not out.stat().st_size:
+            assert run.poll() is None, run.communicate()
+            time.sleep(0.02)
+        killed = workers_below(run.pid)[0]
+        os.kill(killed, signal.SIGKILL)
+        assert out.read_bytes().count(b"\n") < len(names)  # it had work left
+        _, told = run.communicate()
+    assert run.returncode == 0, told
+    lines = [json.loads(line) for line in out.read_bytes().splitlines()]
+    assert [line["image"] for line in lines] == [f"s3://pictures/{name}" for name in names]
+    assert all(line["detections"] for line in lines)
