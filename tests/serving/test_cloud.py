@@ -12,7 +12,6 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ import numpy as np
 import pytest
 from curio_serve.batch.remote_files import Patience, RemoteFiles
 from curio_serve.batch.sources import PassedOver, images
-from curio_serve.errors import ImageError, Unavailable, UsageError
+from curio_serve.errors import ImageError, Unavailable
 
 boto3 = pytest.importorskip("boto3", reason="moto is not installed: extra `dev`")
 pytest.importorskip("s3fs", reason="s3fs is not installed: extra `cloud`")
@@ -212,41 +211,6 @@ def test_a_store_that_goes_silent_ends_the_run_and_a_web_server_an_image(
         RemoteFiles("http", HASTY).read(f"{silent}/a.png", MAX_BYTES)
 
 
-@pytest.fixture
-def flaky() -> Iterator[tuple[str, list[str]]]:
-    """A web server that is overloaded twice before each answer, and the paths that it was asked for."""
-    asked: list[str] = []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            asked.append(self.path)
-            status = 404 if "missing" in self.path else 200 if asked.count(self.path) > 2 else 503
-            self.send_response(status)
-            self.send_header("Content-Length", "4")
-            self.end_headers()
-            self.wfile.write(b"good")
-
-        def log_message(self, *_: object) -> None: ...
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}", asked
-    server.shutdown()
-    thread.join()
-    server.server_close()
-
-
-def test_what_fails_for_a_while_is_asked_for_again_and_what_is_missing_once(flaky: tuple[str, list[str]]) -> None:
-    address, asked = flaky
-    files = RemoteFiles("http", HASTY)
-    assert files.read(f"{address}/a.png", MAX_BYTES) == b"good"
-    assert asked == ["/a.png"] * 3
-    with pytest.raises(ImageError, match="No such file"):
-        files.read(f"{address}/missing.png", MAX_BYTES)
-    assert asked.count("/missing.png") == 1
-
-
 def test_parts_joined_are_the_file_of_a_local_run_after_a_stop_and_a_kill(
     models_dir: Path, bucket: Any, tmp_path: Path
 ) -> None:
@@ -304,24 +268,6 @@ def test_parts_of_something_else_and_parts_that_are_missing_are_refused(models_d
     done = detect(models_dir / "flat", "s3://pictures/day/", "--out", there, "--overwrite")
     assert "notes.md, which is no part of results" in done.stderr
     assert joined(bucket, "out/poses.jsonl") == b"mine{}\n"
-
-
-def test_schemes_that_cannot_be_used_are_said(models_dir: Path) -> None:
-    with pytest.raises(UsageError, match="expected s3://, gs://, http:// or https://"):
-        RemoteFiles("ftp")
-    done = detect(models_dir / "flat", "samples", "--out", "https://127.0.0.1/poses.jsonl")
-    assert done.returncode == 2
-    assert "cannot be written; expected a file, s3://" in done.stderr
-
-
-def test_without_the_extra_it_says_what_to_install_and_files_do_without(models_dir: Path) -> None:
-    blocked = "import sys\nfor name in ('fsspec', 's3fs', 'aiohttp'): sys.modules[name] = None\n" + DETECT
-    arguments = [str(models_dir / "flat"), "s3://pictures/day/"]
-    done = subprocess.run([sys.executable, "-c", blocked, *arguments], capture_output=True, text=True)
-    assert done.returncode == 2
-    assert "pip install 'curio-pose[cloud]'" in done.stderr
-    done = subprocess.run([sys.executable, "-c", blocked, arguments[0], "samples"], capture_output=True, text=True)
-    assert len(done.stdout.splitlines()) == 4, done.stderr
 
 
 def workers_below(root: int) -> list[int]:
