@@ -41,7 +41,7 @@ $(READY): pyproject.toml
 	# torch first and then held fast: an open requirement would pull the newest CUDA build.
 	$(BIN)/pip install --quiet $(TORCH)
 	$(BIN)/pip freeze --quiet | grep -E '^torch[ =]' > .venv/torch.txt
-	$(BIN)/pip install --quiet --constraint .venv/torch.txt --editable '.[train,capture,view,usd,rerun,cad,robots,cloud,dev]'
+	$(BIN)/pip install --quiet --constraint .venv/torch.txt --editable '.[train,capture,view,usd,rerun,cad,robots,cloud,hub,dev]'
 	touch $@
 
 demo: $(READY)

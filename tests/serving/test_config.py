@@ -19,10 +19,10 @@ def test_flags_win_over_environment_over_file(tmp_path: Path) -> None:
     environment = {"CURIO_SERVE_PORT": "2", "CURIO_SERVE_QUEUE": "2", "CURIO_SERVE_FULL_DECODE": "true", "HOME": "/x"}
     config = read_config(["--config", str(file), "--queue", "3"], environment)
     assert (config.max_pixels, config.port, config.queue) == (1000, 2, 3)
-    assert config.models == Path("from_file")
+    assert config.models == "from_file"
     assert config.provider == "cuda,cpu"
     assert config.full_decode
-    assert read_config(["given", "--config", str(file)], environment).models == Path("given")
+    assert read_config(["given", "--config", str(file)], environment).models == "given"
     assert read_config([], {"CURIO_SERVE_CONFIG": str(file)}).port == 1
     assert read_config([], {"CURIO_SERVE_PROVIDER": "openvino,cpu"}).provider == "openvino,cpu"
 

@@ -134,7 +134,7 @@ def test_versions_stand_beside_each_other(single: Exported, half: Exported, mode
         "circles/CARD.md", "circles/SHA256SUMS", "circles/config.pbtxt",
     ]  # fmt: skip
     sums = dict(line.split("  ")[::-1] for line in (models / "circles" / "SHA256SUMS").read_text().splitlines())
-    listed = [f"{version}/{file}" for version in (1, 2) for file in ("model.onnx", "weights.safetensors")]
+    listed = [f"{version}/{file}" for version in (1, 2) for file in ("model.onnx", "golden.npz", "weights.safetensors")]
     assert list(sums) == listed
     for file in listed:
         assert sums[file] == hashlib.sha256((models / "circles" / file).read_bytes()).hexdigest()

@@ -21,8 +21,8 @@ class DetectArguments:
     """
 
     model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
-    """Model folder (its latest version), version folder, .onnx file, or folder of models; if no such path, a server's
-    HOST:PORT/NAME."""
+    """Model folder (its latest version), version folder, .onnx file, folder of models, or hf://ORG/NAME[@REVISION] of a
+    hub; if no such path, a server's HOST:PORT/NAME."""
     images: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="IMAGES...")]
     """Files, folders (and those below; of a BOP scene its photographs), globs, videos, recordings (MCAP with ROS 2
     messages), URLs (s3://…, gs://…, https://…; .txt: a list of images), or - for a list on stdin."""

@@ -2,10 +2,12 @@
 
 import os
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
 from curio_serve.errors import UsageError
+from curio_serve.models.hub import fetch, is_on_hub
 from curio_serve.models.model_folder import CONFIG_FILE, MODEL_FILE
 
 SERVED_MODEL = re.compile(r"(?P<address>(?:\[[^\]]+\]|[^/:\[\]]+):\d{1,5})/(?P<model>[^/]+(?:/\d+)?)")
@@ -21,6 +23,7 @@ def split_models(first: str, rest: Sequence[str]) -> tuple[tuple[str, ...], tupl
 
     Raises:
         UsageError: A model is named twice.
+        CurioError: A model on a hub cannot be had.
     """
     count = 0
     while count < len(rest) and _names_models(rest[count]):
@@ -47,11 +50,13 @@ def is_model(path: str) -> bool:
 def _names_models(argument: str) -> bool:
     if os.path.exists(argument):
         return is_model(argument) or bool(_models_in(argument))
-    return SERVED_MODEL.fullmatch(argument) is not None
+    return is_on_hub(argument) or SERVED_MODEL.fullmatch(argument) is not None
 
 
 def _expanded(argument: str) -> list[str]:
-    """The argument, or the models in it where it is a folder of models."""
+    """The argument, or the models in it where it is a folder of models or on a hub."""
+    if is_on_hub(argument):
+        return _models_in(str(fetch(argument, lambda line: print(f"curio-detect: {line}", file=sys.stderr))))
     return [argument] if not os.path.isdir(argument) or is_model(argument) else _models_in(argument) or [argument]
 
 

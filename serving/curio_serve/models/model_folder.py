@@ -22,6 +22,7 @@ from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime
 
 CONFIG_FILE = "config.pbtxt"
 MODEL_FILE = "model.onnx"
+SUMS_FILE = "SHA256SUMS"
 _MAX_TEXT_BYTES = 1 << 20
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _VERSION = re.compile(r"[1-9][0-9]{0,8}")
@@ -99,14 +100,23 @@ def open_model(path: str | Path, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
     return load_version(resolved, found[-1], runtime)
 
 
+def listed_sums(folder: Path) -> dict[str, str]:
+    """SHA-256 in lower case by file, as SHA256SUMS in a model's folder lists them (``sha256sum``'s format).
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    text = read_file(folder / SUMS_FILE, _MAX_TEXT_BYTES).decode("utf-8", errors="replace")
+    lines = (line.split(maxsplit=1) for line in text.splitlines())
+    return {parts[1].strip().lstrip("*").removeprefix("./"): parts[0].lower() for parts in lines if len(parts) == 2}
+
+
 def _check_sum(folder: Path, file: str, sha256: str) -> None:
-    """Compare with SHA256SUMS (``sha256sum``'s format), if the folder has one."""
-    sums = folder / "SHA256SUMS"
+    """Compare with SHA256SUMS, if the folder has one."""
+    sums = folder / SUMS_FILE
     if not sums.exists():
         return
-    text = read_file(sums, _MAX_TEXT_BYTES).decode("utf-8", errors="replace")
-    lines = (line.split(maxsplit=1) for line in text.splitlines())
-    expected = {parts[1].strip().lstrip("*").removeprefix("./"): parts[0].lower() for parts in lines if len(parts) == 2}
+    expected = listed_sums(folder)
     if file not in expected:
         raise ModelError(f"{sums} does not list {file}; it lists {sorted(expected)}. Export again, or add its line")
     if expected[file] != sha256:

@@ -24,8 +24,8 @@ class ServeConfig:
     (max_pixels). Flags win over the environment, the environment over the file.
     """
 
-    models: Annotated[Path, tyro.conf.Positional] = Path("models")
-    """Folder of models: <name>/<version>/model.onnx, as curio-export writes it."""
+    models: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[MODELS]")] = "models"
+    """Folder of models, <name>/<version>/model.onnx as curio-export writes it, or hf://ORG/NAME[@REVISION] of a hub."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 for all interfaces."""
     port: int = 8500

@@ -4,6 +4,7 @@ import logging
 import os
 import signal
 import sys
+from dataclasses import replace
 
 from curio_serve.errors import CurioError
 from curio_serve.server.config import ServeConfig, read_config, to_toml
@@ -33,10 +34,14 @@ def _serve(config: ServeConfig) -> None:
     # gRPC's own stderr lines say again, and less clearly, what our messages say.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     # Imported here, so that --help need not wait for gRPC and OpenCV.
+    from curio_serve.models.hub import fetch, is_on_hub
     from curio_serve.server.server import PoseServer
 
     lines = start_logging(config.log_level)
     try:
+        if is_on_hub(config.models):
+            folder = fetch(config.models, lambda line: log(logging.WARNING, "hub is out of reach", reason=line))
+            config = replace(config, models=str(folder))
         server = PoseServer(config)
         for number in STOP_SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup sets it

@@ -5,6 +5,7 @@ import logging
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import cv2
 import grpc
@@ -52,7 +53,7 @@ class PoseServer:
         self._metrics = Metrics(registry)
         providers = read_providers(config.provider)
         batch = config.batch or (1 if on_processor(providers) else _DEVICE_BATCH)
-        self._repository = Repository(config.models, config.versions, Runtime(providers, batch))
+        self._repository = Repository(Path(config.models), config.versions, Runtime(providers, batch))
         # Calls that wait for a batch leave their core to others, which decode meanwhile.
         workers = config.workers or num_cores() + (batch if batch > 1 else 0)
         self._reception = Reception(_reception_limits(config))

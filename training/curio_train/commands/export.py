@@ -1,5 +1,6 @@
 """The command ``curio-export``. Heavy packages are imported only once its arguments are understood."""
 
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from curio_train.commands.field_help import parsed
 from curio_train.commands.running import CACHE, answer
-from curio_train.errors import UsageError
+from curio_train.errors import CurioError, UsageError
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class ExportCommand:
     """Write a run's network as the next version of a model that any ONNX runtime can serve."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The run folder. Its training images are not needed."""
+    """The run folder; its training images are not needed. With --push also a model's folder, such as models/ape."""
     out: Path = Path("models")
     """Folder of models; the model goes to OUT/NAME/VERSION/model.onnx."""
     name: str | None = None
@@ -30,6 +31,10 @@ class ExportCommand:
     """Convolutions in int8: a third of the size, and faster. Draws renderings; refused if accuracy falls by a point."""
     cache: Path = CACHE
     """Where image sets that a world draws once are kept, for --int8."""
+    push: Annotated[str | None, arg(metavar="ORG/NAME")] = None
+    """Put the model on a Hugging Face hub, where hf://ORG/NAME names it. A new repository is private."""
+    license: str | None = None
+    """Licence on the hub's card, as the hub spells it, such as apache-2.0. None: the mesh's, if the card names one."""
 
 
 def export(arguments: Sequence[str] | None = None) -> None:
@@ -41,6 +46,32 @@ def export(arguments: Sequence[str] | None = None) -> None:
 def _export(command: ExportCommand) -> int:
     if command.half and command.int8:
         raise UsageError("--half and --int8 are two ways to store the same weights; give one of them")
+    if command.push is None:
+        if command.license is not None:
+            raise UsageError("--license is for the hub's card: give it together with --push")
+        _write(command)
+        return 0
+    from curio_train.export.folder import ModelFolder
+    from curio_train.export.hub import check_repository, push
+
+    check_repository(command.push)
+    is_written = bool(ModelFolder(command.run).versions())
+    if is_written and (command.half or command.int8 or command.name is not None):
+        raise UsageError(f"{command.run} is a model and pushed as it is; --half, --int8 and --name are for run folders")
+    folder = command.run if is_written else _write(command).parent
+    try:
+        with Console(stderr=True).status(f"pushing {folder}"):
+            print(push(folder, command.push, command.license))
+    except CurioError as exc:
+        if is_written:
+            raise
+        again = shlex.join(["curio-export", str(folder), "--push", command.push])
+        raise type(exc)(f"{exc}\n{folder} was written; to push it again: {again}") from exc
+    return 0
+
+
+def _write(command: ExportCommand) -> Path:
+    """Write the next version of the model, and print what it is."""
     from curio_train.evaluation.int8 import int8
     from curio_train.export.graph import export
 
@@ -53,4 +84,4 @@ def _export(command: ExportCommand) -> int:
     )
     if command.int8:
         print(f"{done.weights}; outputs differ by at most {done.rounding_error:.2g} on the check images")
-    return 0
+    return done.path

@@ -4,7 +4,7 @@
 
     OUT/NAME/config.pbtxt        the tensors, the same for all versions
              CARD.md             where each version comes from, newest first
-             SHA256SUMS          of every model.onnx and weights.safetensors
+             SHA256SUMS          of every model.onnx, golden.npz and weights.safetensors
              1/  2/  …           versions; none is ever overwritten
                  model.onnx           what is served
                  golden.npz           an image and its outputs, which a server asks again before it serves the version
@@ -19,13 +19,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from curio_serve.models.model_folder import MODEL_FILE, is_model_name, versions
+from curio_serve.models.golden import GOLDEN_FILE
+from curio_serve.models.model_folder import CONFIG_FILE, MODEL_FILE, SUMS_FILE, is_model_name, versions
 
 from curio_train.errors import ExportError, UsageError
 from curio_train.exported_model import WEIGHTS_FILE
 
-_CONFIG, _CARD, _SUMS = "config.pbtxt", "CARD.md", "SHA256SUMS"
-_LISTED = (MODEL_FILE, WEIGHTS_FILE)
+_CARD = "CARD.md"
+_LISTED = (MODEL_FILE, GOLDEN_FILE, WEIGHTS_FILE)
 _MAX_BATCH_SIZE = 64
 
 
@@ -64,6 +65,19 @@ class ModelFolder:
         """The number after the largest."""
         return max(self.versions(), default=0) + 1
 
+    def files(self) -> list[Path]:
+        """All files of the model that are there."""
+        of_versions = [self.path / str(version) / name for version in self.versions() for name in _LISTED]
+        return [
+            file
+            for file in (*(self.path / name for name in (CONFIG_FILE, _CARD, SUMS_FILE)), *of_versions)
+            if file.is_file()
+        ]
+
+    def card(self) -> str:
+        """Where each version comes from, in Markdown; empty where there is no card."""
+        return _text(self.path / _CARD)
+
     def refuse_other_tensors(self, config: str) -> None:
         """Make sure that a version with these tensors may stand beside those that are there.
 
@@ -73,7 +87,7 @@ class ModelFolder:
         Raises:
             ExportError: It may not.
         """
-        path = self.path / _CONFIG
+        path = self.path / CONFIG_FILE
         if path.exists() and path.read_text(encoding="utf-8") != config:
             raise ExportError(
                 f"{self.path} holds a model with other inputs or outputs (see {path}); versions of one model must "
@@ -110,10 +124,10 @@ class ModelFolder:
     def _add_version(self, draft: Path, target: Path, files: Mapping[str, bytes], card: str) -> None:
         """Beside earlier versions: first what speaks of it, at last the version itself, by one rename."""
         _write(draft, files)
-        others = [line for line in _text(self.path / _SUMS).splitlines() if f"  {target.name}/" not in line]
+        others = [line for line in _text(self.path / SUMS_FILE).splitlines() if f"  {target.name}/" not in line]
         sums = "".join(f"{line}\n" for line in others) + _sums(target.name, files)
         title, _, earlier = _text(self.path / _CARD).partition("\n\n")
-        _replace(self.path / _SUMS, sums)
+        _replace(self.path / SUMS_FILE, sums)
         draft.rename(target)
         _replace(self.path / _CARD, f"{title or _title(self.path.name)}\n\n{card}\n{earlier}")
 
@@ -149,8 +163,8 @@ def _draft(folder: Path) -> Iterator[Path]:
 def _fill(folder: Path, name: str, version: int, files: Mapping[str, bytes], card: str, config: str) -> None:
     (folder / str(version)).mkdir()
     _write(folder / str(version), files)
-    (folder / _CONFIG).write_text(config, encoding="utf-8")
-    (folder / _SUMS).write_text(_sums(str(version), files), encoding="utf-8")
+    (folder / CONFIG_FILE).write_text(config, encoding="utf-8")
+    (folder / SUMS_FILE).write_text(_sums(str(version), files), encoding="utf-8")
     (folder / _CARD).write_text(f"{_title(name)}\n\n{card}", encoding="utf-8")
 
 
