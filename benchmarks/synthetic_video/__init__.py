@@ -1,0 +1,1 @@
+"""Rendered video sequences with truth: what following and several cameras are tested and measured with."""
