@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n$curio_proto/files/onnx_outline.proto\x12\x0b\x63urio.files\"\xc5\x01\n\tOnnxModel\x12%\n\x05graph\x18\x07 \x01(\x0b\x32\x16.curio.files.OnnxGraph\x12\x31\n\x0emetadata_props\x18\x0e \x03(\x0b\x32\x19.curio.files.OnnxProperty\x12\x30\n\rtraining_info\x18\x14 \x03(\x0b\x32\x19.curio.files.OnnxTraining\x12,\n\tfunctions\x18\x19 \x03(\x0b\x32\x19.curio.files.OnnxFunction\"*\n\x0cOnnxProperty\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\t\"\x99\x01\n\tOnnxGraph\x12#\n\x04node\x18\x01 \x03(\x0b\x32\x15.curio.files.OnnxNode\x12,\n\x0binitializer\x18\x05 \x03(\x0b\x32\x17.curio.files.OnnxTensor\x12\x39\n\x12sparse_initializer\x18\x0f \x03(\x0b\x32\x1d.curio.files.OnnxSparseTensor\"9\n\x08OnnxNode\x12-\n\tattribute\x18\x05 \x03(\x0b\x32\x1a.curio.files.OnnxAttribute\"\x95\x02\n\rOnnxAttribute\x12\"\n\x01t\x18\x05 \x01(\x0b\x32\x17.curio.files.OnnxTensor\x12!\n\x01g\x18\x06 \x01(\x0b\x32\x16.curio.files.OnnxGraph\x12(\n\x07tensors\x18\n \x03(\x0b\x32\x17.curio.files.OnnxTensor\x12&\n\x06graphs\x18\x0b \x03(\x0b\x32\x16.curio.files.OnnxGraph\x12\x34\n\rsparse_tensor\x18\x16 \x01(\x0b\x32\x1d.curio.files.OnnxSparseTensor\x12\x35\n\x0esparse_tensors\x18\x17 \x03(\x0b\x32\x1d.curio.files.OnnxSparseTensor\"c\n\nOnnxTensor\x12\x0c\n\x04name\x18\x08 \x01(\t\x12\x30\n\rexternal_data\x18\r \x03(\x0b\x32\x19.curio.files.OnnxProperty\x12\x15\n\rdata_location\x18\x0e \x01(\x05\"e\n\x10OnnxSparseTensor\x12\'\n\x06values\x18\x01 \x01(\x0b\x32\x17.curio.files.OnnxTensor\x12(\n\x07indices\x18\x02 \x01(\x0b\x32\x17.curio.files.OnnxTensor\"h\n\x0cOnnxFunction\x12#\n\x04node\x18\x07 \x03(\x0b\x32\x15.curio.files.OnnxNode\x12\x33\n\x0f\x61ttribute_proto\x18\x0b \x03(\x0b\x32\x1a.curio.files.OnnxAttribute\"i\n\x0cOnnxTraining\x12.\n\x0einitialization\x18\x01 \x01(\x0b\x32\x16.curio.files.OnnxGraph\x12)\n\talgorithm\x18\x02 \x01(\x0b\x32\x16.curio.files.OnnxGraphb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n$curio_proto/files/onnx_outline.proto\x12\x0b\x63urio.files\"\xc5\x01\n\tOnnxModel\x12%\n\x05graph\x18\x07 \x01(\x0b\x32\x16.curio.files.OnnxGraph\x12\x31\n\x0emetadata_props\x18\x0e \x03(\x0b\x32\x19.curio.files.OnnxProperty\x12\x30\n\rtraining_info\x18\x14 \x03(\x0b\x32\x19.curio.files.OnnxTraining\x12,\n\tfunctions\x18\x19 \x03(\x0b\x32\x19.curio.files.OnnxFunction\"*\n\x0cOnnxProperty\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\t\"\xe8\x01\n\tOnnxGraph\x12#\n\x04node\x18\x01 \x03(\x0b\x32\x15.curio.files.OnnxNode\x12,\n\x0binitializer\x18\x05 \x03(\x0b\x32\x17.curio.files.OnnxTensor\x12%\n\x05input\x18\x0b \x03(\x0b\x32\x16.curio.files.OnnxValue\x12&\n\x06output\x18\x0c \x03(\x0b\x32\x16.curio.files.OnnxValue\x12\x39\n\x12sparse_initializer\x18\x0f \x03(\x0b\x32\x1d.curio.files.OnnxSparseTensor\">\n\tOnnxValue\x12\x0c\n\x04name\x18\x01 \x01(\t\x12#\n\x04type\x18\x02 \x01(\x0b\x32\x15.curio.files.OnnxType\"<\n\x08OnnxType\x12\x30\n\x0btensor_type\x18\x01 \x01(\x0b\x32\x1b.curio.files.OnnxTensorType\"#\n\x0eOnnxTensorType\x12\x11\n\telem_type\x18\x01 \x01(\x05\"X\n\x08OnnxNode\x12\r\n\x05input\x18\x01 \x03(\t\x12\x0e\n\x06output\x18\x02 \x03(\t\x12-\n\tattribute\x18\x05 \x03(\x0b\x32\x1a.curio.files.OnnxAttribute\"\x95\x02\n\rOnnxAttribute\x12\"\n\x01t\x18\x05 \x01(\x0b\x32\x17.curio.files.OnnxTensor\x12!\n\x01g\x18\x06 \x01(\x0b\x32\x16.curio.files.OnnxGraph\x12(\n\x07tensors\x18\n \x03(\x0b\x32\x17.curio.files.OnnxTensor\x12&\n\x06graphs\x18\x0b \x03(\x0b\x32\x16.curio.files.OnnxGraph\x12\x34\n\rsparse_tensor\x18\x16 \x01(\x0b\x32\x1d.curio.files.OnnxSparseTensor\x12\x35\n\x0esparse_tensors\x18\x17 \x03(\x0b\x32\x1d.curio.files.OnnxSparseTensor\"c\n\nOnnxTensor\x12\x0c\n\x04name\x18\x08 \x01(\t\x12\x30\n\rexternal_data\x18\r \x03(\x0b\x32\x19.curio.files.OnnxProperty\x12\x15\n\rdata_location\x18\x0e \x01(\x05\"e\n\x10OnnxSparseTensor\x12\'\n\x06values\x18\x01 \x01(\x0b\x32\x17.curio.files.OnnxTensor\x12(\n\x07indices\x18\x02 \x01(\x0b\x32\x17.curio.files.OnnxTensor\"h\n\x0cOnnxFunction\x12#\n\x04node\x18\x07 \x03(\x0b\x32\x15.curio.files.OnnxNode\x12\x33\n\x0f\x61ttribute_proto\x18\x0b \x03(\x0b\x32\x1a.curio.files.OnnxAttribute\"i\n\x0cOnnxTraining\x12.\n\x0einitialization\x18\x01 \x01(\x0b\x32\x16.curio.files.OnnxGraph\x12)\n\talgorithm\x18\x02 \x01(\x0b\x32\x16.curio.files.OnnxGraphb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -36,17 +36,23 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_ONNXPROPERTY']._serialized_start=253
   _globals['_ONNXPROPERTY']._serialized_end=295
   _globals['_ONNXGRAPH']._serialized_start=298
-  _globals['_ONNXGRAPH']._serialized_end=451
-  _globals['_ONNXNODE']._serialized_start=453
-  _globals['_ONNXNODE']._serialized_end=510
-  _globals['_ONNXATTRIBUTE']._serialized_start=513
-  _globals['_ONNXATTRIBUTE']._serialized_end=790
-  _globals['_ONNXTENSOR']._serialized_start=792
-  _globals['_ONNXTENSOR']._serialized_end=891
-  _globals['_ONNXSPARSETENSOR']._serialized_start=893
-  _globals['_ONNXSPARSETENSOR']._serialized_end=994
-  _globals['_ONNXFUNCTION']._serialized_start=996
-  _globals['_ONNXFUNCTION']._serialized_end=1100
-  _globals['_ONNXTRAINING']._serialized_start=1102
-  _globals['_ONNXTRAINING']._serialized_end=1207
+  _globals['_ONNXGRAPH']._serialized_end=530
+  _globals['_ONNXVALUE']._serialized_start=532
+  _globals['_ONNXVALUE']._serialized_end=594
+  _globals['_ONNXTYPE']._serialized_start=596
+  _globals['_ONNXTYPE']._serialized_end=656
+  _globals['_ONNXTENSORTYPE']._serialized_start=658
+  _globals['_ONNXTENSORTYPE']._serialized_end=693
+  _globals['_ONNXNODE']._serialized_start=695
+  _globals['_ONNXNODE']._serialized_end=783
+  _globals['_ONNXATTRIBUTE']._serialized_start=786
+  _globals['_ONNXATTRIBUTE']._serialized_end=1063
+  _globals['_ONNXTENSOR']._serialized_start=1065
+  _globals['_ONNXTENSOR']._serialized_end=1164
+  _globals['_ONNXSPARSETENSOR']._serialized_start=1166
+  _globals['_ONNXSPARSETENSOR']._serialized_end=1267
+  _globals['_ONNXFUNCTION']._serialized_start=1269
+  _globals['_ONNXFUNCTION']._serialized_end=1373
+  _globals['_ONNXTRAINING']._serialized_start=1375
+  _globals['_ONNXTRAINING']._serialized_end=1480
 # @@protoc_insertion_point(module_scope)

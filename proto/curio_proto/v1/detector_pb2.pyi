@@ -77,7 +77,7 @@ class Region(_message.Message):
     def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., width: _Optional[float] = ..., height: _Optional[float] = ...) -> None: ...
 
 class DetectRequest(_message.Message):
-    __slots__ = ("request_id", "models", "encoded", "raw", "camera", "regions", "min_confidence", "max_detections", "apply_exif_rotation")
+    __slots__ = ("request_id", "models", "encoded", "raw", "camera", "regions", "min_confidence", "max_detections", "apply_exif_rotation", "track")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     MODELS_FIELD_NUMBER: _ClassVar[int]
     ENCODED_FIELD_NUMBER: _ClassVar[int]
@@ -87,6 +87,7 @@ class DetectRequest(_message.Message):
     MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     MAX_DETECTIONS_FIELD_NUMBER: _ClassVar[int]
     APPLY_EXIF_ROTATION_FIELD_NUMBER: _ClassVar[int]
+    TRACK_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     models: _containers.RepeatedCompositeFieldContainer[ModelSelector]
     encoded: bytes
@@ -96,10 +97,25 @@ class DetectRequest(_message.Message):
     min_confidence: float
     max_detections: int
     apply_exif_rotation: bool
-    def __init__(self, request_id: _Optional[str] = ..., models: _Optional[_Iterable[_Union[ModelSelector, _Mapping]]] = ..., encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., regions: _Optional[_Iterable[_Union[Region, _Mapping]]] = ..., min_confidence: _Optional[float] = ..., max_detections: _Optional[int] = ..., apply_exif_rotation: bool = ...) -> None: ...
+    track: Tracking
+    def __init__(self, request_id: _Optional[str] = ..., models: _Optional[_Iterable[_Union[ModelSelector, _Mapping]]] = ..., encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., regions: _Optional[_Iterable[_Union[Region, _Mapping]]] = ..., min_confidence: _Optional[float] = ..., max_detections: _Optional[int] = ..., apply_exif_rotation: bool = ..., track: _Optional[_Union[Tracking, _Mapping]] = ...) -> None: ...
+
+class Tracking(_message.Message):
+    __slots__ = ("time_s", "keep_s", "num_objects", "search", "restart")
+    TIME_S_FIELD_NUMBER: _ClassVar[int]
+    KEEP_S_FIELD_NUMBER: _ClassVar[int]
+    NUM_OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    SEARCH_FIELD_NUMBER: _ClassVar[int]
+    RESTART_FIELD_NUMBER: _ClassVar[int]
+    time_s: float
+    keep_s: float
+    num_objects: int
+    search: bool
+    restart: bool
+    def __init__(self, time_s: _Optional[float] = ..., keep_s: _Optional[float] = ..., num_objects: _Optional[int] = ..., search: bool = ..., restart: bool = ...) -> None: ...
 
 class Detection(_message.Message):
-    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range")
+    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range", "track")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     TRANSLATION_M_FIELD_NUMBER: _ClassVar[int]
@@ -109,6 +125,7 @@ class Detection(_message.Message):
     COLOR_FIELD_NUMBER: _ClassVar[int]
     BOX_PX_FIELD_NUMBER: _ClassVar[int]
     OUTSIDE_TRAINED_RANGE_FIELD_NUMBER: _ClassVar[int]
+    TRACK_FIELD_NUMBER: _ClassVar[int]
     object: str
     confidence: float
     translation_m: _containers.RepeatedScalarFieldContainer[float]
@@ -118,7 +135,32 @@ class Detection(_message.Message):
     color: _containers.RepeatedScalarFieldContainer[float]
     box_px: _containers.RepeatedScalarFieldContainer[float]
     outside_trained_range: bool
-    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ...) -> None: ...
+    track: Track
+    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ..., track: _Optional[_Union[Track, _Mapping]] = ...) -> None: ...
+
+class Track(_message.Message):
+    __slots__ = ("track_id", "age_s", "unseen_s", "predicted", "translation_m", "rotation", "quaternion_xyzw", "velocity_m_s", "position_std_m", "rotation_std_rad")
+    TRACK_ID_FIELD_NUMBER: _ClassVar[int]
+    AGE_S_FIELD_NUMBER: _ClassVar[int]
+    UNSEEN_S_FIELD_NUMBER: _ClassVar[int]
+    PREDICTED_FIELD_NUMBER: _ClassVar[int]
+    TRANSLATION_M_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    QUATERNION_XYZW_FIELD_NUMBER: _ClassVar[int]
+    VELOCITY_M_S_FIELD_NUMBER: _ClassVar[int]
+    POSITION_STD_M_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_STD_RAD_FIELD_NUMBER: _ClassVar[int]
+    track_id: int
+    age_s: float
+    unseen_s: float
+    predicted: bool
+    translation_m: _containers.RepeatedScalarFieldContainer[float]
+    rotation: _containers.RepeatedScalarFieldContainer[float]
+    quaternion_xyzw: _containers.RepeatedScalarFieldContainer[float]
+    velocity_m_s: _containers.RepeatedScalarFieldContainer[float]
+    position_std_m: _containers.RepeatedScalarFieldContainer[float]
+    rotation_std_rad: float
+    def __init__(self, track_id: _Optional[int] = ..., age_s: _Optional[float] = ..., unseen_s: _Optional[float] = ..., predicted: bool = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., velocity_m_s: _Optional[_Iterable[float]] = ..., position_std_m: _Optional[_Iterable[float]] = ..., rotation_std_rad: _Optional[float] = ...) -> None: ...
 
 class RegionResult(_message.Message):
     __slots__ = ("model", "model_version", "region", "status", "detections", "light")

@@ -22,6 +22,7 @@ from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.repository import Repository
 from curio_serve.telemetry import Metrics
+from curio_serve.tracking.stream import FollowingStream
 
 Context = grpc.ServicerContext
 _MAX_ID_LENGTH = 128
@@ -62,11 +63,11 @@ class PoseService(PoseDetectorServicer):
         self, requests: Iterator[messages.DetectRequest], context: Context
     ) -> Iterator[messages.DetectResponse]:
         with self._calls.record("DetectStream", context):
-            stream = self._streams.open(context)
+            stream, following = self._streams.open(context), FollowingStream()
             # One frame of a stream at a time: the next is read when this one is answered, so the client feels the load.
             for request in requests:
                 stream.works()
-                yield self._frame_of_stream(request, context)
+                yield self._frame_of_stream(request, following, context)
                 stream.waits()
 
     def ListModels(self, request: messages.ListModelsRequest, context: Context) -> messages.ListModelsResponse:
@@ -78,14 +79,16 @@ class PoseService(PoseDetectorServicer):
             model = self._repository.get(request.model.name, request.model.version)
             return messages.GetModelResponse(spec=model.spec, version=model.version)
 
-    def _frame_of_stream(self, request: messages.DetectRequest, context: Context) -> messages.DetectResponse:
+    def _frame_of_stream(
+        self, request: messages.DetectRequest, following: FollowingStream, context: Context
+    ) -> messages.DetectResponse:
         """One frame's answer, or its error; only the end of the call ends the stream."""
         try:
             with self._calls.record("DetectStream.frame", context) as call:
                 call.request_id = request.request_id
                 detectors = self._detectors(request)
                 with self._work.slot(context, always=True) as waited_s:
-                    return self._detect(request, detectors, waited_s, context)
+                    return self._detect(request, detectors, waited_s, context, following)
         except CallEnded:
             raise
         except CurioError as exc:
@@ -101,9 +104,14 @@ class PoseService(PoseDetectorServicer):
         return answer
 
     def _detect(
-        self, request: messages.DetectRequest, detectors: list[Detector], waited_s: float, context: Context
+        self,
+        request: messages.DetectRequest,
+        detectors: list[Detector],
+        waited_s: float,
+        context: Context,
+        following: FollowingStream | None = None,
     ) -> messages.DetectResponse:
-        """Decode a request's frame and run the models on it.
+        """Decode a request's frame and run the models on it, or follow their objects in a stream.
 
         Raises:
             CallEnded: The deadline passed, or the client or the server ended the call, before the last run.
@@ -115,20 +123,34 @@ class PoseService(PoseDetectorServicer):
         camera = camera_from_message(request.camera) if request.HasField("camera") else None
         regions = list(map(region_from_message, request.regions))
         min_confidence = request.min_confidence if request.HasField("min_confidence") else limits.min_confidence
+        if request.HasField("track"):
+            _check_following(request, following).check(request.track)
         frame, camera = _decode(request, camera, detectors, limits)
         decoded = time.perf_counter()
-        answer = messages.DetectResponse()
-        for detector in detectors:
-            detector.detect(
+        answer, before_run = messages.DetectResponse(), partial(check_is_wanted, context)
+        if request.HasField("track"):
+            _check_following(request, following).follow(
+                request.track,
+                detectors,
                 frame.pixels,
                 camera,
-                regions=regions,
                 min_confidence=min_confidence,
-                max_detections=request.max_detections or None,
                 reduction=frame.reduction,
                 results=answer.results,
-                before_run=partial(check_is_wanted, context),
+                before_run=before_run,
             )
+        else:
+            for detector in detectors:
+                detector.detect(
+                    frame.pixels,
+                    camera,
+                    regions=regions,
+                    min_confidence=min_confidence,
+                    max_detections=request.max_detections or None,
+                    reduction=frame.reduction,
+                    results=answer.results,
+                    before_run=before_run,
+                )
         inferred = time.perf_counter()
         # Only now: what writes messages has gone cold by the time that a network has run.
         answer.request_id = request.request_id or new_request_id()
@@ -163,6 +185,19 @@ class PoseService(PoseDetectorServicer):
         if len(set(found)) < len(found):
             raise ArgumentError("models names a model more than once; expected each once")
         return list(map(Detector, found))
+
+
+def _check_following(request: messages.DetectRequest, following: FollowingStream | None) -> FollowingStream:
+    """The stream's memory.
+
+    Raises:
+        ArgumentError: The request is none of a stream, or asks for what is not for following.
+    """
+    if following is None:
+        raise ArgumentError("track is set in a single call; objects are followed in DetectStream")
+    if request.regions or request.HasField("max_detections"):
+        raise ArgumentError("regions and max_detections are not for following; leave them out, or leave out track")
+    return following
 
 
 def new_request_id() -> str:

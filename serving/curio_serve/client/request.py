@@ -34,6 +34,7 @@ def detect_request(
     apply_exif_rotation: bool = False,
     color: Literal["rgb", "bgr"] = "rgb",
     request_id: str = "",
+    track: messages.Tracking | None = None,
 ) -> messages.DetectRequest:
     """The message for one frame.
 
@@ -47,6 +48,7 @@ def detect_request(
         apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
         color: Order of the channels of pixels; OpenCV reads images as ``bgr``.
         request_id: Comes back with the answer; empty: the server makes one up.
+        track: Follow objects from frame to frame, in a stream alone.
 
     Raises:
         ArgumentError: A value is of the wrong shape or kind.
@@ -60,6 +62,7 @@ def detect_request(
         min_confidence=min_confidence,
         max_detections=max_detections,
         apply_exif_rotation=apply_exif_rotation,
+        track=track,
     )
     if isinstance(image, np.ndarray):
         request.raw.CopyFrom(_raw(image, color))

@@ -36,9 +36,12 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 class Detector:
     """Finds a model's objects in frames; safe to share between threads."""
 
+    depths_m: tuple[float, float]
+    """Smallest and largest depth that the model was trained for, see :func:`trained_depths_m`."""
+
     def __init__(self, model: Model) -> None:
         self.model = model
-        self._depths_m = trained_depths_m(model.spec)
+        self.depths_m = trained_depths_m(model.spec)
 
     def detect(
         self,
@@ -87,7 +90,7 @@ class Detector:
             if crop is None:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
-                _fill(result, crop, self.model.slots, next(outputs), min_confidence, max_detections, self._depths_m)
+                _fill(result, crop, self.model.slots, next(outputs), min_confidence, max_detections, self.depths_m)
         return results
 
     def _outputs(self, images: list[Array], before_run: Callable[[], None]) -> list[Values]:
@@ -195,12 +198,12 @@ def _fill(
             rotation=rotation,
             quaternion_xyzw=quaternion_xyzw(rotation) if rotation else (),
             color=values["color"][row] if "color" in values else (),
-            box_px=crop.project(_transformed(slots[row].box_corners, rotation or _UPRIGHT, translation)),
+            box_px=crop.project(transformed(slots[row].box_corners, rotation or _UPRIGHT, translation)),
             outside_trained_range=not depths_m[0] <= values["translation_m"][row][2] <= depths_m[1],
         )
 
 
-def _transformed(
+def transformed(
     points: Sequence[Sequence[float]], rotation: Sequence[float], translation: Sequence[float]
 ) -> Sequence[Sequence[float]]:
     """An object's points in the frame's camera, metres.

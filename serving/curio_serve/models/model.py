@@ -15,8 +15,9 @@ from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.view import CanonicalCamera
 from curio_serve.models.batching import Batcher
+from curio_serve.models.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote
 from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime, open_session, runtime_errors
-from curio_serve.models.spec import read_spec
+from curio_serve.models.spec import read_metadata, read_spec
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -63,6 +64,8 @@ class Model:
     """One for each row of the per-object outputs."""
     sha256: str
     """Of the file, hexadecimal."""
+    crop_stage: CropStage | None = None
+    """Reads poses from crops alone; None: the model has no such stage."""
 
     def __init__(
         self,
@@ -155,6 +158,9 @@ def from_bytes(data: bytes, where: str, name: str = "", version: int = 0, runtim
     model = Model(session, spec, name, version, hashlib.sha256(data).hexdigest(), runtime.max_batch)
     _check_graph(session, model)
     _check_outputs(model)
+    note = read_metadata(data, CROP_STAGE_KEY)
+    if note and model.camera.matrix is not None and spec.num_slots == 1:
+        model.crop_stage = CropStage(data, CropStageNote.parse(note, where), where, runtime.providers)
     return model
 
 

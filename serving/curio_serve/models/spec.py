@@ -56,6 +56,11 @@ def read_spec(data: bytes, path: str) -> ModelSpec:
     return _parse_spec(entries[0], path)
 
 
+def read_metadata(data: bytes, key: str) -> str:
+    """An entry of the metadata of an ONNX file that :func:`read_spec` has read; empty if there is none."""
+    return next((entry.value for entry in OnnxModel.FromString(data).metadata_props if entry.key == key), "")
+
+
 def _parse_spec(text: str, path: str) -> ModelSpec:
     try:
         # Unknown fields pass here, so that a newer schema is refused by its version, not by a field's name.

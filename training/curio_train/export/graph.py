@@ -23,13 +23,15 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from curio_train.errors import ExportError
 from curio_train.export.card import Provenance, card
+from curio_train.export.crop_stage import STAGE_TENSORS, traced
 from curio_train.export.folder import ModelFolder, triton_config
-from curio_train.export.onnx import put_spec, store_half, to_onnx
+from curio_train.export.onnx import put_spec, store_half
 from curio_train.exported_model import WEIGHTS_FILE, ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
 from curio_train.learning.runs.initial import weights_file
 from curio_train.learning.runs.provenance import run_sessions
+from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import Field
 from curio_train.worlds import build
 from curio_train.worlds.base import ObjectKind, World
@@ -87,15 +89,23 @@ class Graph(nn.Module):
         self.eval()
 
     def forward(self, image: Tensor) -> tuple[Tensor, ...]:
-        return tuple(self.outputs(image).values())
+        """The outputs, then the tensors of the crop-pose stage, if the network has one."""
+        if not isinstance(self.network, TwoStageNetwork):
+            return tuple(self.outputs(image).values())
+        code, stage = self.network.with_crop_stage(_pixels(image))
+        return (*self._world.outputs.from_code(code).values(), *(stage[name] for name in STAGE_TENSORS))
 
     def outputs(self, image: Tensor) -> dict[str, Tensor]:
         """Outputs by name, for uint8 images [batch, height, width, 3]."""
-        return self.read(image.permute(0, 3, 1, 2).float() / 255)
+        return self.read(_pixels(image))
 
     def read(self, pixels: Tensor) -> dict[str, Tensor]:
         """Outputs by name, for pixels [batch, 3, height, width] in [0, 1]."""
         return self._world.outputs.from_code(self.network(pixels))
+
+
+def _pixels(image: Tensor) -> Tensor:
+    return image.permute(0, 3, 1, 2).float() / 255
 
 
 def export(
@@ -132,7 +142,7 @@ def export(
     target.refuse_other_tensors(config)
     known = numerically_stable(deployed if half else trained, images)
 
-    model = to_onnx(deployed, world.camera.width, world.camera.height, list(expected))
+    model = traced(deployed, deployed.network, world.camera, list(expected))
     if half:
         store_half(model)
     spec = model_spec(world, target.path.name)

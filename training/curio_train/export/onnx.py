@@ -2,7 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -96,6 +96,19 @@ def store_half(model: onnx.ModelProto) -> None:
 
 def put_spec(model: onnx.ModelProto, spec: ModelSpec) -> None:
     """Write the specification into the metadata."""
+    put_metadata(model, SPEC_KEY, json_format.MessageToJson(spec, preserving_proto_field_name=True, indent=None))
+
+
+def put_metadata(model: onnx.ModelProto, key: str, text: str) -> None:
+    """Write an entry of the metadata, in place of an older one."""
+    others = [entry for entry in model.metadata_props if entry.key != key]
     del model.metadata_props[:]
-    text = json_format.MessageToJson(spec, preserving_proto_field_name=True, indent=None)
-    model.metadata_props.add(key=SPEC_KEY, value=text)
+    model.metadata_props.extend(others)
+    model.metadata_props.add(key=key, value=text)
+
+
+def hide_outputs(model: onnx.ModelProto, names: Collection[str]) -> None:
+    """Make outputs tensors inside the graph: they keep their names, and runtimes do not compute them for nothing."""
+    shown = [value for value in model.graph.output if value.name not in names]
+    del model.graph.output[:]
+    model.graph.output.extend(shown)

@@ -21,6 +21,9 @@ sees (three coordinates, in half extents from the middle of its box), then the l
 Position and rotation as predicted by each cell are under :func:`~curio_train.networks.grid.per_cell`
 [batch, cells, size]."""
 
+CELL_WEIGHTS = "cell_weights"
+"""Key of the weights with which the cells make the mean [batch, cells, 1]."""
+
 OBJECT_COORDINATES_STRIDE = 4
 """Side of a patch in pixels."""
 
@@ -77,7 +80,8 @@ class CropPoseNetwork(StageNetwork):
             value = mean if field.name == TRANSLATION else field.activate(mean)
             code[field.name] = value[:, None] if field.per_object else value
         pose = {per_cell(name): fields[name] for name in (TRANSLATION, ROTATION_6D)}
-        return {}, {**code, **pose, OBJECT_COORDINATES: self.unfold(features[:, -self._num_coordinates :])}
+        beside = {CELL_WEIGHTS: weights, OBJECT_COORDINATES: self.unfold(features[:, -self._num_coordinates :])}
+        return {}, {**code, **pose, **beside}
 
     def _start_at_identity(self, last: nn.Conv2d) -> None:
         """Rotation numbers near zero have no useful gradient: start with small weights at the identity."""

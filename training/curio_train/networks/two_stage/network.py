@@ -6,13 +6,15 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
+from curio_serve.models.crop_stage import INPUT, CropStageNote
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.networks.base import StageNetwork
 from curio_train.networks.crop_camera import cut_crops
-from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
+from curio_train.networks.grid import per_cell
+from curio_train.networks.two_stage.crop_pose import CELL_WEIGHTS, OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import TOP_LOG_WEIGHTS, TOP_PROPOSALS
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
@@ -79,7 +81,28 @@ class TwoStageNetwork(nn.Module):
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
-        code, features = self.uncalibrated(images)
+        code, features, _ = self._estimate(images)
+        return self._calibrated(code, features)
+
+    def with_crop_stage(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The codes, and the tensors at which the refinement pass can be cut out of an exported graph."""
+        code, features, (crops, read) = self._estimate(images)
+        stage = {
+            INPUT: crops,
+            "translation": read[TRANSLATION][:, 0],
+            "rotation_6d": read[ROTATION_6D][:, 0],
+            "confidence": read[CONFIDENCE][:, 0],
+            "light": read[LIGHT],
+            "visibility": read[OBJECT_COORDINATES][:, 3],
+            "cell_translation": read[per_cell(TRANSLATION)],
+            "cell_rotation_6d": read[per_cell(ROTATION_6D)],
+            "weights": read[CELL_WEIGHTS],
+        }
+        return self._calibrated(code, features), stage
+
+    def _calibrated(self, code: dict[str, Tensor], features: CalibrationFeatures) -> dict[str, Tensor]:
         pose_correct = _probability(features.pose_correct, self.rightness)
         confidence = pose_correct * _probability(features.presence, self.presence)
         return code | {CONFIDENCE: confidence[:, None, None]}
@@ -88,19 +111,47 @@ class TwoStageNetwork(nn.Module):
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code with the crop-pose stage's own confidence, and the features to calibrate it with."""
+        code, features, _ = self._estimate(images)
+        return code, features
+
+    def _estimate(
+        self, images: Tensor
+    ) -> tuple[dict[str, Tensor], CalibrationFeatures, tuple[Tensor, dict[str, Tensor]]]:
+        """Code and features, and the crops of the refinement pass with what is read from them."""
         located = self.first(F.avg_pool2d(images, self._optics.localisation_stride))
-        crops = self._crop_poses(images, located[TOP_PROPOSALS])
+        crops, _ = self._crop_poses(images, located[TOP_PROPOSALS])
         position, log_weight = _likeliest(crops[TRANSLATION], crops[_VISIBILITY], located[TOP_LOG_WEIGHTS])
-        refined = self._crop_poses(images, position * position.new_tensor(SCALES)[:, None])
+        refined, read = self._crop_poses(images, position * position.new_tensor(SCALES)[:, None])
         logit, visibility = torch.logit(refined[CONFIDENCE].flatten(), 1e-6), refined.pop(_VISIBILITY)
         logit, visibility = (values.view(-1, len(SCALES)).mean(dim=1, keepdim=True) for values in (logit, visibility))
-        return _mean_position(refined), CalibrationFeatures(logit, torch.cat([visibility, log_weight], dim=1))
+        features = CalibrationFeatures(logit, torch.cat([visibility, log_weight], dim=1))
+        return _mean_position(refined), features, read
 
-    def _crop_poses(self, images: Tensor, centres: Float[Tensor, "batch num 3"]) -> dict[str, Tensor]:
+    def crop_stage_note(self, tensors: dict[str, str]) -> CropStageNote:
+        """What serving has to know to run the refinement pass alone.
+
+        Args:
+            tensors: Names in the exported graph of what :meth:`with_crop_stage` gives.
+        """
+        optics = self._optics
+        return CropStageNote(
+            tensors,
+            optics.crop_px,
+            optics.fill,
+            optics.diameter_m,
+            optics.near_m,
+            self.rightness.tolist(),
+            self.presence.tolist(),
+        )
+
+    def _crop_poses(
+        self, images: Tensor, centres: Float[Tensor, "batch num 3"]
+    ) -> tuple[dict[str, Tensor], tuple[Tensor, dict[str, Tensor]]]:
         """Crop around positions, predict poses there, and rotate them back into the frame's camera.
 
         Returns:
-            Codes of all crops [batch · num, …], those of one image after the other, and the visibility in each.
+            Codes of all crops [batch · num, …], those of one image after the other, and the visibility in each; and
+            the crops with what the crop-pose stage gives for them.
         """
         optics, centre = self._optics, centres.flatten(0, 1)
         depth = centre.norm(dim=1, keepdim=True).clamp(min=optics.near_m)  # along the crop camera's axis
@@ -111,13 +162,14 @@ class TwoStageNetwork(nn.Module):
         position = torch.cat([relative[:, :2] * optics.diameter_m, relative[:, 2:] * depth], dim=-1)
         cam_from_crop = crop_from_cam.transpose(1, 2)
         rotation = cam_from_crop @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
-        return {name: code[name] for name in (COLOR,) if name in code} | {
+        poses = {name: code[name] for name in (COLOR,) if name in code} | {
             _VISIBILITY: _visibility(code[OBJECT_COORDINATES]),
             TRANSLATION: (cam_from_crop @ position[..., None])[:, None, :, 0],
             ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None],
             CONFIDENCE: code[CONFIDENCE],
             LIGHT: (cam_from_crop @ code[LIGHT][..., None])[..., 0],
         }
+        return poses, (crops, code)
 
 
 def _mean_position(crops: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -1,0 +1,316 @@
+"""The crop-pose stage of a two-stage model alone: reads a pose from a crop around where the object is expected.
+
+A two-stage model localises its object in the whole frame and then reads the pose from crops. Where the place is known,
+as in a stream, the crops alone cost a seventh. The exporter notes in the metadata which tensors of the graph are the
+crops and what is read from them; here the graph is cut at these tensors, so that a model stays one file. Models without
+that note have no such stage and read whole frames alone.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from curio_proto.files.onnx_outline_pb2 import OnnxModel, OnnxValue
+
+from curio_serve.errors import InternalError, ModelError
+from curio_serve.imaging.camera import PinholeCamera, scaling
+from curio_serve.imaging.rotation import smallest_rotation
+from curio_serve.models.runtime import open_session, runtime_errors
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+Array = np.ndarray
+CROP_STAGE_KEY = "curio.crop_stage"
+INPUT = "crops"
+OUTPUTS = (
+    *("translation", "rotation_6d", "confidence", "light", "visibility"),
+    *("cell_translation", "cell_rotation_6d", "weights"),
+)
+"""Tensors that are read from crops: the pose, its logit and the light in each crop's camera, the logits of seeing the
+object [n, 16, 16], and each cell's own pose and weight. Positions are (x, y) in diameters and z in expected depths."""
+_FLOAT32 = 1
+_OVERSAMPLING = 2  # as in training: each pixel of a crop is the mean of four samples
+_NUM_CLEAREST = 16  # patches whose mean logit says whether the object is visible
+_FAR_BEHIND = 0.05  # cosine to the optical axis below which nothing is cut out
+_SCALES = (1 / 1.09, 1.09)  # of the expected distance: the errors of two crops are nearly independent
+_SAME_ROTATION_RAD = math.radians(30)  # crops that differ by more have read symmetric poses
+_FOUND_LOG_WEIGHT = 0.0  # log weight of the proposal of an object that is followed: there was one
+
+
+@dataclass(frozen=True)
+class CropStageNote:
+    """What the exporter notes about the stage, as JSON under ``curio.crop_stage``."""
+
+    tensors: Mapping[str, str]
+    """Names in the graph of :data:`INPUT` and :data:`OUTPUTS`."""
+    side_px: int
+    """Of a crop."""
+    fill: float
+    """Fraction of the side that the diameter spans at the expected depth."""
+    diameter_m: float
+    """Of the object."""
+    near_m: float
+    """Objects nearer than this are taken to be at this distance."""
+    pose_correct: Sequence[float]
+    """Weight and offset from the logit of the stage's confidence to the probability of a correct pose."""
+    presence: Sequence[float]
+    """Weights of visibility and log weight, and offset, to the probability that the object is there."""
+
+    @staticmethod
+    def parse(text: str, where: str) -> "CropStageNote":
+        """The note in a model's metadata.
+
+        Raises:
+            ModelError: It is not one.
+        """
+        try:
+            note = CropStageNote(**json.loads(text))
+            numbers = (note.side_px, note.fill, note.diameter_m, note.near_m, *note.pose_correct, *note.presence)
+            is_valid = all(map(math.isfinite, numbers)) and min(numbers[:4]) > 0 and note.side_px <= 1024
+            is_valid &= (len(note.pose_correct), len(note.presence)) == (2, 3)
+        except (ValueError, TypeError) as exc:
+            raise ModelError(f"{where}: the metadata {CROP_STAGE_KEY} is not what curio-export writes: {exc}") from exc
+        if not is_valid or set(note.tensors) != {INPUT, *OUTPUTS}:
+            raise ModelError(f"{where}: the metadata {CROP_STAGE_KEY} has impossible values; export the model again")
+        return note
+
+
+@dataclass(frozen=True, eq=False)
+class CropPose:
+    """A pose read around an expected position, in the frame's camera."""
+
+    translation_m: Array
+    """[3]."""
+    rotation: Array
+    """cam_from_obj [3, 3]."""
+    confidence: float
+    """Probability that the object is there and the pose correct."""
+    position_covariance_m2: Array
+    """Spread of the network's own cells and crops [3, 3]."""
+    rotation_variance: float
+    """The same of the rotation about each axis, rad²."""
+    light: Array
+    """[3], towards the light; its length is the strength."""
+
+
+class CropStage:
+    """Cuts crops out of frames and reads poses from them; safe to share between threads."""
+
+    def __init__(self, data: bytes, note: CropStageNote, where: str, providers: Sequence[str]) -> None:
+        """Cut the graph; the runtime opens it when the stage is first used.
+
+        Args:
+            data: Content of the ONNX file.
+            note: What it says about the stage.
+            where: The file, for messages.
+            providers: onnxruntime's names.
+
+        Raises:
+            ModelError: The graph has not the tensors of the note.
+        """
+        self.note, self._where, self._providers = note, where, tuple(providers)
+        self._graph = _cut(data, note, where)
+
+    @cached_property
+    def _session(self) -> "onnxruntime.InferenceSession":
+        return open_session(self._graph, self._where, self._providers)
+
+    def read(self, pixels: Array, camera: PinholeCamera, position_m: Array, canonical_focal_px: float) -> CropPose:
+        """The pose of the object in crops around a position.
+
+        Args:
+            pixels: uint8 RGB [height, width, 3].
+            camera: That took them.
+            position_m: Where the object is expected, frame's camera, in front of it.
+            canonical_focal_px: Of the camera that the model was trained for: larger frames are averaged down to it.
+
+        Raises:
+            InternalError: The network failed, or gives what is not finite.
+        """
+        note = self.note
+        distance_m = max(float(np.linalg.norm(position_m)), note.near_m)
+        crop_from_cam = smallest_rotation(position_m / np.linalg.norm(position_m), np.array([0.0, 0.0, 1.0]))
+        depths_m = [scale * distance_m for scale in _SCALES]
+        crops = [
+            cut_crop(
+                pixels,
+                camera,
+                crop_from_cam,
+                note.fill * note.side_px * depth_m / note.diameter_m,
+                note.side_px,
+                canonical_focal_px,
+            )
+            for depth_m in depths_m
+        ]
+        found = self._run(np.stack(crops))
+        return self._pose(found, depths_m, crop_from_cam.T)
+
+    def sees(self, camera: PinholeCamera, position_m: Array, width: int, height: int) -> bool:
+        """Whether a position is in front of the camera and its pixel within the frame."""
+        if position_m[2] <= _FAR_BEHIND * float(np.linalg.norm(position_m)):
+            return False
+        x, y = camera.pixels([position_m.tolist()])
+        return -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
+
+    def _run(self, crops: Array) -> dict[str, Array]:
+        """Outputs by name for uint8 crops [n, side, side, 3]."""
+        images = np.ascontiguousarray(crops.transpose(0, 3, 1, 2), np.float32) / 255
+        try:
+            values = self._session.run(
+                [self.note.tensors[name] for name in OUTPUTS], {self.note.tensors[INPUT]: images}
+            )
+        except runtime_errors() as exc:
+            raise InternalError(f"{self._where}: onnxruntime failed on {len(crops)} crops: {exc}") from exc
+        if not all(np.isfinite(value).all() for value in values):
+            raise InternalError(f"{self._where}: an output of the crop-pose stage is not finite for this image")
+        return dict(zip(OUTPUTS, values, strict=True))
+
+    def _pose(self, found: Mapping[str, Array], depths_m: Sequence[float], cam_from_crop: Array) -> CropPose:
+        """The mean position of the crops, the rotation of the surest, and how far cells and crops disagree."""
+        num = len(depths_m)
+        units = np.array([[self.note.diameter_m, self.note.diameter_m, depth_m] for depth_m in depths_m])
+        positions = found["translation"].reshape(num, 3) * units
+        confidence = found["confidence"].reshape(num).clip(1e-6, 1 - 1e-6)
+        logit = float(np.log(confidence / (1 - confidence)).mean())
+        depth_m = math.exp(float(np.log(positions[:, 2].clip(1e-6)).mean()))
+        mean = (positions / positions[:, 2:]).mean(axis=0) * depth_m
+        rotations = rotations_from_6d(found["rotation_6d"].reshape(num, 6))
+        rotation, between = _mean_rotation(rotations, int(confidence.argmax()))
+        weights = found["weights"].reshape(num, -1, 1)
+        cells = found["cell_translation"].reshape(num, -1, 3) * units[:, None]
+        offsets = (np.sqrt(weights) * (cells - positions[:, None])).reshape(-1, 3)
+        apart = positions - mean
+        spread = (offsets.T @ offsets + apart.T @ apart) / num
+        turned = found["cell_rotation_6d"].reshape(num, -1, 6) - found["rotation_6d"].reshape(num, 1, 6)
+        # The squared length of the change of two columns is four times the variance about an axis.
+        variance = float((weights * turned**2).sum()) / num / 4 + between**2 / 4
+        return CropPose(
+            cam_from_crop @ mean,
+            cam_from_crop @ rotation,
+            self._confidence(logit, _visibility(found["visibility"], num)),
+            cam_from_crop @ spread @ cam_from_crop.T,
+            variance,
+            cam_from_crop @ found["light"].reshape(num, 3).mean(axis=0),
+        )
+
+    def _confidence(self, logit: float, visibility: float) -> float:
+        note = self.note
+        correct = _sigmoid(note.pose_correct[0] * logit + note.pose_correct[1])
+        seen = note.presence[0] * visibility + note.presence[1] * _FOUND_LOG_WEIGHT + note.presence[2]
+        return correct * _sigmoid(seen)
+
+
+def cut_crop(
+    pixels: Array,
+    camera: PinholeCamera,
+    crop_from_cam: Array,
+    focal_px: float,
+    side_px: int,
+    canonical_focal_px: float,
+) -> Array:
+    """A crop by a virtual camera at the frame's camera, each pixel the mean of four samples.
+
+    Args:
+        pixels: uint8 RGB [height, width, 3].
+        camera: That took them.
+        crop_from_cam: Rotation [3, 3].
+        focal_px: Of the crop; its principal point is its middle.
+        side_px: Of the crop.
+        canonical_focal_px: Frames of a longer focal length are averaged down to this one.
+
+    Returns:
+        uint8 RGB [side_px, side_px, 3]; beyond the frame its edge pixels continue.
+    """
+    fine = _OVERSAMPLING * side_px
+    middle, focal = (fine - 1) / 2, _OVERSAMPLING * focal_px
+    target = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+    matrix = camera.matrix
+    reduced = round(max(1.0, camera.focal_lengths[0] / canonical_focal_px))
+    if reduced > 1:
+        pixels = cv2.resize(pixels, None, fx=1 / reduced, fy=1 / reduced, interpolation=cv2.INTER_AREA)
+        matrix = scaling(1 / reduced, 1 / reduced) @ matrix
+    if camera.coefficients is not None:
+        maps = cv2.initUndistortRectifyMap(
+            matrix, camera.coefficients, crop_from_cam, target, (fine, fine), cv2.CV_32FC1
+        )
+        image = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    else:
+        frame_from_crop = matrix @ crop_from_cam.T @ np.linalg.inv(target)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        image = cv2.warpPerspective(pixels, frame_from_crop, (fine, fine), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.resize(image, (side_px, side_px), interpolation=cv2.INTER_AREA)
+
+
+def rotations_from_6d(values: Array) -> Array:
+    """Rotations [n, 3, 3] of 6D vectors [n, 6]: the first two columns, made orthonormal (Zhou et al. 2019)."""
+    first, second = values[:, :3].astype(float), values[:, 3:].astype(float)
+    first = first / np.linalg.norm(first, axis=1, keepdims=True).clip(1e-9)
+    second = second - (first * second).sum(axis=1, keepdims=True) * first
+    second = second / np.linalg.norm(second, axis=1, keepdims=True).clip(1e-9)
+    return np.stack([first, second, np.cross(first, second)], axis=2)
+
+
+def _mean_rotation(rotations: Array, surest: int) -> tuple[Array, float]:
+    """Mean of the crops' rotations, and the angle between them; the surest alone where they are symmetric poses."""
+    cosine = (float((rotations[0] * rotations[-1]).sum()) - 1) / 2
+    angle = math.acos(min(1.0, max(-1.0, cosine)))
+    if angle > _SAME_ROTATION_RAD:
+        return rotations[surest], angle
+    left, _, right = np.linalg.svd(rotations.mean(axis=0))
+    return left @ right, angle
+
+
+def _visibility(logits: Array, num: int) -> float:
+    clearest = np.partition(logits.reshape(num, -1), -_NUM_CLEAREST, axis=1)[:, -_NUM_CLEAREST:]
+    return float(clearest.mean())
+
+
+def _sigmoid(value: float) -> float:
+    return 1 / (1 + math.exp(-min(max(value, -60.0), 60.0)))
+
+
+def _cut(data: bytes, note: CropStageNote, where: str) -> bytes:
+    """The part of a graph between the crops and what is read from them.
+
+    Raises:
+        ModelError: A tensor of the note is none of the graph's, or needs more than the crops.
+    """
+    model = OnnxModel.FromString(data)
+    graph, crops = model.graph, note.tensors[INPUT]
+    outputs = [note.tensors[name] for name in OUTPUTS]
+    number_of = {name: number for number, node in enumerate(graph.node) for name in node.output}
+    constants = {tensor.name for tensor in graph.initializer}
+    needed, pending = set[int](), list(outputs)
+    while pending:
+        name = pending.pop()
+        if not name or name == crops or name in constants:
+            continue
+        if name not in number_of:
+            raise ModelError(f"{where}: {CROP_STAGE_KEY} names tensors that need {name!r} beside the crops")
+        if number_of[name] not in needed:
+            needed.add(number_of[name])
+            pending += graph.node[number_of[name]].input
+    nodes = [graph.node[number] for number in sorted(needed)]
+    used = {name for node in nodes for name in node.input}
+    initializers = [tensor for tensor in graph.initializer if tensor.name in used]
+    part = OnnxModel()
+    part.CopyFrom(model)
+    for field in ("node", "initializer", "sparse_initializer", "input", "output"):
+        part.graph.ClearField(field)
+    part.graph.node.extend(nodes)
+    part.graph.initializer.extend(initializers)
+    part.graph.input.append(_float(crops))
+    part.graph.output.extend(map(_float, outputs))
+    return part.SerializeToString()
+
+
+def _float(name: str) -> OnnxValue:
+    value = OnnxValue(name=name)
+    value.type.tensor_type.elem_type = _FLOAT32
+    return value

@@ -1,0 +1,213 @@
+"""Follows the objects of one model through the frames of one stream.
+
+An object that was found is looked for where it is expected: the crop-pose stage alone reads it there. The whole frame
+is looked at where nothing is followed, at an interval, where confidence falls, and when a request asks for it. An
+object that is not seen for a while keeps its track and is answered as predicted.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from curio_proto.v1.detector_pb2 import REGION_STATUS_DETECTED, REGION_STATUS_NO_OBJECT, RegionResult
+
+from curio_serve.errors import ArgumentError
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.models.detector import Detector
+from curio_serve.tracking.frame import StreamFrame
+from curio_serve.tracking.tracks import Measurement, Track, assign, without_doubles
+
+if TYPE_CHECKING:
+    from curio_serve.models.detector import Results
+
+Array = np.ndarray
+KEEP_S, MAX_OBJECTS = 1.5, 16
+_FOUND, _FOLLOWED = 0.2, 0.08  # least confidence to begin a track, and to go on with it
+_SEARCH_S = 0.09  # between looks at whole frames while an object is not seen
+_MORE_S, _VERIFY_S = 0.5, 2.0  # the same for further objects, and to make sure of those that are followed
+_SURER = 0.2  # by which another place must be more confident than the one that is followed
+
+
+@dataclass(frozen=True)
+class Following:
+    """How objects are followed."""
+
+    keep_s: float = KEEP_S
+    """How long an object that is not seen is answered as predicted."""
+    num_objects: int = 1
+    """Most that are followed at a time."""
+    search: bool = False
+    """Look at this whole frame, whatever is followed."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be.
+
+        Raises:
+            ArgumentError: A value is out of range.
+        """
+        if not 0 <= self.keep_s <= 3600:
+            raise ArgumentError(f"track.keep_s is {self.keep_s}; expected 0 to 3600 seconds")
+        if not 1 <= self.num_objects <= MAX_OBJECTS:
+            raise ArgumentError(f"track.num_objects is {self.num_objects}; expected 1 to {MAX_OBJECTS}")
+
+
+class Follower:
+    """The objects of one model in one stream; not to be shared between threads."""
+
+    def __init__(self) -> None:
+        self._tracks: list[Track] = []
+        self._last_number = 0
+        self._looked_s = self._time_s = -math.inf
+
+    def follow(
+        self,
+        detector: Detector,
+        pixels: Array,
+        camera: PinholeCamera | None,
+        time_s: float,
+        following: Following,
+        *,
+        min_confidence: float = 0.0,
+        reduction: int = 1,
+        results: "Results",
+        before_run: Callable[[], None] = lambda: None,
+    ) -> RegionResult:
+        """Add the result of one frame to those of a response.
+
+        Args:
+            detector: Of the model.
+            pixels: uint8 RGB [height / reduction, width / reduction, 3].
+            camera: Intrinsics of the full-size frame.
+            time_s: When it was taken, after the frame before.
+            following: How.
+            min_confidence: What the frame shows below it is not answered.
+            reduction: How much smaller than the frame the pixels were decoded.
+            results: The field of a response.
+            before_run: Called before each run of a network.
+
+        Raises:
+            As :meth:`~curio_serve.models.detector.Detector.detect`.
+        """
+        frame = StreamFrame(detector, pixels, camera, reduction, time_s, before_run)
+        for track in self._tracks:
+            track.predict(min(time_s - self._time_s, following.keep_s))
+        self._time_s = time_s
+        light = self._read_crops(frame)
+        if self._is_look_due(frame, following):
+            self._looked_s = time_s
+            light = self._look(frame, following) or light
+        kept = [track for track in self._tracks if time_s - track.seen_s <= following.keep_s]
+        self._tracks = without_doubles(kept)[: following.num_objects * len(detector.model.spec.objects)]
+        return self._answer(frame, light, following, min_confidence, results)
+
+    def _read_crops(self, frame: StreamFrame) -> Sequence[float]:
+        """Look for each object where it is expected; the light there."""
+        light: Sequence[float] = ()
+        stage = frame.detector.model.crop_stage
+        if stage is None or frame.scaled_camera is None:
+            return light
+        height, width = frame.pixels.shape[:2]
+        for track in self._tracks:
+            position_m = track.filter.translation_m
+            if not stage.sees(frame.scaled_camera, position_m, width, height):
+                continue
+            frame.before_run()
+            focal_px = frame.detector.model.camera.focal_lengths[0]
+            pose = stage.read(frame.pixels, frame.scaled_camera, position_m, focal_px)
+            if pose.confidence >= _FOLLOWED and pose.translation_m[2] > 0:
+                track.update(
+                    Measurement(
+                        track.kind.name,
+                        pose.translation_m,
+                        pose.rotation,
+                        pose.confidence,
+                        pose.position_covariance_m2,
+                        pose.rotation_variance,
+                    ),
+                    frame.time_s,
+                )
+                light = pose.light.tolist()
+        return light
+
+    def _is_look_due(self, frame: StreamFrame, following: Following) -> bool:
+        if frame.detector.model.crop_stage is None or following.search:
+            return True
+        waited_s, num_seen = frame.time_s - self._looked_s, sum(track.is_seen for track in self._tracks)
+        wanted = following.num_objects * len(frame.detector.model.spec.objects)
+        if num_seen == 0 or num_seen < len(self._tracks):
+            return waited_s >= _SEARCH_S
+        return waited_s >= (_MORE_S if num_seen < wanted else _VERIFY_S)
+
+    def _look(self, frame: StreamFrame, following: Following) -> Sequence[float]:
+        """Look at the whole frame; the light there."""
+        has_crops = frame.detector.model.crop_stage is not None
+        hidden = [track for track in self._tracks if track.is_seen] if has_crops and following.num_objects > 1 else []
+        found, light = frame.look(hidden)
+        alone = following.num_objects == 1
+        found = [measured for measured in found if measured.confidence >= _FOLLOWED]
+        if has_crops and alone:
+            found = self._verified(found)
+        unseen = [track for track in self._tracks if not track.is_seen]
+        pairs = assign(unseen, found, frame.time_s, alone=alone)
+        for row, column in pairs.items():
+            unseen[row].update(found[column], frame.time_s)
+        for column, measured in enumerate(found):
+            if column not in pairs.values() and measured.confidence >= _FOUND:
+                self._begin(frame, measured, following)
+        return light
+
+    def _verified(self, found: list[Measurement]) -> list[Measurement]:
+        """Drop a track where another place is surer to be the one object; what is left are objects not yet seen."""
+        left = []
+        for measured in found:
+            seen = next((t for t in self._tracks if t.is_seen and t.kind.name == measured.object), None)
+            if seen is None:
+                left.append(measured)
+                continue
+            gap_m = float(np.linalg.norm(measured.translation_m - seen.measured.translation_m))
+            if gap_m > seen.kind.diameter_m and measured.confidence > seen.measured.confidence + _SURER:
+                self._tracks.remove(seen)
+                left.append(measured)
+        return left
+
+    def _begin(self, frame: StreamFrame, measured: Measurement, following: Following) -> None:
+        kind = next(kind for kind in frame.detector.model.spec.objects if kind.name == measured.object)
+        same = [track for track in self._tracks if track.kind.name == kind.name]
+        if len(same) >= following.num_objects:
+            unseen = [track for track in same if not track.is_seen]
+            if not unseen:
+                return
+            self._tracks.remove(min(unseen, key=lambda track: track.seen_s))
+        self._last_number += 1
+        self._tracks.append(Track.begin(self._last_number, kind, measured, frame.time_s))
+
+    def _answer(
+        self,
+        frame: StreamFrame,
+        light: Sequence[float],
+        following: Following,
+        min_confidence: float,
+        results: "Results",
+    ) -> RegionResult:
+        model = frame.detector.model
+        result = results.add(model=model.name, model_version=model.version, status=REGION_STATUS_NO_OBJECT)
+        result.light.extend(light)
+        for track in sorted(self._tracks, key=lambda t: (-t.measured.confidence, t.number)):
+            unseen_s = frame.time_s - track.seen_s
+            if track.is_seen and track.measured.confidence < min_confidence:
+                continue
+            result.status = REGION_STATUS_DETECTED
+            pose = track.filter
+            raw = track.measured if track.is_seen else None
+            fading = 1.0 if raw is not None else max(0.0, 1 - unseen_s / max(following.keep_s, 1e-9))
+            detection = frame.add_detection(
+                result,
+                track.kind.name,
+                pose.translation_m if raw is None else raw.translation_m,
+                pose.rotation if raw is None else raw.rotation,
+                track.measured.confidence * fading,
+            )
+            frame.describe(detection.track, track)
+        return result

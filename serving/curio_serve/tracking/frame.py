@@ -1,0 +1,124 @@
+"""One frame of a stream as following needs it: whole, with objects hidden, and as an answer."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from curio_proto.v1.detector_pb2 import Detection, RegionResult
+from curio_proto.v1.detector_pb2 import Track as TrackMessage
+from scipy.spatial.transform import Rotation
+
+from curio_serve.imaging.camera import PinholeCamera, scaling
+from curio_serve.imaging.rotation import quaternion_xyzw
+from curio_serve.models.detector import Detector, transformed
+from curio_serve.tracking.tracks import Measurement, Track
+
+Array = np.ndarray
+_MARGIN = 1.15  # of a box that hides an object
+
+
+@dataclass(frozen=True, eq=False)
+class StreamFrame:
+    """A frame, its camera and the model that looks at it."""
+
+    detector: Detector
+    """Of the model."""
+    pixels: Array
+    """uint8 RGB [height / reduction, width / reduction, 3]."""
+    camera: PinholeCamera | None
+    """Of the full-size frame."""
+    reduction: int
+    """How much smaller the pixels are."""
+    time_s: float
+    """When it was taken."""
+    before_run: Callable[[], None]
+    """Called before each run of a network."""
+
+    @cached_property
+    def known_camera(self) -> PinholeCamera | None:
+        """The camera, or the model's own where a frame may come without."""
+        height, width = self.pixels.shape[:2]
+        default = self.detector.model.camera.for_frame(width * self.reduction, height * self.reduction)
+        return self.camera or default
+
+    @cached_property
+    def scaled_camera(self) -> PinholeCamera | None:
+        """The camera of the pixels as they were decoded."""
+        if self.known_camera is None or self.reduction == 1:
+            return self.known_camera
+        scale = scaling(1 / self.reduction, 1 / self.reduction)
+        return PinholeCamera(scale @ self.known_camera.matrix, self.known_camera.distortion)
+
+    def look(self, hidden: Sequence[Track]) -> tuple[list[Measurement], Sequence[float]]:
+        """Run the whole model.
+
+        Args:
+            hidden: Objects that are covered first, so that a model of one object finds another.
+
+        Returns:
+            What it finds of any confidence, and the light.
+        """
+        pixels = self.pixels
+        if hidden and self.scaled_camera is not None:
+            pixels = pixels.copy()
+            for track in hidden:
+                self._cover(pixels, self.scaled_camera, track)
+        (result,) = self.detector.detect(pixels, self.camera, reduction=self.reduction, before_run=self.before_run)
+        kinds = {kind.name: kind for kind in self.detector.model.spec.objects}
+        found = [
+            Measurement.of_whole_frame(
+                kinds[detection.object],
+                np.array(detection.translation_m),
+                np.reshape(detection.rotation, (3, 3)) if detection.rotation else np.eye(3),
+                detection.confidence,
+            )
+            for detection in result.detections
+        ]
+        return found, result.light
+
+    def add_detection(
+        self, result: RegionResult, object_: str, translation_m: Array, rotation: Array, confidence: float
+    ) -> Detection:
+        """Add a pose in the frame's camera to a result."""
+        rows, position = rotation.ravel().tolist(), translation_m.tolist()
+        slot = next(slot for slot in self.detector.model.slots if slot.object == object_)
+        nearest, farthest = self.detector.depths_m
+        corners = transformed(slot.box_corners, rows, position)
+        return result.detections.add(
+            object=object_,
+            confidence=confidence,
+            translation_m=position,
+            rotation_6d=[*rows[0::3], *rows[1::3]],
+            rotation=rows,
+            quaternion_xyzw=quaternion_xyzw(rows),
+            box_px=[] if self.known_camera is None else self.known_camera.pixels(corners),
+            outside_trained_range=not nearest <= position[2] <= farthest,
+        )
+
+    def describe(self, message: TrackMessage, track: Track) -> None:
+        """Write a track's number, age and filtered pose into an answer."""
+        pose = track.filter
+        message.track_id, message.predicted = track.number, not track.is_seen
+        message.age_s, message.unseen_s = self.time_s - track.first_s, self.time_s - track.seen_s
+        message.translation_m.extend(pose.translation_m.tolist())
+        message.rotation.extend(pose.rotation.ravel().tolist())
+        message.quaternion_xyzw.extend(Rotation.from_matrix(pose.rotation).as_quat(canonical=True).tolist())
+        message.velocity_m_s.extend(pose.velocity_m_s.tolist())
+        message.position_std_m.extend(pose.position_std_m.tolist())
+        message.rotation_std_rad = pose.rotation_std_rad
+
+    def _cover(self, pixels: Array, camera: PinholeCamera, track: Track) -> None:
+        """Paint over an object's box with the mean colour of its corners' surroundings, in place."""
+        pose = track.measured
+        corners = np.reshape(track.kind.box_corners_m, (-1, 3)) * _MARGIN
+        if not len(corners):
+            return
+        seen = camera.project(corners @ pose.rotation.T + pose.translation_m)
+        if not np.isfinite(seen).all():
+            return
+        hull = cv2.convexHull(seen.round().astype(np.int32))
+        inside = np.clip(hull[:, 0], 0, (pixels.shape[1] - 1, pixels.shape[0] - 1))
+        color = pixels[inside[:, 1], inside[:, 0]].mean(axis=0)
+        cv2.fillConvexPoly(pixels, hull, tuple(color.tolist()))

@@ -1,0 +1,172 @@
+"""What is known of the objects that one stream shows of one model: which is which, where each is, when it was seen."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from curio_proto.v1.model_spec_pb2 import ObjectModel
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from curio_serve.tracking.pose_filter import PoseFilter
+
+Array = np.ndarray
+_FLIP_RAD = math.radians(50)  # a rotation that changes by more between frames was misread
+_FLIPS_BELIEVED = 4  # in a row
+_SYMMETRY_STEP_RAD = math.radians(5)
+_DRIFT_M_S = 0.3  # speed at which an object that nobody sees may wander off
+_NEAR = 0.5  # diameters between an object and what is read of it, beside the uncertainty
+_SAME = 0.35  # diameters between two tracks that follow one object
+_ACROSS, _IN_DEPTH, _ROTATION_RAD = 0.04, 0.03, math.radians(6)  # errors of a whole frame's poses
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A pose that one frame shows, in the frame's camera."""
+
+    object: str
+    """Name of the kind of object."""
+    translation_m: Array
+    """[3]."""
+    rotation: Array
+    """cam_from_obj [3, 3]."""
+    confidence: float
+    """0 to 1."""
+    covariance_m2: Array
+    """[3, 3]."""
+    rotation_variance: float
+    """About each axis, rad²."""
+
+    @staticmethod
+    def of_whole_frame(kind: ObjectModel, translation_m: Array, rotation: Array, confidence: float) -> "Measurement":
+        """A pose of a network that says nothing of its spread: positions are worse in depth than across."""
+        distance_m = float(np.linalg.norm(translation_m))
+        ray = translation_m / max(distance_m, 1e-9)
+        across, along = (_ACROSS * kind.diameter_m) ** 2, (_IN_DEPTH * distance_m) ** 2
+        covariance = np.eye(3) * across + np.outer(ray, ray) * along
+        return Measurement(kind.name, translation_m, rotation, confidence, covariance, _ROTATION_RAD**2)
+
+
+@dataclass(eq=False)
+class Track:
+    """One object that is followed."""
+
+    number: int
+    """The same as long as it is followed; never given twice in a stream."""
+    kind: ObjectModel
+    """Of the object."""
+    filter: PoseFilter
+    """Its pose."""
+    first_s: float
+    """When it was found."""
+    seen_s: float
+    """When it was last seen."""
+    measured: Measurement
+    """When it was last seen."""
+    is_seen: bool = True
+    """In the present frame."""
+    _symmetries: Array = field(default_factory=lambda: np.eye(3)[None])
+    _num_flips: int = 0
+
+    @staticmethod
+    def begin(number: int, kind: ObjectModel, measured: Measurement, time_s: float) -> "Track":
+        """The track of an object that was just found."""
+        pose = PoseFilter(measured.translation_m, measured.rotation, measured.covariance_m2, measured.rotation_variance)
+        return Track(number, kind, pose, time_s, time_s, measured, _symmetries=symmetry_rotations(kind))
+
+    def predict(self, seconds: float) -> None:
+        """Move on to the next frame, in which it counts as not seen until :meth:`update`."""
+        self.filter.predict(seconds, seen=self.is_seen)
+        self.is_seen = False
+
+    def update(self, measured: Measurement, time_s: float) -> None:
+        """Take in what a frame shows of it."""
+        unseen_s = time_s - self.seen_s
+        self.is_seen, self.seen_s, self.measured = True, time_s, measured
+        if self._is_elsewhere(measured) and unseen_s > 0:
+            self.filter = PoseFilter(
+                measured.translation_m, measured.rotation, measured.covariance_m2, measured.rotation_variance
+            )
+            return
+        self.filter.update(measured.translation_m, measured.covariance_m2)
+        rotation = self._nearest_symmetric(measured.rotation)
+        if _angle(rotation, self.filter.rotation) < _FLIP_RAD:
+            self._num_flips = 0
+            self.filter.update_rotation(rotation, measured.rotation_variance)
+        elif self._num_flips >= _FLIPS_BELIEVED:
+            self._num_flips = 0
+            self.filter.replace_rotation(rotation, measured.rotation_variance)
+        else:
+            self._num_flips += 1
+
+    def reach_m(self, time_s: float) -> float:
+        """How far from its expected position it may be found."""
+        spread_m = 3 * float(self.filter.position_std_m.max())
+        return _NEAR * self.kind.diameter_m + spread_m + _DRIFT_M_S * (time_s - self.seen_s)
+
+    def _is_elsewhere(self, measured: Measurement) -> bool:
+        gap = measured.translation_m - self.filter.translation_m
+        return float(np.linalg.norm(gap)) > self.kind.diameter_m
+
+    def _nearest_symmetric(self, rotation: Array) -> Array:
+        if len(self._symmetries) == 1:
+            return rotation
+        candidates = rotation @ self._symmetries
+        nearest: Array = candidates[np.tensordot(candidates, self.filter.rotation, 2).argmax()]
+        return nearest
+
+
+def symmetry_rotations(kind: ObjectModel) -> Array:
+    """Rotations [n, 3, 3] of an object onto itself; continuous symmetries in steps."""
+    discrete = [np.reshape(s.transform, (4, 4))[:3, :3] for s in kind.symmetries if len(s.transform) == 16]
+    found = np.stack([np.eye(3), *discrete])
+    for symmetry in kind.symmetries:
+        if len(symmetry.axis) == 3:
+            angles = np.arange(0, 2 * math.pi, _SYMMETRY_STEP_RAD)
+            turns = Rotation.from_rotvec(angles[:, None] * np.array(symmetry.axis)).as_matrix()
+            found = (found[:, None] @ turns[None]).reshape(-1, 3, 3)
+    return found
+
+
+def assign(tracks: Sequence[Track], found: Sequence[Measurement], time_s: float, *, alone: bool) -> dict[int, int]:
+    """Which measurement belongs to which track, at the least sum of distances.
+
+    Args:
+        tracks: Predicted to this frame.
+        found: In this frame.
+        time_s: Of this frame.
+        alone: There is one object of each kind, so a measurement of it is that object wherever it is found.
+
+    Returns:
+        Index of the measurement by index of the track.
+    """
+    if not tracks or not found:
+        return {}
+    far = 1e6
+    distance = np.full((len(tracks), len(found)), far)
+    for row, track in enumerate(tracks):
+        for column, measured in enumerate(found):
+            gap_m = float(np.linalg.norm(measured.translation_m - track.filter.translation_m))
+            if measured.object == track.kind.name and (alone or gap_m < track.reach_m(time_s)):
+                distance[row, column] = gap_m
+    rows, columns = linear_sum_assignment(distance)
+    return {int(r): int(c) for r, c in zip(rows, columns, strict=True) if distance[r, c] < far}
+
+
+def without_doubles(tracks: Sequence[Track]) -> list[Track]:
+    """The tracks of different objects: of two that are at one place, the one seen, then the older one, stays."""
+    kept: list[Track] = []
+    for track in sorted(tracks, key=lambda t: (not t.is_seen, t.number)):
+        apart = _SAME * track.kind.diameter_m
+        if all(
+            other.kind.name != track.kind.name
+            or float(np.linalg.norm(other.filter.translation_m - track.filter.translation_m)) > apart
+            for other in kept
+        ):
+            kept.append(track)
+    return sorted(kept, key=lambda t: t.number)
+
+
+def _angle(one: Array, other: Array) -> float:
+    return math.acos(min(1.0, max(-1.0, (float((one * other).sum()) - 1) / 2)))
