@@ -98,5 +98,5 @@ dist: $(READY)
 		"$$fresh/venv/bin/pip" check
 		"$$fresh/venv/bin/curio-serve" --help > /dev/null
 		"$$fresh/venv/bin/curio-detect" models/ape samples/ --camera samples/camera.json --out "$$fresh/poses.jsonl" --overwrite
-		echo "dist: $$("$$python" --version): installed and tried, $$("$$fresh/venv/bin/pip" list 2> /dev/null | tail -n +3 | wc -l) packages, pip among them"
+		echo "dist: $$("$$python" --version): installed and tried, $$("$$fresh/venv/bin/pip" list 2> /dev/null | tail -n +3 | wc -l) packages and $$(du -sm "$$fresh/venv" | cut -f1) MiB, pip among them"
 	done
