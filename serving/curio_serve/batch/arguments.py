@@ -54,6 +54,12 @@ class DetectArguments:
     """Leave out detections below, 0 to 1."""
     max_detections: int | None = None
     """Keep that many of an image, the most confident. None: all."""
+    track: bool = False
+    """Follow objects through the frames of each video, or of each folder's images in order: JSON Lines have tracks."""
+    track_objects: int = 1
+    """With --track: most objects of each model at a time."""
+    frame_rate: float = 30.0
+    """With --track: of a folder's images and of videos that say none, frames/s."""
     exif_rotation: bool = False
     """Turn images as EXIF says, and K with them. Otherwise pixels are taken as stored, to which K belongs."""
     jobs: int = num_cores()

@@ -68,10 +68,13 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.read_ahead import read_ahead
     from curio_serve.batch.remote_files import is_url
     from curio_serve.batch.sources import STANDARD_INPUT, PassedOver, Topics, check_arguments, images
+    from curio_serve.batch.tracked import check_tracking, refuse_to_go_on
     from curio_serve.models.model_check import ChildCheck
 
     models, arguments = _models_first(arguments)
     _check_numbers(arguments)
+    if arguments.track:
+        arguments = check_tracking(arguments, models)
     if arguments.video is None:
         check_arguments(arguments.images)
     cv2.setNumThreads(1)  # the images are what runs in parallel
@@ -87,6 +90,8 @@ def run(arguments: DetectArguments) -> int:
     form = _format(arguments, estimators)
     passed_over, topics = PassedOver(), Topics(arguments.topic, arguments.info_topic)
     with _output(arguments, form, estimators) as output:
+        if arguments.track:
+            refuse_to_go_on(output)
         remaining = output.unanswered(images(arguments.images, passed_over, topics))
         if arguments.ray is None:
             may_be_remote = any(name == STANDARD_INPUT or is_url(name) for name in arguments.images)
@@ -164,6 +169,8 @@ def _settings(arguments: DetectArguments) -> "Settings":
         arguments.exif_rotation,
         arguments.overlays and Path(os.path.abspath(arguments.overlays)),
         common_folder(arguments.images or ["."]),
+        arguments.track_objects if arguments.track else None,
+        arguments.frame_rate,
     )
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from curio_proto.v1.detector_pb2 import Detection, RegionResult
+from curio_proto.v1.detector_pb2 import Detection, DetectResponse, RegionResult, Tracking
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_serve.batch.formats import ImageResult
@@ -27,6 +27,7 @@ from curio_serve.imaging.image_header import Header
 from curio_serve.imaging.overlay import draw
 from curio_serve.models.detector import Detector
 from curio_serve.models.model import Model, canonical_camera
+from curio_serve.tracking.stream import FollowingStream
 
 if TYPE_CHECKING:
     from curio_serve.client import PoseClient
@@ -52,6 +53,10 @@ class Settings:
     """Where drawings go; None: nowhere."""
     sources_root: Path = Path("/")
     """Folder below which the images' paths are told apart."""
+    track_objects: int | None = None
+    """Follow that many objects of each model from image to image; None: every image on its own."""
+    frame_rate: float = 30.0
+    """Of images that do not say when they were taken, frames/s."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +138,7 @@ class Estimator(ABC):
             RequestError: The frame or its camera is not acceptable.
             ServiceError: The server is out of reach or overloaded.
         """
-        image = SourceImage("frame", "frame", 0, pixels)
+        image = SourceImage("frame", "frame", 0, pixels, time_s=time.monotonic())
         seen = self._look(image, b"", self._camera(image))
         found = [detection for result in seen.results for detection in result.detections]
         return draw(pixels, seen.results, self.spec, seen.camera), found
@@ -224,6 +229,7 @@ class LocalEstimator(Estimator):
     def __init__(self, model: Model, settings: Settings) -> None:
         super().__init__(model.name, model.version, model.spec, settings)
         self._detector = Detector(model)
+        self._following, self._stream, self._num_frames = FollowingStream(), "", 0
 
     def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> Seen:
         started = time.perf_counter()
@@ -234,17 +240,48 @@ class LocalEstimator(Estimator):
         frame = self._frame(image, data, header, reduction)
         camera = _turned(camera, frame) or self.canonical.for_frame(frame.width, frame.height)
         decoded = time.perf_counter()
-        results = self._detector.detect(
-            frame.pixels,
-            camera,
-            min_confidence=self.settings.min_confidence,
-            max_detections=self.settings.max_detections,
-            reduction=frame.reduction,
-        )
+        results: Sequence[RegionResult]
+        if self.settings.track_objects is None:
+            results = self._detector.detect(
+                frame.pixels,
+                camera,
+                min_confidence=self.settings.min_confidence,
+                max_detections=self.settings.max_detections,
+                reduction=frame.reduction,
+            )
+        else:
+            results = self._follow(image, frame, camera, self.settings.track_objects)
         decode_ms = None if image.pixels is not None else 1000 * (decoded - started)
         inference_ms = 1000 * (time.perf_counter() - decoded)
         full_size = frame if frame.reduction == 1 else None
         return Seen(frame.width, frame.height, camera, results, decode_ms, inference_ms, full_size)
+
+    def _follow(
+        self, image: SourceImage, frame: images.Frame, camera: PinholeCamera | None, num_objects: int
+    ) -> Sequence[RegionResult]:
+        """Follow objects from the frame before; images have to come one after the other, in the order they were taken.
+
+        Raises:
+            RequestError: The frame is of another size or camera than those before it.
+            InternalError: The network fails on it.
+        """
+        if image.stream != self._stream:
+            self._following, self._stream, self._num_frames = FollowingStream(), image.stream, 0
+        time_s = self._num_frames / self.settings.frame_rate if image.time_s is None else image.time_s
+        if image.recorded is not None:
+            time_s = image.recorded.stamp_ns / 1e9
+        self._num_frames += 1
+        results = DetectResponse().results
+        self._following.follow(
+            Tracking(time_s=time_s, num_objects=num_objects),
+            [self._detector],
+            frame.pixels,
+            camera,
+            min_confidence=self.settings.min_confidence,
+            reduction=frame.reduction,
+            results=results,
+        )
+        return results
 
 
 class RemoteEstimator(Estimator):

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import PurePath
 
-from curio_proto.v1.detector_pb2 import Detection, RegionResult
+from curio_proto.v1.detector_pb2 import Detection, RegionResult, Track
 
 from curio_serve.batch.sources import RecordedAt
 from curio_serve.bop import LINEMOD_IDS
@@ -269,6 +269,7 @@ def bop_object_ids(objects: Sequence[str], given: int | None) -> dict[str, int]:
 
 
 def _detection_json(detection: Detection) -> dict[str, object]:
+    track = {"track": _track_json(detection.track)} if detection.HasField("track") else {}
     return {
         "object": detection.object,
         "confidence": round(detection.confidence, 6),
@@ -279,6 +280,22 @@ def _detection_json(detection: Detection) -> dict[str, object]:
         "color": list(detection.color) or None,
         "box_px": [[_finite(value) for value in corner] for corner in _rows(detection.box_px, 2)] or None,
         "outside_trained_range": detection.outside_trained_range,
+        **track,
+    }
+
+
+def _track_json(track: Track) -> dict[str, object]:
+    return {
+        "track_id": track.track_id,
+        "age_s": round(track.age_s, 6),
+        "unseen_s": round(track.unseen_s, 6),
+        "predicted": track.predicted,
+        "translation_m": list(track.translation_m),
+        "rotation": _rows(track.rotation, 3),
+        "quaternion_xyzw": list(track.quaternion_xyzw),
+        "velocity_m_s": list(track.velocity_m_s),
+        "position_std_m": list(track.position_std_m),
+        "rotation_std_rad": track.rotation_std_rad,
     }
 
 

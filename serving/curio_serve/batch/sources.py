@@ -83,6 +83,8 @@ class SourceImage:
     """For an image of a recording."""
     error: str = ""
     """Why a video has no frames to give, or a folder no images."""
+    time_s: float | None = None
+    """When a video's frame was taken, since its first, where that is known."""
 
     def read(self) -> bytes:
         """The bytes of an image file.
@@ -102,6 +104,11 @@ class SourceImage:
         except (OSError, ValueError) as exc:  # ValueError: a null byte in the name
             reason = exc.strerror if isinstance(exc, OSError) else str(exc)
             raise ImageError(f"cannot be read: {reason}") from exc
+
+    @property
+    def stream(self) -> str:
+        """The video or recording, or the folder whose images are frames of one camera in order."""
+        return os.path.dirname(self.path) if self.video_frame is None and self.recorded is None else self.path
 
     @property
     def relative_name(self) -> str:
@@ -326,13 +333,12 @@ def _video_frames(path: str) -> Iterator[SourceImage]:
         return
     capture = cv2.VideoCapture(path)
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    number = 0
+    number, rate = 0, capture.get(cv2.CAP_PROP_FPS)
     try:
-        while True:
-            is_read, pixels = capture.read()
-            if not is_read:
-                break
-            yield SourceImage(f"{path}#{number}", path, number, cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+        while (read := capture.read())[0]:
+            time_s = number / rate if rate > 0 else None
+            pixels = cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB)
+            yield SourceImage(f"{path}#{number}", path, number, pixels, time_s=time_s)
             number += 1
     finally:
         capture.release()

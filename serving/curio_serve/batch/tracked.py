@@ -1,0 +1,53 @@
+"""What ``curio-detect --track`` asks of its call: frames are followed one after the other, here, from the first on."""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from curio_serve.batch.arguments import DetectArguments
+from curio_serve.errors import UsageError
+from curio_serve.tracking.follower import MAX_OBJECTS
+
+if TYPE_CHECKING:
+    from curio_serve.batch.recorded_poses import PoseRecording
+    from curio_serve.batch.result_file import ResultFile
+    from curio_serve.batch.result_parts import ResultParts
+
+
+def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectArguments:
+    """The call with one image worked on at a time.
+
+    Raises:
+        UsageError: It asks for what following cannot do.
+    """
+    if remote := [model for model in models if not os.path.exists(model)]:
+        raise UsageError(
+            f"--track: {remote[0]} is behind a server; name a model on this machine, or set `track` in DetectStream"
+        )
+    is_recording = arguments.out is not None and arguments.out.lower().endswith(".mcap")
+    if arguments.ray is not None or arguments.format != "jsonl" or is_recording:
+        raise UsageError(
+            "--track follows on one machine and writes JSON Lines; leave out --ray and --format, and name --out so"
+        )
+    if arguments.max_detections is not None:
+        raise UsageError("--track: say by --track-objects how many are followed, and leave out --max-detections")
+    if not 1 <= arguments.track_objects <= MAX_OBJECTS:
+        raise UsageError(f"--track-objects {arguments.track_objects}: expected 1 to {MAX_OBJECTS}")
+    if not (math.isfinite(arguments.frame_rate) and arguments.frame_rate > 0):
+        raise UsageError(f"--frame-rate {arguments.frame_rate}: expected more than 0 frames/s")
+    return replace(arguments, jobs=1)
+
+
+def refuse_to_go_on(output: "ResultFile | ResultParts | PoseRecording") -> None:
+    """Refuse a result file that holds answers: who was followed in them is forgotten.
+
+    Raises:
+        UsageError: It holds some.
+    """
+    if output.num_images:
+        raise UsageError(
+            f"--track: {output.label} holds {output.num_images} images, and following cannot go on in the middle; "
+            "give --overwrite, or another --out"
+        )
