@@ -68,7 +68,7 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.read_ahead import read_ahead
     from curio_serve.batch.remote_files import is_url
     from curio_serve.batch.sources import STANDARD_INPUT, PassedOver, Topics, check_arguments, images
-    from curio_serve.batch.tracked import check_tracking, refuse_to_go_on
+    from curio_serve.batch.tracked import check_tracking, from_the_first
     from curio_serve.models.model_check import ChildCheck
 
     models, arguments = _models_first(arguments)
@@ -90,9 +90,9 @@ def run(arguments: DetectArguments) -> int:
     form = _format(arguments, estimators)
     passed_over, topics = PassedOver(), Topics(arguments.topic, arguments.info_topic)
     with _output(arguments, form, estimators) as output:
-        if arguments.track:
-            refuse_to_go_on(output)
         remaining = output.unanswered(images(arguments.images, passed_over, topics))
+        if arguments.track:
+            remaining = from_the_first(output, remaining)
         if arguments.ray is None:
             may_be_remote = any(name == STANDARD_INPUT or is_url(name) for name in arguments.images)
             content = read_ahead(remaining) if may_be_remote else remaining

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from curio_serve.batch.recorded_poses import PoseRecording
     from curio_serve.batch.result_file import ResultFile
     from curio_serve.batch.result_parts import ResultParts
+    from curio_serve.batch.sources import SourceImage
 
 
 def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectArguments:
@@ -40,14 +41,20 @@ def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectA
     return replace(arguments, jobs=1)
 
 
-def refuse_to_go_on(output: "ResultFile | ResultParts | PoseRecording") -> None:
-    """Refuse a result file that holds answers: who was followed in them is forgotten.
+def from_the_first(
+    output: "ResultFile | ResultParts | PoseRecording", remaining: "Iterator[SourceImage]"
+) -> "Iterator[SourceImage]":
+    """The images that are left, which have to be all: who was followed in those before is forgotten.
 
     Raises:
-        UsageError: It holds some.
+        UsageError: The result file holds answers to some.
     """
+    first = next(remaining, None)  # the file is read now
     if output.num_images:
         raise UsageError(
             f"--track: {output.label} holds {output.num_images} images, and following cannot go on in the middle; "
             "give --overwrite, or another --out"
         )
+    if first is not None:
+        yield first
+        yield from remaining
