@@ -60,6 +60,12 @@ class DetectArguments:
     """With --track: most objects of each model at a time."""
     frame_rate: float = 30.0
     """With --track: of a folder's images and of videos that say none, frames/s."""
+    refine: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Improve each pose by render-and-compare with the object's mesh: seconds a pose, and the extra train."""
+    mesh: Path | None = None
+    """Mesh for --refine. None: that of the run in whose folder the model lies."""
+    mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
+    """Unit of --mesh; the file's own, or metres, unless given. BOP's meshes are in mm."""
     exif_rotation: bool = False
     """Turn images as EXIF says, and K with them. Otherwise pixels are taken as stored, to which K belongs."""
     jobs: int = num_cores()

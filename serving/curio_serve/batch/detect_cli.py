@@ -66,6 +66,7 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.parallel import in_order
     from curio_serve.batch.progress import Progress
     from curio_serve.batch.read_ahead import read_ahead
+    from curio_serve.batch.refinement import refining
     from curio_serve.batch.remote_files import is_url
     from curio_serve.batch.sources import STANDARD_INPUT, PassedOver, Topics, check_arguments, images
     from curio_serve.batch.tracked import check_tracking, from_the_first
@@ -83,6 +84,7 @@ def run(arguments: DetectArguments) -> int:
         if os.path.exists(model):
             ChildCheck()(Path(model))
     estimators, recordings = _estimators(arguments, models, settings), _recordings(arguments)
+    refiner = refining(arguments, models[0], estimators)
     for estimator in estimators:
         _check_camera(arguments, estimator, recordings)
     if arguments.video is not None:
@@ -109,6 +111,9 @@ def run(arguments: DetectArguments) -> int:
                 progress.count(result)
         for line in passed_over.lines():
             print(f"curio-detect: {line}", file=sys.stderr)
+        if refiner is not None:
+            told = f"refined {refiner.num_refined} of {refiner.num_detections} poses; the others stay as detected"
+            print(f"curio-detect: {told}", file=sys.stderr)
         if output.num_images == 0:
             raise UsageError(
                 f"no images in {' '.join(arguments.images)}; looked for .jpg, .jpeg, .png and .webp in folders, "

@@ -62,7 +62,7 @@ _LEARNING_RATES = {"across": 0.01, "log_depth": 0.015, "turn": 0.03, "light": 0.
 _BETAS = (0.8, 0.95)  # of Adam: there are few steps
 _MIN_GAIN, _MAX_GAIN = 0.4, 2.0
 _MIN_VARIANCE = 0.002  # of colours below which gains are uncertain
-_DEFAULT_LIGHT = 0.0, -0.4, -0.5  # from above the camera, for poses that are not optimised
+DEFAULT_LIGHT = 0.0, -0.4, -0.5  # from above the camera, for poses that are not optimised
 _BATCH_SIZE = 32  # of poses that are not optimised
 
 
@@ -153,7 +153,7 @@ class RenderAndCompare:
         for first in range(0, len(images), _BATCH_SIZE):
             rows = slice(first, first + _BATCH_SIZE)
             part = index(code, rows)
-            part[LIGHT] = part[LIGHT].new_tensor(_DEFAULT_LIGHT).expand_as(part[LIGHT])
+            part[LIGHT] = part[LIGHT].new_tensor(DEFAULT_LIGHT).expand_as(part[LIGHT])
             crops = self._crops(images[rows], part, _ROUNDS[0].margin_px).blurred(1)
             estimate = crops.from_code(part)
             residual = crops.residual(self._rendered(crops, estimate, self._gain_and_offset(crops, estimate)))

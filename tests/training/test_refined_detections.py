@@ -1,0 +1,187 @@
+"""``curio-detect --refine``: poses come nearer to the truth, and a wrong mesh is refused with a reason."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+import torch
+from curio_proto.v1.model_spec_pb2 import CanonicalCamera, Field, ModelSpec, ObjectModel
+from curio_serve.batch import refinement
+from curio_serve.batch.arguments import DetectArguments
+from curio_serve.batch.detect_cli import run
+from curio_serve.errors import UsageError
+from curio_train.camera import Intrinsics
+from curio_train.config import RunConfig
+from curio_train.data.backgrounds import ClutterBackgrounds
+from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.learning.runs.configuration import to_json
+from curio_train.meshes.meshes import Mesh, to_ply
+from curio_train.meshes.shapes import chair
+from curio_train.scene_code import ROTATION_6D, TRANSLATION
+from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.world import Object
+from google.protobuf import json_format
+from onnx import TensorProto, helper, numpy_helper
+from scipy.spatial.transform import Rotation
+
+K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
+MESH = chair(0.12)
+OFF_DEG, OFF_DEPTH = 8.0, 1.04
+
+
+def constant_model(path: Path, rotation: np.ndarray, translation_m: np.ndarray) -> None:
+    """A model that finds its chair in the same pose in every image."""
+    rotation_6d = rotation[:, :2].T.reshape(1, 1, 6)
+    values = {
+        "translation_m": translation_m.reshape(1, 1, 3),
+        "rotation_6d": rotation_6d,
+        "rotation": rotation[None, None],
+    }
+    zero = [numpy_helper.from_array(np.float32(0), "zero"), numpy_helper.from_array(np.array([1, 2, 3]), "axes")]
+    nodes = [
+        helper.make_node("Cast", ["image"], ["float"], to=TensorProto.FLOAT),
+        helper.make_node("Mul", ["float", "zero"], ["black"]),
+        helper.make_node("ReduceSum", ["black", "axes"], ["none"], keepdims=0),
+    ]
+    for name, value in values.items():
+        shape = numpy_helper.from_array(np.array([-1, *[1] * (value.ndim - 1)]), f"{name}_shape")
+        zero += [shape, numpy_helper.from_array(value.astype(np.float32), f"{name}_value")]
+        nodes.append(helper.make_node("Reshape", ["none", f"{name}_shape"], [f"{name}_none"]))
+        nodes.append(helper.make_node("Add", [f"{name}_none", f"{name}_value"], [name]))
+    outputs = [helper.make_tensor_value_info(n, TensorProto.FLOAT, ["b", *v.shape[1:]]) for n, v in values.items()]
+    image = helper.make_tensor_value_info("image", TensorProto.UINT8, ["b", 480, 640, 3])
+    graph = helper.make_graph(nodes, "constant", [image], outputs, zero)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    part = ObjectModel(name="chair", diameter_m=MESH.diameter_m, box_corners_m=MESH.box_corners_m.ravel(), slots=[0])
+    spec = ModelSpec(
+        schema_version=1,
+        name="chair",
+        world="capture",
+        num_slots=1,
+        fields=[
+            Field(name=name, size=size, per_object=True, unit=unit, frame="camera")
+            for name, size, unit in (("translation_m", 3, "m"), ("rotation_6d", 6, "1"))
+        ],
+        objects=[part],
+        camera=CanonicalCamera(width=640, height=480, camera_matrix=K.ravel()),
+    )
+    entry = model.metadata_props.add(key="curio.model_spec")
+    entry.value = json_format.MessageToJson(spec)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    onnx.save(model, path)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run's folder with its mesh, a model that is off, and a frame of twice the size, rendered with ``truth``."""
+    folder = tmp_path_factory.mktemp("run")
+    kind = ObjectKind("chair", (0,), MESH.diameter_m, MESH.box_corners_m, MESH.sha256)
+    random = np.random.default_rng(3)
+    pool = cv2.resize(random.integers(0, 256, (24, 32, 3), np.uint8), (640, 480))[None]
+    object_ = Object(kind, MESH, Intrinsics(K, 640, 480), 0.5, 1.0, lambda _: ClutterBackgrounds(pool))
+    world = TwoStageWorld("linemod", object_)
+    code = world.sample(1, (1,))
+    code[TRANSLATION][..., :2] *= 0.6
+    picture = world.render(code, world.backgrounds(Path()).draw(1, 640, 480, (2,)))[0]
+    pixels = (picture.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+    large = cv2.resize(pixels, (1280, 960), interpolation=cv2.INTER_LINEAR)
+    cv2.imwrite(str(folder / "frame.png"), cv2.cvtColor(large, cv2.COLOR_RGB2BGR))
+    scaling = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
+    (folder / "camera.json").write_text(
+        json.dumps({"camera_matrix": (scaling @ K).tolist(), "width": 1280, "height": 960})
+    )
+    rotation, translation = truth(code)
+    np.savez(folder / "truth.npz", rotation=rotation, translation=translation)
+    turn = Rotation.from_rotvec(np.radians(OFF_DEG) * np.array([0.6, 0.0, 0.8])).as_matrix()
+    constant_model(folder / "models" / "chair.onnx", turn @ rotation, translation * OFF_DEPTH)
+    (folder / "part.ply").write_bytes(to_ply(MESH))
+    options = CaptureOptions((folder / "part.ply",), folder / "camera.json", folder)
+    (folder / "config.json").write_text(json.dumps(to_json(RunConfig(options))))
+    return folder
+
+
+def truth(code: Mapping[str, torch.Tensor]) -> tuple[np.ndarray, np.ndarray]:
+    return matrix_from_rotation_6d(code[ROTATION_6D][0, 0]).numpy(), code[TRANSLATION][0, 0].numpy()
+
+
+def detect(place: Path, **flags: Any) -> dict[str, Any]:
+    out = place / "out.jsonl"
+    flags = {"camera": place / "camera.json", "out": str(out), "overwrite": True} | flags
+    model = flags.pop("model", place / "models" / "chair.onnx")
+    assert run(DetectArguments(str(model), (str(place / "frame.png"),), **flags)) == 0
+    (found,) = json.loads(out.read_text())["detections"]
+    return found
+
+
+def rotation_error_deg(place: Path, found: Mapping[str, Any]) -> float:
+    with np.load(place / "truth.npz") as true:
+        turn = np.array(found["rotation"]) @ true["rotation"].T
+    return float(np.degrees(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())))
+
+
+def test_the_pose_comes_nearer_to_the_truth(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the mesh of the run that the model lies in; the box follows the pose."""
+    before, after = detect(place), detect(place, refine=True)
+    assert "refined 1 of 1 poses" in capsys.readouterr().err
+    assert rotation_error_deg(place, before) == pytest.approx(OFF_DEG, abs=0.1)
+    assert rotation_error_deg(place, after) < 3
+    with np.load(place / "truth.npz") as true:
+        depth = float(true["translation"][2])
+    assert abs(after["translation_m"][2] / depth - 1) < 0.015
+    assert after["confidence"] == before["confidence"]
+    camera = np.array(json.loads((place / "camera.json").read_text())["camera_matrix"])
+    seen = (MESH.box_corners_m @ np.array(after["rotation"]).T + after["translation_m"]) @ camera.T
+    np.testing.assert_allclose(after["box_px"], seen[:, :2] / seen[:, 2:], atol=0.01)
+
+
+def test_the_mesh_that_is_named_counts(place: Path) -> None:
+    mesh = place / "millimetres.ply"
+    mesh.write_bytes(to_ply(Mesh(MESH.vertices_m * 1000, MESH.faces)))
+    assert rotation_error_deg(place, detect(place, refine=True, mesh=mesh, mesh_unit="mm")) < 3
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "told"),
+    [
+        (25.4, 0.0, r"--mesh .*its diameter is 3\.7\d+ m, the model's object has 0\.1\d+ m.*--mesh-unit"),
+        (1.0, 0.02, "its box is from .* the model's from"),
+    ],
+)
+def test_another_mesh_is_refused(place: Path, tmp_path: Path, scale: float, shift: float, told: str) -> None:
+    mesh = tmp_path / "other.ply"
+    mesh.write_bytes(to_ply(Mesh(MESH.vertices_m * scale + shift, MESH.faces)))
+    with pytest.raises(UsageError, match=told):
+        detect(place, refine=True, mesh=mesh)
+
+
+def test_a_model_apart_from_its_run_needs_a_mesh(place: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "chair.onnx"
+    copy.write_bytes((place / "models" / "chair.onnx").read_bytes())
+    with pytest.raises(UsageError, match="give --mesh FILE, the mesh that chair was trained with"):
+        detect(place, model=copy, refine=True)
+
+
+@pytest.mark.parametrize(
+    ("flags", "told"),
+    [
+        ({"mesh": Path("part.ply")}, "--mesh and --mesh-unit are for --refine"),
+        ({"refine": True, "ray": "local"}, "leave out --ray"),
+        ({"refine": True, "mesh": Path("missing.ply")}, "missing.ply: the mesh cannot be read"),
+    ],
+)
+def test_calls_that_cannot_be_refined_are_refused(place: Path, flags: dict[str, Any], told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        detect(place, **flags)
+
+
+def test_a_missing_extra_is_named(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refinement, "_MODULE", "curio_train_is_not_here")
+    with pytest.raises(UsageError, match=r"pip install 'curio-pose\[train\]'"):
+        detect(place, refine=True)

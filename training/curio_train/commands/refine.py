@@ -1,0 +1,76 @@
+"""What ``curio-detect --refine`` asks this package for; its errors are serving's, because serving's command tells them.
+
+The command itself is serving's, which installs without this package's dependencies.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from curio_proto.v1.model_spec_pb2 import ModelSpec
+from curio_serve import errors as serving
+
+from curio_train.errors import CurioError, MeshError, UsageError
+
+if TYPE_CHECKING:
+    from curio_train.meshes.meshes import Mesh, Unit
+    from curio_train.refinement.detections import DetectionRefiner
+
+_LEVELS = 3  # RUN/models/NAME/VERSION
+
+
+def refiner(spec: ModelSpec, model: str, mesh: Path | None, unit: "Unit | None") -> "DetectionRefiner":
+    """Render-and-compare for a model's detections.
+
+    Args:
+        spec: Of the model.
+        model: As it was named.
+        mesh: Of its object; None: that of the run in whose folder the model lies.
+        unit: Of the mesh's coordinates; None: the file's own, or metres.
+
+    Raises:
+        curio_serve.errors.UsageError: The model does not find one kind of object in space, or there is no mesh of it.
+        curio_serve.errors.ModelError: The renderer cannot be used here.
+    """
+    if len(spec.objects) != 1 or not spec.camera.camera_matrix:
+        raise serving.UsageError(
+            f"--refine is for models of one kind of object in space; {spec.name or model} finds "
+            f"{len(spec.objects)} kinds in world {spec.world!r}"
+        )
+    from curio_train.refinement.detections import DetectionRefiner
+
+    try:
+        label, found = _mesh(spec, model, mesh, unit)
+        return DetectionRefiner(found, spec, label)
+    except (MeshError, UsageError) as exc:
+        raise serving.UsageError(f"--refine: {exc}") from exc
+    except CurioError as exc:
+        raise serving.ModelError(f"--refine: {exc}") from exc
+
+
+def _mesh(spec: ModelSpec, model: str, mesh: Path | None, unit: "Unit | None") -> tuple[str, "Mesh"]:
+    from curio_train.meshes.meshes import load_mesh
+
+    if mesh is not None:
+        return f"--mesh {mesh}", load_mesh(mesh, unit)
+    beside = _of_run(Path(model))
+    if beside is None:
+        raise UsageError(
+            f"found no mesh with {model}: it lies in no run's folder of a part; give --mesh FILE, the mesh that "
+            f"{spec.objects[0].name} was trained with"
+        )
+    return str(beside[0]), load_mesh(*beside)
+
+
+def _of_run(model: Path) -> "tuple[Path, Unit | None, str | None] | None":
+    """File, unit and body of the mesh that a run was trained with, where a model lies in its folder."""
+    from curio_train.learning.runs.checkpoint import RunFolder
+    from curio_train.learning.runs.configuration import CONFIG_FILE
+    from curio_train.worlds.options import CaptureOptions
+
+    for folder in list(model.absolute().parents)[: _LEVELS + 1]:
+        if (folder / CONFIG_FILE).is_file():
+            world = RunFolder.open(folder).config.world
+            if isinstance(world, CaptureOptions):
+                return world.mesh[0], world.mesh_unit, world.body
+            return None
+    return None
