@@ -11,7 +11,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 PROTOS := $(shell cd proto && find curio_proto -name '*.proto' | sort)
 PROTOC := $(BIN)/python -m grpc_tools.protoc -Iproto
-BENCHMARKS := $(filter-out benchmarks/screenshot.py benchmarks/demo.py benchmarks/endurance.py benchmarks/results.py benchmarks/curiosity.py benchmarks/linemod.py benchmarks/samples.py benchmarks/scale.py,$(wildcard benchmarks/*.py))
+BENCHMARKS := $(filter-out benchmarks/screenshot.py benchmarks/demo.py benchmarks/endurance.py benchmarks/results.py benchmarks/curiosity.py benchmarks/linemod.py benchmarks/samples.py benchmarks/scale.py benchmarks/refinement.py benchmarks/instances.py,$(wildcard benchmarks/*.py))
 
 # Every recipe is one bash script that stops at the first failure.
 SHELL := /bin/bash

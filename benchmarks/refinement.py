@@ -1,6 +1,6 @@
 """What ``curio-detect --refine`` gains, and what it costs, on rendered frames of LineMOD's objects.
 
-    python benchmarks/refinement.py models/ape --data DIR [--json FILE]
+    python benchmarks/refinement.py models/ape --data DIR [--json]
 
 add_recall          fraction of frames whose ADD(-S) is below a tenth of the diameter, as detected and refined
 add_diameters       median ADD(-S) in diameters
@@ -11,7 +11,6 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tyro
@@ -40,8 +39,8 @@ class Settings:
     """BOP data set with its mesh."""
     num_frames: int = 100
     """Held-out renderings."""
-    json: Path | None = None
-    """File for the figures."""
+    json: bool = False
+    """Print one JSON object on the last line."""
     cache: Path = CACHE
     """Where clutter is kept."""
 
@@ -79,21 +78,12 @@ def main() -> None:
         "milliseconds": {name: round(1000 * float(np.median(seconds)), 1) for name, seconds in spent.items()},
         "machine": machine(),
     }
-    written(figures, settings.json)
+    print(json.dumps(figures, indent=None if settings.json else 1))
 
 
 def pose(detection: Detection) -> Pose:
     """cam_from_obj of a detection."""
     return Pose(np.reshape(detection.rotation, (3, 3)), np.array(detection.translation_m))
-
-
-def written(figures: dict[str, Any], path: Path | None) -> None:
-    """Print the figures, or write them."""
-    text = json.dumps(figures, indent=1)
-    if path is None:
-        print(text)
-    else:
-        path.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -77,7 +77,7 @@ class Region(_message.Message):
     def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., width: _Optional[float] = ..., height: _Optional[float] = ...) -> None: ...
 
 class DetectRequest(_message.Message):
-    __slots__ = ("request_id", "models", "encoded", "raw", "camera", "regions", "min_confidence", "max_detections", "apply_exif_rotation", "track")
+    __slots__ = ("request_id", "models", "encoded", "raw", "camera", "regions", "min_confidence", "max_detections", "apply_exif_rotation", "track", "max_instances")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     MODELS_FIELD_NUMBER: _ClassVar[int]
     ENCODED_FIELD_NUMBER: _ClassVar[int]
@@ -88,6 +88,7 @@ class DetectRequest(_message.Message):
     MAX_DETECTIONS_FIELD_NUMBER: _ClassVar[int]
     APPLY_EXIF_ROTATION_FIELD_NUMBER: _ClassVar[int]
     TRACK_FIELD_NUMBER: _ClassVar[int]
+    MAX_INSTANCES_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     models: _containers.RepeatedCompositeFieldContainer[ModelSelector]
     encoded: bytes
@@ -98,7 +99,8 @@ class DetectRequest(_message.Message):
     max_detections: int
     apply_exif_rotation: bool
     track: Tracking
-    def __init__(self, request_id: _Optional[str] = ..., models: _Optional[_Iterable[_Union[ModelSelector, _Mapping]]] = ..., encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., regions: _Optional[_Iterable[_Union[Region, _Mapping]]] = ..., min_confidence: _Optional[float] = ..., max_detections: _Optional[int] = ..., apply_exif_rotation: bool = ..., track: _Optional[_Union[Tracking, _Mapping]] = ...) -> None: ...
+    max_instances: int
+    def __init__(self, request_id: _Optional[str] = ..., models: _Optional[_Iterable[_Union[ModelSelector, _Mapping]]] = ..., encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., regions: _Optional[_Iterable[_Union[Region, _Mapping]]] = ..., min_confidence: _Optional[float] = ..., max_detections: _Optional[int] = ..., apply_exif_rotation: bool = ..., track: _Optional[_Union[Tracking, _Mapping]] = ..., max_instances: _Optional[int] = ...) -> None: ...
 
 class Tracking(_message.Message):
     __slots__ = ("time_s", "keep_s", "num_objects", "search", "restart")

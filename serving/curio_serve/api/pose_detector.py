@@ -147,6 +147,7 @@ class PoseService(PoseDetectorServicer):
                     regions=regions,
                     min_confidence=min_confidence,
                     max_detections=request.max_detections or None,
+                    max_instances=request.max_instances if request.HasField("max_instances") else None,
                     reduction=frame.reduction,
                     results=answer.results,
                     before_run=before_run,
@@ -175,10 +176,11 @@ class PoseService(PoseDetectorServicer):
             raise ArgumentError(f"request_id has {len(request.request_id)} characters; at most {_MAX_ID_LENGTH}")
         if request.HasField("max_detections") and not request.max_detections:
             raise ArgumentError("max_detections is 0; leave it out for no limit, or give at least 1")
-        most_runs = max(limits.max_models, limits.max_regions)
-        if len(models) * num_regions > most_runs:
+        most_runs, num_instances = max(limits.max_models, limits.max_regions), request.max_instances or 1
+        if (num_runs := len(models) * max(num_regions, 1) * num_instances) > most_runs:
+            times = f" times {num_instances} instances" if num_instances > 1 else ""
             raise ArgumentError(
-                f"{len(models)} models times {num_regions} regions are {len(models) * num_regions} runs of a network; "
+                f"{len(models)} models times {max(num_regions, 1)} regions{times} are {num_runs} runs of a network; "
                 f"at most {most_runs} are accepted (the larger of --max-models and --max-regions)"
             )
         found = [self._repository.get(model.name, model.version) for model in models]
@@ -195,8 +197,10 @@ def _check_following(request: messages.DetectRequest, following: FollowingStream
     """
     if following is None:
         raise ArgumentError("track is set in a single call; objects are followed in DetectStream")
-    if request.regions or request.HasField("max_detections"):
-        raise ArgumentError("regions and max_detections are not for following; leave them out, or leave out track")
+    if request.regions or request.HasField("max_detections") or request.HasField("max_instances"):
+        raise ArgumentError(
+            "regions, max_detections and max_instances are not for following; leave them out, or leave out track"
+        )
     return following
 
 

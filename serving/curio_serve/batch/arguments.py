@@ -54,6 +54,8 @@ class DetectArguments:
     """Leave out detections below, 0 to 1."""
     max_detections: int | None = None
     """Keep that many of an image, the most confident. None: all."""
+    max_instances: int | None = None
+    """Find up to that many of each kind of object, at a further run of the network each. None: what one run gives."""
     track: bool = False
     """Follow objects through the frames of each video, or of each folder's images in order: JSON Lines have tracks."""
     track_objects: int = 1

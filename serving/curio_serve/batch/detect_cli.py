@@ -152,6 +152,8 @@ def _check_numbers(arguments: DetectArguments) -> None:
         raise UsageError(f"--min-confidence {arguments.min_confidence}: expected 0 to 1")
     if arguments.max_detections is not None and arguments.max_detections < 1:
         raise UsageError(f"--max-detections {arguments.max_detections}: expected at least 1")
+    if arguments.max_instances is not None and not 1 <= arguments.max_instances <= 16:
+        raise UsageError(f"--max-instances {arguments.max_instances}: expected 1 to 16")
     if arguments.obj_id is not None and (arguments.format != "bop" or arguments.obj_id < 1):
         raise UsageError(f"--obj-id {arguments.obj_id}: expected a number from 1, together with --format bop")
 
@@ -176,6 +178,7 @@ def _settings(arguments: DetectArguments) -> "Settings":
         common_folder(arguments.images or ["."]),
         arguments.track_objects if arguments.track else None,
         arguments.frame_rate,
+        arguments.max_instances,
     )
 
 
@@ -292,6 +295,8 @@ def _output(
 
 def _check_camera(arguments: DetectArguments, estimator: "Estimator", recordings: "list[Recording]") -> None:
     canonical = estimator.canonical
+    if arguments.max_instances is not None and canonical.matrix is None:
+        raise UsageError(f"--max-instances is for poses in space; the world of {estimator.name} is flat")
     if arguments.camera is not None or canonical.matrix is None or canonical.is_default:
         return
     for recording in recordings:

@@ -57,6 +57,8 @@ class Settings:
     """Follow that many objects of each model from image to image; None: every image on its own."""
     frame_rate: float = 30.0
     """Of images that do not say when they were taken, frames/s."""
+    max_instances: int | None = None
+    """Of each kind of object; None: what one run of the network gives."""
 
 
 @dataclass(frozen=True)
@@ -247,6 +249,7 @@ class LocalEstimator(Estimator):
                 camera,
                 min_confidence=self.settings.min_confidence,
                 max_detections=self.settings.max_detections,
+                max_instances=self.settings.max_instances,
                 reduction=frame.reduction,
             )
         else:
@@ -310,6 +313,7 @@ class RemoteEstimator(Estimator):
             camera,
             min_confidence=self.settings.min_confidence,
             max_detections=self.settings.max_detections,
+            max_instances=self.settings.max_instances,
         )
         camera = camera or self.canonical.for_frame(answer.width, answer.height)
         spent = answer.milliseconds

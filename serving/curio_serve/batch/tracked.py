@@ -32,8 +32,10 @@ def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectA
         raise UsageError(
             "--track follows on one machine and writes JSON Lines; leave out --ray and --format, and name --out so"
         )
-    if arguments.max_detections is not None:
-        raise UsageError("--track: say by --track-objects how many are followed, and leave out --max-detections")
+    if arguments.max_detections is not None or arguments.max_instances is not None:
+        raise UsageError(
+            "--track: say by --track-objects how many are followed, and leave out --max-detections and --max-instances"
+        )
     if not 1 <= arguments.track_objects <= MAX_OBJECTS:
         raise UsageError(f"--track-objects {arguments.track_objects}: expected 1 to {MAX_OBJECTS}")
     if not (math.isfinite(arguments.frame_rate) and arguments.frame_rate > 0):

@@ -108,6 +108,7 @@ class PoseClient(_Client):
         regions: Iterable[RegionLike] = (),
         min_confidence: float | None = None,
         max_detections: int | None = None,
+        max_instances: int | None = None,
         apply_exif_rotation: bool = False,
         color: Literal["rgb", "bgr"] = "rgb",
         request_id: str = "",
@@ -124,6 +125,8 @@ class PoseClient(_Client):
             regions: Rectangles to search, each (x, y, width, height) in pixels; none: the whole frame.
             min_confidence: Detections below it are left out; None: the server's own threshold.
             max_detections: Largest number a region and model, the most confident; None: no limit.
+            max_instances: Most of each kind of object and region, 1 to 16, by further runs of a network that reads one
+                pose; None: what one run gives.
             apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
             color: Order of the channels of pixels; OpenCV reads images as ``bgr``.
             request_id: Comes back with the answer; empty: the server makes one up.
@@ -139,6 +142,7 @@ class PoseClient(_Client):
             regions=regions,
             min_confidence=min_confidence,
             max_detections=max_detections,
+            max_instances=max_instances,
             apply_exif_rotation=apply_exif_rotation,
             color=color,
             request_id=request_id,

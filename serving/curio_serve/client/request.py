@@ -31,6 +31,7 @@ def detect_request(
     regions: Iterable[RegionLike] = (),
     min_confidence: float | None = None,
     max_detections: int | None = None,
+    max_instances: int | None = None,
     apply_exif_rotation: bool = False,
     color: Literal["rgb", "bgr"] = "rgb",
     request_id: str = "",
@@ -45,6 +46,7 @@ def detect_request(
         regions: Each (x, y, width, height) in pixels.
         min_confidence: None: the server's own threshold.
         max_detections: None: no limit.
+        max_instances: Most of each kind of object and region, 1 to 16; None: what one run of the network gives.
         apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
         color: Order of the channels of pixels; OpenCV reads images as ``bgr``.
         request_id: Comes back with the answer; empty: the server makes one up.
@@ -61,6 +63,7 @@ def detect_request(
         regions=[_region(region) for region in regions],
         min_confidence=min_confidence,
         max_detections=max_detections,
+        max_instances=max_instances,
         apply_exif_rotation=apply_exif_rotation,
         track=track,
     )

@@ -1,8 +1,9 @@
 """Detects a model's objects in the regions of a frame. No gRPC here."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from curio_proto.v1.detector_pb2 import (
@@ -18,6 +19,7 @@ from curio_serve.errors import ArgumentError, CameraError, CameraMissing, ImageE
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
+from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Values
 from curio_serve.models.model import Model, Slot
 
 if TYPE_CHECKING:
@@ -26,11 +28,18 @@ if TYPE_CHECKING:
     Results = RepeatedCompositeFieldContainer[RegionResult]
 
 Array = np.ndarray
-Values = Mapping[str, Any]  # outputs of one image by name, as plain numbers
 _REDUCTIONS = (8, 4, 2)
 _MAX_BATCH = 8
 _DEPTH_TOLERANCE = 0.01  # of the range: an object at its end is as likely beyond it
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class _Limits(NamedTuple):
+    """What is left out of an answer."""
+
+    min_confidence: float
+    max_detections: int | None
+    max_instances: int | None
 
 
 class Detector:
@@ -51,6 +60,7 @@ class Detector:
         regions: Sequence[Region] = (),
         min_confidence: float = 0.0,
         max_detections: int | None = None,
+        max_instances: int | None = None,
         reduction: int = 1,
         results: "Results | None" = None,
         before_run: Callable[[], None] = lambda: None,
@@ -63,6 +73,8 @@ class Detector:
             regions: Rectangles to search, in pixels of the full-size frame; none: the whole frame.
             min_confidence: Detections below it are left out; 0 … 1.
             max_detections: Most detections a region; None: all.
+            max_instances: Most instances of each kind of object a region, by a further run of the network for each of
+                them where it reads one pose; None: what one run gives.
             reduction: How much smaller than the frame the pixels were decoded.
             results: The field of a response to which results are added; None: a new one.
             before_run: Called before each run of the network; what it raises ends the detection.
@@ -74,24 +86,48 @@ class Detector:
             CameraMissing: The model needs K.
             CameraError: K cannot be this frame's, or gives a pose that is not finite.
             ImageError: The pixels are not uint8 RGB.
-            ArgumentError: A region or threshold is out of range.
+            ArgumentError: A region, threshold or number is out of range, or ``max_instances`` of a flat world.
             InternalError: The network failed.
         """
         _check_arguments(pixels, regions, min_confidence)
+        self._check_instances(max_instances)
+        limits = _Limits(min_confidence, max_detections, max_instances)
         frame = self._frame(pixels, camera, reduction)
         crops = [
             frame.crop(region) if region.overlaps(frame.width, frame.height) else None
             for region in regions or [Region(0, 0, frame.width, frame.height)]
         ]
-        outputs = iter(self._outputs([crop.image for crop in crops if crop is not None], before_run))
+        readings = iter(self._readings([crop.image for crop in crops if crop is not None], max_instances, before_run))
         results = DetectResponse().results if results is None else results
         for index, crop in enumerate(crops):
             result = results.add(model=self.model.name, model_version=self.model.version, region=index)
             if crop is None:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
-                _fill(result, crop, self.model.slots, next(outputs), min_confidence, max_detections, self.depths_m)
+                _fill(result, crop, self.model.slots, next(readings), limits, self.depths_m)
         return results
+
+    def _readings(self, images: list[Array], max_instances: int | None, before_run: Callable[[], None]) -> list[Values]:
+        """The network's outputs for each image; of a network that reads one pose, a row an instance."""
+        outputs = self._outputs(images, before_run)
+        if max_instances in (None, 1) or len(self.model.slots) > 1:
+            return outputs
+        searches = [InstanceSearch(self.model, image) for image in images]
+        going_on = [search for search, values in zip(searches, outputs, strict=True) if search.take(values)]
+        for _ in range((max_instances or 1) - 1):
+            outputs = self._outputs([search.image for search in going_on], before_run)
+            going_on = [search for search, values in zip(going_on, outputs, strict=True) if search.take(values)]
+        return [search.outputs() for search in searches]
+
+    def _check_instances(self, max_instances: int | None) -> None:
+        if max_instances is None:
+            return
+        if not 1 <= max_instances <= MAX_INSTANCES:
+            raise ArgumentError(f"max_instances is {max_instances}; expected 1 to {MAX_INSTANCES}")
+        if self.model.camera.matrix is None:
+            raise ArgumentError(
+                f"max_instances is for poses in space; model {self.model.label} is of a flat world, leave it out"
+            )
 
     def _outputs(self, images: list[Array], before_run: Callable[[], None]) -> list[Values]:
         """The network's outputs for each image, computed a few at a time: memory stays flat however many there are."""
@@ -162,13 +198,23 @@ def _check_arguments(pixels: Array, regions: Sequence[Region], min_confidence: f
             )
 
 
+def _first_of_each(rows: list[int], slots: Sequence[Slot], count: int) -> list[int]:
+    """The first rows of each kind of object, at most that many, in their order."""
+    numbers = Counter[str]()
+    kept = []
+    for row in rows:
+        numbers[slots[row].object] += 1
+        if numbers[slots[row].object] <= count:
+            kept.append(row)
+    return kept
+
+
 def _fill(
     result: RegionResult,
     crop: Crop,
     slots: Sequence[Slot],
     values: Values,
-    min_confidence: float,
-    max_detections: int | None,
+    limits: _Limits,
     depths_m: tuple[float, float],
 ) -> None:
     """Write the most confident detections of one crop into a result, best first, in the frame's camera.
@@ -178,14 +224,17 @@ def _fill(
     """
     if "light" in values:
         result.light.extend(crop.rotate([[value] for value in values["light"]]))
+    slots = [*slots] * (len(values["translation_m"]) // len(slots))
     confidences = [min(max(c, 0.0), 1.0) for c in values.get("confidence", [1.0] * len(slots))]
-    confident = [row for row, confidence in enumerate(confidences) if confidence >= min_confidence]
+    confident = [row for row, confidence in enumerate(confidences) if confidence >= limits.min_confidence]
     if not confident:
         result.status = REGION_STATUS_NO_OBJECT
         return
     result.status = REGION_STATUS_DETECTED
     confident.sort(key=confidences.__getitem__, reverse=True)
-    for row in confident[:max_detections]:
+    if limits.max_instances is not None:
+        confident = _first_of_each(confident, slots, limits.max_instances)
+    for row in confident[: limits.max_detections]:
         translation = crop.translation(values["translation_m"][row])
         rotation = crop.rotate(values["rotation"][row]) if "rotation" in values else ()
         if not all(map(math.isfinite, (*translation, *rotation, *result.light))):

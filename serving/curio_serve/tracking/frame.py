@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
 from curio_proto.v1.detector_pb2 import Track as TrackMessage
@@ -13,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from curio_serve.imaging.camera import PinholeCamera, scaling
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.models.detector import Detector, transformed
+from curio_serve.models.instances import cover, enlarged
 from curio_serve.tracking.tracks import Measurement, Track
 
 Array = np.ndarray
-_MARGIN = 1.15  # of a box that hides an object
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,14 +110,9 @@ class StreamFrame:
 
     def _cover(self, pixels: Array, camera: PinholeCamera, track: Track) -> None:
         """Paint over an object's box with the mean colour of its corners' surroundings, in place."""
-        pose = track.measured
-        corners = np.reshape(track.kind.box_corners_m, (-1, 3)) * _MARGIN
+        pose, corners = track.measured, np.reshape(track.kind.box_corners_m, (-1, 3))
         if not len(corners):
             return
-        seen = camera.project(corners @ pose.rotation.T + pose.translation_m)
-        if not np.isfinite(seen).all():
-            return
-        hull = cv2.convexHull(seen.round().astype(np.int32))
-        inside = np.clip(hull[:, 0], 0, (pixels.shape[1] - 1, pixels.shape[0] - 1))
-        color = pixels[inside[:, 1], inside[:, 0]].mean(axis=0)
-        cv2.fillConvexPoly(pixels, hull, tuple(color.tolist()))
+        seen = camera.project(enlarged(corners) @ pose.rotation.T + pose.translation_m)
+        if np.isfinite(seen).all():
+            cover(pixels, seen)
