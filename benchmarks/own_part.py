@@ -1,14 +1,16 @@
 """The README's section "Your own part" as a user would type it, timed and scored.
 
-    python benchmarks/own_part.py [--minutes 26.5] [--photos 200] [--tests 50] [--out runs/own_part] [--json]
+    python benchmarks/own_part.py [--minutes 26.5] [--photos 200] [--tests 50] [--step] [--commands BIN] [--json]
 
 An unpainted STL, 200 path traced photographs of it on a table, a background image and a camera file, calibrated from
 photographs of a chessboard, are made first (see ``benchmarks/make_captures.py``); what is there already is kept. Then
-the installed commands look at the files, train and export, and detect in 50 photographs that nothing has seen. The last
-line is the result, also in OUT/own_part.json:
+the installed commands look at the files, train and export, detect in 50 photographs that nothing has seen, and do that
+again through a server. With --step the mesh is a STEP file that OpenCASCADE has drawn. The last line is the result,
+also in OUT/own_part.json:
 
 right       share of the unseen photographs in which ADD(-S) is below a tenth of the diameter
 add_median  of ADD(-S), in diameters
+served_as   largest difference between a served and a local position, metres
 seconds     of each command; of all of them as "total"
 """
 
@@ -43,6 +45,10 @@ def main() -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("runs/own_part"), help="what an earlier call trained is replaced"
     )
+    parser.add_argument("--step", action="store_true", help="the mesh as a STEP file (package cadquery-ocp-novtk)")
+    parser.add_argument(
+        "--commands", type=Path, default=Path(sys.executable).parent, help="folder of the installed commands"
+    )
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
     arguments = parser.parse_args()
 
@@ -50,8 +56,17 @@ def main() -> None:
     make("part", out, Amount(arguments.photos, arguments.tests, _SAMPLES_PER_PIXEL), _show)
     files = out / "part"
     shutil.rmtree(out / "run", ignore_errors=True)
-    seconds = _as_typed(files, out, arguments.minutes)
-    scored = _score(files, out / "poses.jsonl")
+    given = ["--mesh", str(files / "meshes" / "bracket.stl"), "--mesh-unit", "m"]
+    if arguments.step:
+        from synthetic_captures.step_file import write_bracket
+
+        given = ["--mesh", str(files / "meshes" / "bracket.step")]
+        write_bracket(files / "meshes" / "bracket.step")
+    commands = arguments.commands.absolute()
+    seconds = _as_typed(commands, given, files, out, arguments.minutes)
+    seconds["serve"] = _served(commands, files, out)
+    seconds["total"] = round(sum(seconds.values()), 1)
+    scored = _score(files, out / "poses.jsonl") | {"served_as": _difference(out)}
     machine = json.loads((out / "run" / "sittings.jsonl").read_text(encoding="utf-8").splitlines()[0])["machine"]
     result = scored | {"seconds": seconds, "machine": machine, "minutes": arguments.minutes, "photos": arguments.photos}
     (out / "own_part.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
@@ -62,28 +77,52 @@ def _show(text: str) -> None:
     print(f"\r{text}", end="", file=sys.stderr)
 
 
-def _as_typed(files: Path, out: Path, minutes: float) -> dict[str, float]:
-    """The commands, and how long each took."""
-    mesh, camera = str(files / "meshes" / "bracket.stl"), str(files / "camera.json")
-    given = ["--mesh", mesh, "--mesh-unit", "m", "--camera", camera, "--photos", str(files / "photos")]
+def _as_typed(commands: Path, mesh: list[str], files: Path, out: Path, minutes: float) -> dict[str, float]:
+    """The commands that need no server, and how long each took."""
+    camera = str(files / "camera.json")
+    given = [*mesh, "--camera", camera, "--photos", str(files / "photos")]
     given += ["--background", str(files / "plates" / "a-0.png")]
     distances = ["--near-m", str(_NEAR_M), "--far-m", str(_FAR_M)]
     run, poses = out / "run", out / "poses.jsonl"
     poses.unlink(missing_ok=True)
-    commands = {
+    typed = {
         "look": ["curio-doctor", *given],
         "train": ["curio-train", "capture", *given, *distances, "--minutes", str(minutes), "--out", str(run)],
         "detect": ["curio-detect", str(run / "models" / "bracket"), str(files / "test" / "a"), "--camera", camera],
     }
-    commands["detect"] += ["--out", str(poses), "--overlays", str(out / "overlays")]
-    seconds: dict[str, float] = {}
-    for name, (command, *flags) in commands.items():
-        begun = time.monotonic()
-        done = subprocess.run([Path(sys.executable).with_name(command), *flags], check=False, env=os.environ)
-        if done.returncode:
-            sys.exit(f"{command} {' '.join(flags)} ended with status {done.returncode}")
-        seconds[name] = round(time.monotonic() - begun, 1)
-    return seconds | {"total": round(sum(seconds.values()), 1)}
+    typed["detect"] += ["--out", str(poses), "--overlays", str(out / "overlays")]
+    return {name: _call(commands, *call) for name, call in typed.items()}
+
+
+def _call(commands: Path, command: str, *flags: str) -> float:
+    """Run a command to its good end; seconds."""
+    begun = time.monotonic()
+    done = subprocess.run([commands / command, *flags], check=False, env=os.environ)
+    if done.returncode:
+        sys.exit(f"{command} {' '.join(flags)} ended with status {done.returncode}")
+    return round(time.monotonic() - begun, 1)
+
+
+def _served(commands: Path, files: Path, out: Path) -> float:
+    """The same photographs through the server; seconds."""
+    begun = time.monotonic()
+    line = [commands / "curio-serve", out / "run" / "models", "--port", "0"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True, stderr=subprocess.DEVNULL) as server:
+        assert server.stdout is not None
+        address = server.stdout.readline().split()[-1]
+        flags = ["--camera", str(files / "camera.json"), "--out", str(out / "served.jsonl"), "--overwrite"]
+        _call(commands, "curio-detect", f"{address}/bracket", str(files / "test" / "a"), *flags)
+        server.terminate()
+    return round(time.monotonic() - begun, 1)
+
+
+def _difference(out: Path) -> float:
+    """Largest difference between a served and a local position, metres."""
+    places = [
+        [json.loads(line)["detections"][0]["translation_m"] for line in (out / name).read_text().splitlines()]
+        for name in ("poses.jsonl", "served.jsonl")
+    ]
+    return float(np.abs(np.subtract(*places)).max())
 
 
 def _score(files: Path, poses: Path) -> dict[str, Any]:

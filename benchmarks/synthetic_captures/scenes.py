@@ -72,21 +72,31 @@ def bunny_like() -> Mesh:
     return Mesh(np.asarray(whole.vertices, np.float64), np.asarray(whole.faces, np.int64))
 
 
+BRACKET_BLOCKS = (
+    ((0.08, 0.012, 0.05), (0.0, 0.0, 0.0)),
+    ((0.014, 0.05, 0.05), (-0.033, 0.031, 0.0)),
+    ((0.03, 0.02, 0.01), (-0.011, 0.016, 0.014)),
+)
+"""Of the bracket: a base, an upright and a rib, extents and centre of each, metres."""
+
+BRACKET_PIN = ((0.024, 0.016, -0.008), 0.009, 0.03)
+"""Of the bracket: centre, radius and height of a cylinder along y, metres."""
+
+BRACKET_MIDDLE = (0.0, 0.025, 0.0)
+"""The middle of their bounding box, which is the bracket's origin."""
+
+
 def bracket() -> Mesh:
     """A machined part of about 10 cm: a base with an upright, a rib on one side and a pin. No two sides are alike."""
-    blocks = [
-        ((0.08, 0.012, 0.05), (0.0, 0.0, 0.0)),
-        ((0.014, 0.05, 0.05), (-0.033, 0.031, 0.0)),
-        ((0.03, 0.02, 0.01), (-0.011, 0.016, 0.014)),
-    ]
     parts = []
-    for extents, centre in blocks:
+    for extents, centre in BRACKET_BLOCKS:
         block = trimesh.creation.box(extents)
         block.apply_translation(centre)
         parts.append(block)
-    pin = trimesh.creation.cylinder(radius=0.009, height=0.03, sections=32)
+    place, radius, height = BRACKET_PIN
+    pin = trimesh.creation.cylinder(radius=radius, height=height, sections=32)
     pin.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
-    pin.apply_translation((0.024, 0.016, -0.008))
+    pin.apply_translation(place)
     whole: Any = trimesh.util.concatenate([*parts, pin])
     whole.apply_translation(-whole.bounds.mean(axis=0))
     return Mesh(np.asarray(whole.vertices, np.float64), np.asarray(whole.faces, np.int64))

@@ -289,6 +289,7 @@ def test_from_files_to_a_model_by_a_project_file(
     assert call("--resume", run, "--cache", cache) == 0, "nothing was lost"
     told = capsys.readouterr().err
     assert f"curio-serve {run / 'models'}" in told
+    assert "by its photographs, without labels: Do not trust it: in 0% of" in told
     assert f"curio-detect {run / 'models' / 'bracket'} PHOTOS --camera {folder / 'camera.json'}" in told
     assert (run / "models" / "bracket" / "1" / "model.onnx").is_file()
     config = RunFolder.open(run).config

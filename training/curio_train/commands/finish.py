@@ -28,8 +28,9 @@ def end(run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None]) 
     """
     from curio_train.evaluation.report import REPORT_FILE, report_training
 
+    verdict = ""
     try:
-        report_training(run, cache)
+        verdict = report_training(run, cache)
     except CurioError as exc:
         warn(str(exc))
     if not isinstance(config.world, CaptureOptions):
@@ -37,10 +38,10 @@ def end(run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None]) 
             f"to see what it learned: {run / REPORT_FILE}, or curio-view {run}\n"
             f"to serve it: curio-export {run} --out models/, then curio-serve models/"
         )
-    return _exported(run, config.world.camera)
+    return _exported(run, config.world.camera, verdict)
 
 
-def _exported(run: Path, camera: Path) -> str:
+def _exported(run: Path, camera: Path, verdict: str) -> str:
     from curio_train.export.graph import export
 
     models = run / MODELS_FOLDER
@@ -53,6 +54,7 @@ def _exported(run: Path, camera: Path) -> str:
         ) from exc
     return (
         f"{done.path}: the model, {done.num_bytes / 1e6:.1f} MB; what it finds in the photographs: {run}/report.html\n"
-        f"to serve it: curio-serve {models}\n"
+        + (f"by its photographs, without labels: {verdict}\n" if verdict else "")
+        + f"to serve it: curio-serve {models}\n"
         f"to try it:   curio-detect {done.path.parent} PHOTOS --camera {camera} --out poses.jsonl --overlays overlays/"
     )

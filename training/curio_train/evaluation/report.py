@@ -35,8 +35,11 @@ _NUM_COMPARED = 48  # training images whose re-renderings are compared with them
 _LIBRARIES = ("curio-pose", "torch", "mitsuba", "drjit", "numpy")
 
 
-def report_training(run: Path, cache: Path) -> None:
+def report_training(run: Path, cache: Path) -> str:
     """The report of a run that has just ended. Opens no label file.
+
+    Returns:
+        The verdict on the model by photographs; empty where there are none to judge by.
 
     Raises:
         CurioError: The report could not be made. The run is none the worse.
@@ -49,6 +52,7 @@ def report_training(run: Path, cache: Path) -> None:
     except DataError as exc:
         raise ReportError(f"{run / REPORT_FILE} could not be written ({exc}); the run itself is whole") from exc
     write_report(run, subject, "train", cache, judgement=judgement)
+    return "" if judgement is None else judgement.verdict
 
 
 def write_report(
