@@ -23,6 +23,7 @@ HELP = {
     "train-linemod-all": "curio-train linemod --help-all",
     "train-capture-all": "curio-train capture --help-all",
     "train-capture-calibrate": "curio-train capture --calibrate",
+    "train-capture-assistant": "curio-train capture --assistant",
     "eval": "curio-eval",
     "export": "curio-export",
     "doctor": "curio-doctor",

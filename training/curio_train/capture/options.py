@@ -1,4 +1,4 @@
-"""What a user may choose about calibration, as plain data: the flags of ``curio-train capture --calibrate``."""
+"""What a user may choose about calibration and about taking photographs, as plain data."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,3 +38,33 @@ class CalibrateCommand:
     """The camera file to write."""
     views_out: Path | None = None
     """File for where each photograph was taken: cam_from_world, y up, origin on the ground."""
+
+
+@dataclass(frozen=True)
+class AssistantCommand:
+    """Take photographs of a part, or of a calibration board, with a camera that is watched.
+
+    Sharp, well exposed frames that differ from those already kept become files, until there are enough. The frames, and
+    what is wrong with them, are shown in the browser on this machine alone.
+    """
+
+    out: Path
+    """Folder for the photographs; those that are there count."""
+    assistant: tyro.conf.FlagCreatePairsOff[bool] = False
+    """This command."""
+    video: str = "0"
+    """A camera's number, a video file, or a folder of photographs."""
+    board: tuple[int, int] | None = None
+    """Squares, or inner corners, of a chessboard or ChArUco board along and across: only frames that show it are
+    kept."""
+    marker_mm: float | None = None
+    """Side of a ChArUco marker, where squares have 30 mm; a plain chessboard has none."""
+    dictionary: str = "DICT_4X4_50"
+    """OpenCV's name of the markers' dictionary."""
+    background: Path | None = None
+    """Photograph of the empty scene by the camera as it stands: only frames that differ from it are kept. Where there
+    is none, the first good frame becomes it: leave the part away until it is taken."""
+    count: int | None = None
+    """How many are enough. None: 80 of a part, from which on a model learns from them, and 20 of a board."""
+    port: int = 8080
+    """Port of the page, on 127.0.0.1."""

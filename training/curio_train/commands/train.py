@@ -13,7 +13,7 @@ import tyro
 from curio_serve.version import answer_version
 from tyro.conf import OmitArgPrefixes
 
-from curio_train.capture.options import CalibrateCommand
+from curio_train.capture.options import AssistantCommand, CalibrateCommand
 from curio_train.commands.field_help import join_help_lines, parsed
 from curio_train.commands.project_file import with_project
 from curio_train.commands.running import CACHE, answer, tell, warn
@@ -61,6 +61,9 @@ def train(arguments: Sequence[str] | None = None) -> None:
     if given[:1] == ["capture"] and "--calibrate" in given:
         calibration = parsed(CalibrateCommand, given[1:], "curio-train capture")
         sys.exit(answer(lambda _: _calibrate(calibration)))
+    if given[:1] == ["capture"] and "--assistant" in given:
+        assistance = parsed(AssistantCommand, given[1:], "curio-train capture")
+        sys.exit(answer(lambda interruption: _assist(assistance, interruption)))
     sys.exit(answer(lambda interruption: _train(parse(given), interruption)))
 
 
@@ -74,6 +77,12 @@ def _calibrate(command: CalibrateCommand) -> int:
 
     print(run(command, by_objects))
     return 0
+
+
+def _assist(command: AssistantCommand, interruption: Interruption) -> int:
+    from curio_train.commands.assist import run
+
+    return run(command, interruption, tell)
 
 
 def parse(arguments: list[str]) -> TrainCommand:

@@ -48,10 +48,8 @@ def measure(path: Path) -> Photograph:
     """
     pixels = read_photograph(path)
     height, width = pixels.shape[:2]
-    scale = min(1.0, _MEASURED_PX / max(width, height))
-    small = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else pixels
-    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     orientation, focal = _exif(path)
+    blur, lost = sharpness_and_exposure(pixels)
     return Photograph(
         path=path,
         width=width,
@@ -59,10 +57,19 @@ def measure(path: Path) -> Photograph:
         orientation=orientation,
         focal_35mm=focal,
         thumbnail=thumbnail(pixels),
-        # The measure compares an image with itself blurred; of one without any contrast nothing can be said.
-        blur=float(blur_effect(grey)) if np.ptp(grey) > 0 else 0.0,
-        lost=float(((grey < _BLACK) | (grey > _WHITE)).mean()),
+        blur=blur,
+        lost=lost,
     )
+
+
+def sharpness_and_exposure(pixels: np.ndarray) -> tuple[float, float]:
+    """What :class:`Photograph` calls ``blur`` and ``lost``, of an image [height, width, 3] uint8."""
+    scale = min(1.0, _MEASURED_PX / max(pixels.shape[:2]))
+    small = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else pixels
+    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    # The measure compares an image with itself blurred; of one without any contrast nothing can be said.
+    blur = float(blur_effect(grey)) if np.ptp(grey) > 0 else 0.0
+    return blur, float(((grey < _BLACK) | (grey > _WHITE)).mean())
 
 
 def thumbnail(pixels: np.ndarray) -> np.ndarray:
@@ -80,11 +87,11 @@ def _exif(path: Path) -> tuple[int, float]:
     return int(numbers[0]) or 1, float(numbers[1])
 
 
-_BLURRED = 0.6  # sharp photographs of clutter: up to 0.45; blurred with a sigma of 2.5 pixels: 0.65 and more
+BLURRED = 0.6  # sharp photographs of clutter: up to 0.45; blurred with a sigma of 2.5 pixels: 0.65 and more
 _TOLERATED = 0.1  # fraction of photographs
 _EQUAL_LEVELS = 4.0  # two frames of one static scene differ by more somewhere, if anything moved
 _COMPARED = 60  # neighbours in brightness that each is compared with
-_MOSTLY_LOST = 0.6
+MOSTLY_LOST = 0.6
 _BETTER_SWAPPED = 0.6
 
 
@@ -97,7 +104,7 @@ def examine_content(photographs: Sequence[Photograph]) -> Iterator[Finding]:
 
 
 def _blur(photographs: Sequence[Photograph]) -> Iterator[Finding]:
-    blurred = [photo for photo in photographs if photo.blur > _BLURRED]
+    blurred = [photo for photo in photographs if photo.blur > BLURRED]
     if len(blurred) > _TOLERATED * len(photographs):
         worst = max(blurred, key=lambda photo: photo.blur)
         text = f"{len(blurred)} of {len(photographs)} are blurred, most of all {worst.path.name}"
@@ -125,7 +132,7 @@ def _duplicates(photographs: Sequence[Photograph]) -> Iterator[Finding]:
 
 
 def _exposure(photographs: Sequence[Photograph]) -> Iterator[Finding]:
-    lost = [photo for photo in photographs if photo.lost > _MOSTLY_LOST]
+    lost = [photo for photo in photographs if photo.lost > MOSTLY_LOST]
     if len(lost) > _TOLERATED * len(photographs):
         text = f"{len(lost)} of {len(photographs)} are mostly black or white, for instance {lost[0].path.name}"
         yield Finding("photograph exposure", "warning", text, "Expose for the object", "likely", fault="exposure")

@@ -103,7 +103,9 @@ class LinemodOptions(WorldOptions):
 
 @dataclass(frozen=True)
 class CaptureOptions(WorldOptions):
-    """A part of your own, from its CAD file, in six degrees of freedom. With --calibrate: find out its camera instead.
+    """A part of your own, from its CAD file, in six degrees of freedom. Camera: --calibrate; photos: --assistant.
+
+    With --calibrate: find out its camera instead. With --assistant: take its photographs with a camera on this machine.
 
     With --plane: one or more parts on a table or floor, learned from the photographs.
     """
