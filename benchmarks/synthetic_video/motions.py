@@ -56,6 +56,17 @@ def side_by_side(num: int, random: np.random.Generator, depth_m: float = 0.9) ->
     return poses(left, _viewpoint(random), num), poses(right, _viewpoint(random), num)
 
 
+def on_a_grid(num: int, random: np.random.Generator, count: int = 8, depth_m: float = 1.15) -> list[Path6]:
+    """Objects in two rows that each wander by a few centimetres."""
+    columns = (count + 1) // 2
+    places = [((column - (columns - 1) / 2) * 0.28, (row - 0.5) * 0.36) for row in (0, 1) for column in range(columns)]
+    seconds, found = np.arange(num)[:, None] / FRAMES_PER_SECOND, []
+    for x, y in places[:count]:
+        offset = 0.03 * np.sin(seconds * random.uniform(1, 2, 3) + random.uniform(0, 6, 3))
+        found.append(poses(offset + np.array([x, y, depth_m]), _viewpoint(random), num))
+    return found
+
+
 def poses(position_m: np.ndarray, rotation: Rotation, num: int) -> Path6:
     """Matrices of positions [frames, 3] and of one rotation or one a frame."""
     found = np.repeat(np.eye(4)[None], num, axis=0)

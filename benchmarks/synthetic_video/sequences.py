@@ -39,21 +39,20 @@ class Sequence6:
 
 
 class Studio:
-    """One camera before which objects of one mesh are moved."""
+    """One camera before which objects are moved."""
 
-    def __init__(self, mesh: Mesh, num_objects: int = 1, scale: float = 1.0) -> None:
+    def __init__(self, meshes: Sequence[Mesh], scale: float = 1.0) -> None:
         """Build the scene.
 
         Args:
-            mesh: Of the objects, metres.
-            num_objects: How many there are.
+            meshes: Of each object, metres.
             scale: Size of the frames relative to 640x480.
         """
         width, height = (round(side * scale) for side in SIZE)
         half = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
-        self.matrix, self._size, self._num = half @ MATRIX, (width, height), num_objects
-        kinds = [0] * num_objects + [1]
-        self._renderer = Renderer([mesh, box(_BOARD_M)], kinds, width, height, ambient=_AMBIENT)
+        self.matrix, self._size, self._num = half @ MATRIX, (width, height), len(meshes)
+        kinds = list(range(len(meshes) + 1))
+        self._renderer = Renderer([*meshes, box(_BOARD_M)], kinds, width, height, ambient=_AMBIENT)
 
     def film(self, paths: Sequence[np.ndarray], random: np.random.Generator, hidden: slice | None = None) -> Sequence6:
         """Render objects on their paths.
@@ -72,9 +71,9 @@ class Studio:
             self._render(cam_from_obj[start : start + _BATCH], is_hidden[start : start + _BATCH], background)
             for start in range(0, len(cam_from_obj), _BATCH)
         ]
-        seen = np.concatenate(frames).astype(np.float32)
-        noisy = seen + random.normal(0, _NOISE, seen.shape).astype(np.float32)
-        return Sequence6(noisy.clip(0, 255).astype(np.uint8), self.matrix, cam_from_obj, is_hidden)
+        seen = np.concatenate(frames)
+        noisy = np.stack([_noisy(frame, random) for frame in seen])
+        return Sequence6(noisy, self.matrix, cam_from_obj, is_hidden)
 
     @torch.no_grad()
     def _render(self, cam_from_obj: np.ndarray, hidden: np.ndarray, background: torch.Tensor) -> np.ndarray:
@@ -94,6 +93,12 @@ class Studio:
         )
         pixels: np.ndarray = (images.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).numpy()
         return pixels
+
+
+def _noisy(frame: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    changed = frame + _NOISE * random.standard_normal(frame.shape, np.float32)
+    result: np.ndarray = changed.clip(0, 255).astype(np.uint8)
+    return result
 
 
 def clutter(width: int, height: int, random: np.random.Generator, num: int = 60) -> UInt8[np.ndarray, "h w 3"]:

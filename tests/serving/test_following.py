@@ -16,9 +16,10 @@ from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.crop_stage import CROP_STAGE_KEY, CropStageNote
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
+from curio_serve.models.symmetries import symmetry_rotations
 from curio_serve.tracking.pose_filter import PoseFilter
 from curio_serve.tracking.stream import FollowingStream
-from curio_serve.tracking.tracks import Measurement, Track, assign, symmetry_rotations, without_doubles
+from curio_serve.tracking.tracks import Measurement, Track, assign, without_doubles
 from scipy.spatial.transform import Rotation
 
 ROOT = Path(__file__).parents[2]

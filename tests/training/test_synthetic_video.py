@@ -9,7 +9,7 @@ from synthetic_video.sequences import Studio
 
 @pytest.fixture(scope="module")
 def studio() -> Studio:
-    return Studio(box((0.1, 0.08, 0.12)), num_objects=2, scale=0.25)
+    return Studio([box((0.1, 0.08, 0.12))] * 2, scale=0.25)
 
 
 def test_objects_are_seen_where_the_truth_puts_them(studio: Studio) -> None:

@@ -25,17 +25,17 @@ _sym_db = _symbol_database.Default()
 from curio_proto.v1 import model_spec_pb2 as curio__proto_dot_v1_dot_model__spec__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1d\x63urio_proto/v1/detector.proto\x12\x08\x63urio.v1\x1a\x1f\x63urio_proto/v1/model_spec.proto\".\n\rModelSelector\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\r\"n\n\x08RawImage\x12%\n\x06\x66ormat\x18\x01 \x01(\x0e\x32\x15.curio.v1.PixelFormat\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\x0e\n\x06stride\x18\x04 \x01(\r\x12\x0c\n\x04\x64\x61ta\x18\x05 \x01(\x0c\"R\n\x06\x43\x61mera\x12\x15\n\rcamera_matrix\x18\x01 \x03(\x01\x12\x12\n\ndistortion\x18\x02 \x03(\x01\x12\r\n\x05width\x18\x03 \x01(\r\x12\x0e\n\x06height\x18\x04 \x01(\r\"=\n\x06Region\x12\t\n\x01x\x18\x01 \x01(\x02\x12\t\n\x01y\x18\x02 \x01(\x02\x12\r\n\x05width\x18\x03 \x01(\x02\x12\x0e\n\x06height\x18\x04 \x01(\x02\"\xad\x03\n\rDetectRequest\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\'\n\x06models\x18\x02 \x03(\x0b\x32\x17.curio.v1.ModelSelector\x12\x11\n\x07\x65ncoded\x18\x03 \x01(\x0cH\x00\x12!\n\x03raw\x18\x04 \x01(\x0b\x32\x12.curio.v1.RawImageH\x00\x12 \n\x06\x63\x61mera\x18\x05 \x01(\x0b\x32\x10.curio.v1.Camera\x12!\n\x07regions\x18\x06 \x03(\x0b\x32\x10.curio.v1.Region\x12\x1b\n\x0emin_confidence\x18\x07 \x01(\x02H\x01\x88\x01\x01\x12\x1b\n\x0emax_detections\x18\x08 \x01(\rH\x02\x88\x01\x01\x12\x1b\n\x13\x61pply_exif_rotation\x18\t \x01(\x08\x12&\n\x05track\x18\n \x01(\x0b\x32\x12.curio.v1.TrackingH\x03\x88\x01\x01\x12\x1a\n\rmax_instances\x18\x0b \x01(\rH\x04\x88\x01\x01\x42\x07\n\x05imageB\x11\n\x0f_min_confidenceB\x11\n\x0f_max_detectionsB\x08\n\x06_trackB\x10\n\x0e_max_instances\"\x95\x01\n\x08Tracking\x12\x13\n\x06time_s\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x13\n\x06keep_s\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12\x18\n\x0bnum_objects\x18\x03 \x01(\rH\x02\x88\x01\x01\x12\x0e\n\x06search\x18\x04 \x01(\x08\x12\x0f\n\x07restart\x18\x05 \x01(\x08\x42\t\n\x07_time_sB\t\n\x07_keep_sB\x0e\n\x0c_num_objects\"\xe4\x01\n\tDetection\x12\x0e\n\x06object\x18\x01 \x01(\t\x12\x12\n\nconfidence\x18\x02 \x01(\x02\x12\x15\n\rtranslation_m\x18\x03 \x03(\x01\x12\x13\n\x0brotation_6d\x18\x04 \x03(\x01\x12\x10\n\x08rotation\x18\x05 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x06 \x03(\x01\x12\r\n\x05\x63olor\x18\x07 \x03(\x01\x12\x0e\n\x06\x62ox_px\x18\x08 \x03(\x01\x12\x1d\n\x15outside_trained_range\x18\t \x01(\x08\x12\x1e\n\x05track\x18\n \x01(\x0b\x32\x0f.curio.v1.Track\"\xd7\x01\n\x05Track\x12\x10\n\x08track_id\x18\x01 \x01(\x04\x12\r\n\x05\x61ge_s\x18\x02 \x01(\x01\x12\x10\n\x08unseen_s\x18\x03 \x01(\x01\x12\x11\n\tpredicted\x18\x04 \x01(\x08\x12\x15\n\rtranslation_m\x18\x05 \x03(\x01\x12\x10\n\x08rotation\x18\x06 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x07 \x03(\x01\x12\x14\n\x0cvelocity_m_s\x18\x08 \x03(\x01\x12\x16\n\x0eposition_std_m\x18\t \x03(\x01\x12\x18\n\x10rotation_std_rad\x18\n \x01(\x01\"\xa4\x01\n\x0cRegionResult\x12\r\n\x05model\x18\x01 \x01(\t\x12\x15\n\rmodel_version\x18\x02 \x01(\r\x12\x0e\n\x06region\x18\x03 \x01(\r\x12&\n\x06status\x18\x04 \x01(\x0e\x32\x16.curio.v1.RegionStatus\x12\'\n\ndetections\x18\x05 \x03(\x0b\x32\x13.curio.v1.Detection\x12\r\n\x05light\x18\x06 \x03(\x01\"@\n\x0cMilliseconds\x12\r\n\x05queue\x18\x01 \x01(\x01\x12\x0e\n\x06\x64\x65\x63ode\x18\x02 \x01(\x01\x12\x11\n\tinference\x18\x03 \x01(\x01\";\n\nFrameError\x12\x0c\n\x04\x63ode\x18\x01 \x01(\r\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x0f\n\x07message\x18\x03 \x01(\t\"\xbf\x01\n\x0e\x44\x65tectResponse\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\'\n\x07results\x18\x04 \x03(\x0b\x32\x16.curio.v1.RegionResult\x12,\n\x0cmilliseconds\x18\x05 \x01(\x0b\x32\x16.curio.v1.Milliseconds\x12#\n\x05\x65rror\x18\x06 \x01(\x0b\x32\x14.curio.v1.FrameError\"\x13\n\x11ListModelsRequest\"K\n\tModelInfo\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x10\n\x08versions\x18\x02 \x03(\r\x12\r\n\x05world\x18\x03 \x01(\t\x12\x0f\n\x07objects\x18\x04 \x03(\t\"9\n\x12ListModelsResponse\x12#\n\x06models\x18\x01 \x03(\x0b\x32\x13.curio.v1.ModelInfo\"9\n\x0fGetModelRequest\x12&\n\x05model\x18\x01 \x01(\x0b\x32\x17.curio.v1.ModelSelector\"F\n\x10GetModelResponse\x12!\n\x04spec\x18\x01 \x01(\x0b\x32\x13.curio.v1.ModelSpec\x12\x0f\n\x07version\x18\x02 \x01(\r*q\n\x0bPixelFormat\x12\x1c\n\x18PIXEL_FORMAT_UNSPECIFIED\x10\x00\x12\x15\n\x11PIXEL_FORMAT_RGB8\x10\x01\x12\x15\n\x11PIXEL_FORMAT_BGR8\x10\x02\x12\x16\n\x12PIXEL_FORMAT_GRAY8\x10\x03*\x87\x01\n\x0cRegionStatus\x12\x1d\n\x19REGION_STATUS_UNSPECIFIED\x10\x00\x12\x1a\n\x16REGION_STATUS_DETECTED\x10\x01\x12\x1b\n\x17REGION_STATUS_NO_OBJECT\x10\x02\x12\x1f\n\x1bREGION_STATUS_OUTSIDE_FRAME\x10\x03\x32\x9e\x02\n\x0cPoseDetector\x12;\n\x06\x44\x65tect\x12\x17.curio.v1.DetectRequest\x1a\x18.curio.v1.DetectResponse\x12\x45\n\x0c\x44\x65tectStream\x12\x17.curio.v1.DetectRequest\x1a\x18.curio.v1.DetectResponse(\x01\x30\x01\x12G\n\nListModels\x12\x1b.curio.v1.ListModelsRequest\x1a\x1c.curio.v1.ListModelsResponse\x12\x41\n\x08GetModel\x12\x19.curio.v1.GetModelRequest\x1a\x1a.curio.v1.GetModelResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1d\x63urio_proto/v1/detector.proto\x12\x08\x63urio.v1\x1a\x1f\x63urio_proto/v1/model_spec.proto\".\n\rModelSelector\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\r\"n\n\x08RawImage\x12%\n\x06\x66ormat\x18\x01 \x01(\x0e\x32\x15.curio.v1.PixelFormat\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\x0e\n\x06stride\x18\x04 \x01(\r\x12\x0c\n\x04\x64\x61ta\x18\x05 \x01(\x0c\"R\n\x06\x43\x61mera\x12\x15\n\rcamera_matrix\x18\x01 \x03(\x01\x12\x12\n\ndistortion\x18\x02 \x03(\x01\x12\r\n\x05width\x18\x03 \x01(\r\x12\x0e\n\x06height\x18\x04 \x01(\r\"=\n\x06Region\x12\t\n\x01x\x18\x01 \x01(\x02\x12\t\n\x01y\x18\x02 \x01(\x02\x12\r\n\x05width\x18\x03 \x01(\x02\x12\x0e\n\x06height\x18\x04 \x01(\x02\"\xcc\x03\n\rDetectRequest\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\'\n\x06models\x18\x02 \x03(\x0b\x32\x17.curio.v1.ModelSelector\x12\x11\n\x07\x65ncoded\x18\x03 \x01(\x0cH\x00\x12!\n\x03raw\x18\x04 \x01(\x0b\x32\x12.curio.v1.RawImageH\x00\x12 \n\x06\x63\x61mera\x18\x05 \x01(\x0b\x32\x10.curio.v1.Camera\x12!\n\x07regions\x18\x06 \x03(\x0b\x32\x10.curio.v1.Region\x12\x1b\n\x0emin_confidence\x18\x07 \x01(\x02H\x01\x88\x01\x01\x12\x1b\n\x0emax_detections\x18\x08 \x01(\rH\x02\x88\x01\x01\x12\x1b\n\x13\x61pply_exif_rotation\x18\t \x01(\x08\x12&\n\x05track\x18\n \x01(\x0b\x32\x12.curio.v1.TrackingH\x03\x88\x01\x01\x12\x1a\n\rmax_instances\x18\x0b \x01(\rH\x04\x88\x01\x01\x12\x1d\n\x05views\x18\x0c \x03(\x0b\x32\x0e.curio.v1.ViewB\x07\n\x05imageB\x11\n\x0f_min_confidenceB\x11\n\x0f_max_detectionsB\x08\n\x06_trackB\x10\n\x0e_max_instances\"}\n\x04View\x12\x11\n\x07\x65ncoded\x18\x01 \x01(\x0cH\x00\x12!\n\x03raw\x18\x02 \x01(\x0b\x32\x12.curio.v1.RawImageH\x00\x12 \n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x10.curio.v1.Camera\x12\x14\n\x0c\x63\x61m_from_rig\x18\x04 \x03(\x01\x42\x07\n\x05image\"\x95\x01\n\x08Tracking\x12\x13\n\x06time_s\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x13\n\x06keep_s\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12\x18\n\x0bnum_objects\x18\x03 \x01(\rH\x02\x88\x01\x01\x12\x0e\n\x06search\x18\x04 \x01(\x08\x12\x0f\n\x07restart\x18\x05 \x01(\x08\x42\t\n\x07_time_sB\t\n\x07_keep_sB\x0e\n\x0c_num_objects\"\xf3\x01\n\tDetection\x12\x0e\n\x06object\x18\x01 \x01(\t\x12\x12\n\nconfidence\x18\x02 \x01(\x02\x12\x15\n\rtranslation_m\x18\x03 \x03(\x01\x12\x13\n\x0brotation_6d\x18\x04 \x03(\x01\x12\x10\n\x08rotation\x18\x05 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x06 \x03(\x01\x12\r\n\x05\x63olor\x18\x07 \x03(\x01\x12\x0e\n\x06\x62ox_px\x18\x08 \x03(\x01\x12\x1d\n\x15outside_trained_range\x18\t \x01(\x08\x12\x1e\n\x05track\x18\n \x01(\x0b\x32\x0f.curio.v1.Track\x12\r\n\x05views\x18\x0b \x03(\r\"\xd7\x01\n\x05Track\x12\x10\n\x08track_id\x18\x01 \x01(\x04\x12\r\n\x05\x61ge_s\x18\x02 \x01(\x01\x12\x10\n\x08unseen_s\x18\x03 \x01(\x01\x12\x11\n\tpredicted\x18\x04 \x01(\x08\x12\x15\n\rtranslation_m\x18\x05 \x03(\x01\x12\x10\n\x08rotation\x18\x06 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x07 \x03(\x01\x12\x14\n\x0cvelocity_m_s\x18\x08 \x03(\x01\x12\x16\n\x0eposition_std_m\x18\t \x03(\x01\x12\x18\n\x10rotation_std_rad\x18\n \x01(\x01\"\xa4\x01\n\x0cRegionResult\x12\r\n\x05model\x18\x01 \x01(\t\x12\x15\n\rmodel_version\x18\x02 \x01(\r\x12\x0e\n\x06region\x18\x03 \x01(\r\x12&\n\x06status\x18\x04 \x01(\x0e\x32\x16.curio.v1.RegionStatus\x12\'\n\ndetections\x18\x05 \x03(\x0b\x32\x13.curio.v1.Detection\x12\r\n\x05light\x18\x06 \x03(\x01\"@\n\x0cMilliseconds\x12\r\n\x05queue\x18\x01 \x01(\x01\x12\x0e\n\x06\x64\x65\x63ode\x18\x02 \x01(\x01\x12\x11\n\tinference\x18\x03 \x01(\x01\";\n\nFrameError\x12\x0c\n\x04\x63ode\x18\x01 \x01(\r\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x0f\n\x07message\x18\x03 \x01(\t\"\xbf\x01\n\x0e\x44\x65tectResponse\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\'\n\x07results\x18\x04 \x03(\x0b\x32\x16.curio.v1.RegionResult\x12,\n\x0cmilliseconds\x18\x05 \x01(\x0b\x32\x16.curio.v1.Milliseconds\x12#\n\x05\x65rror\x18\x06 \x01(\x0b\x32\x14.curio.v1.FrameError\"\x13\n\x11ListModelsRequest\"K\n\tModelInfo\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x10\n\x08versions\x18\x02 \x03(\r\x12\r\n\x05world\x18\x03 \x01(\t\x12\x0f\n\x07objects\x18\x04 \x03(\t\"9\n\x12ListModelsResponse\x12#\n\x06models\x18\x01 \x03(\x0b\x32\x13.curio.v1.ModelInfo\"9\n\x0fGetModelRequest\x12&\n\x05model\x18\x01 \x01(\x0b\x32\x17.curio.v1.ModelSelector\"F\n\x10GetModelResponse\x12!\n\x04spec\x18\x01 \x01(\x0b\x32\x13.curio.v1.ModelSpec\x12\x0f\n\x07version\x18\x02 \x01(\r*q\n\x0bPixelFormat\x12\x1c\n\x18PIXEL_FORMAT_UNSPECIFIED\x10\x00\x12\x15\n\x11PIXEL_FORMAT_RGB8\x10\x01\x12\x15\n\x11PIXEL_FORMAT_BGR8\x10\x02\x12\x16\n\x12PIXEL_FORMAT_GRAY8\x10\x03*\x87\x01\n\x0cRegionStatus\x12\x1d\n\x19REGION_STATUS_UNSPECIFIED\x10\x00\x12\x1a\n\x16REGION_STATUS_DETECTED\x10\x01\x12\x1b\n\x17REGION_STATUS_NO_OBJECT\x10\x02\x12\x1f\n\x1bREGION_STATUS_OUTSIDE_FRAME\x10\x03\x32\x9e\x02\n\x0cPoseDetector\x12;\n\x06\x44\x65tect\x12\x17.curio.v1.DetectRequest\x1a\x18.curio.v1.DetectResponse\x12\x45\n\x0c\x44\x65tectStream\x12\x17.curio.v1.DetectRequest\x1a\x18.curio.v1.DetectResponse(\x01\x30\x01\x12G\n\nListModels\x12\x1b.curio.v1.ListModelsRequest\x1a\x1c.curio.v1.ListModelsResponse\x12\x41\n\x08GetModel\x12\x19.curio.v1.GetModelRequest\x1a\x1a.curio.v1.GetModelResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'curio_proto.v1.detector_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_PIXELFORMAT']._serialized_start=2192
-  _globals['_PIXELFORMAT']._serialized_end=2305
-  _globals['_REGIONSTATUS']._serialized_start=2308
-  _globals['_REGIONSTATUS']._serialized_end=2443
+  _globals['_PIXELFORMAT']._serialized_start=2365
+  _globals['_PIXELFORMAT']._serialized_end=2478
+  _globals['_REGIONSTATUS']._serialized_start=2481
+  _globals['_REGIONSTATUS']._serialized_end=2616
   _globals['_MODELSELECTOR']._serialized_start=76
   _globals['_MODELSELECTOR']._serialized_end=122
   _globals['_RAWIMAGE']._serialized_start=124
@@ -45,31 +45,33 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_REGION']._serialized_start=320
   _globals['_REGION']._serialized_end=381
   _globals['_DETECTREQUEST']._serialized_start=384
-  _globals['_DETECTREQUEST']._serialized_end=813
-  _globals['_TRACKING']._serialized_start=816
-  _globals['_TRACKING']._serialized_end=965
-  _globals['_DETECTION']._serialized_start=968
-  _globals['_DETECTION']._serialized_end=1196
-  _globals['_TRACK']._serialized_start=1199
-  _globals['_TRACK']._serialized_end=1414
-  _globals['_REGIONRESULT']._serialized_start=1417
-  _globals['_REGIONRESULT']._serialized_end=1581
-  _globals['_MILLISECONDS']._serialized_start=1583
-  _globals['_MILLISECONDS']._serialized_end=1647
-  _globals['_FRAMEERROR']._serialized_start=1649
-  _globals['_FRAMEERROR']._serialized_end=1708
-  _globals['_DETECTRESPONSE']._serialized_start=1711
-  _globals['_DETECTRESPONSE']._serialized_end=1902
-  _globals['_LISTMODELSREQUEST']._serialized_start=1904
-  _globals['_LISTMODELSREQUEST']._serialized_end=1923
-  _globals['_MODELINFO']._serialized_start=1925
-  _globals['_MODELINFO']._serialized_end=2000
-  _globals['_LISTMODELSRESPONSE']._serialized_start=2002
-  _globals['_LISTMODELSRESPONSE']._serialized_end=2059
-  _globals['_GETMODELREQUEST']._serialized_start=2061
-  _globals['_GETMODELREQUEST']._serialized_end=2118
-  _globals['_GETMODELRESPONSE']._serialized_start=2120
-  _globals['_GETMODELRESPONSE']._serialized_end=2190
-  _globals['_POSEDETECTOR']._serialized_start=2446
-  _globals['_POSEDETECTOR']._serialized_end=2732
+  _globals['_DETECTREQUEST']._serialized_end=844
+  _globals['_VIEW']._serialized_start=846
+  _globals['_VIEW']._serialized_end=971
+  _globals['_TRACKING']._serialized_start=974
+  _globals['_TRACKING']._serialized_end=1123
+  _globals['_DETECTION']._serialized_start=1126
+  _globals['_DETECTION']._serialized_end=1369
+  _globals['_TRACK']._serialized_start=1372
+  _globals['_TRACK']._serialized_end=1587
+  _globals['_REGIONRESULT']._serialized_start=1590
+  _globals['_REGIONRESULT']._serialized_end=1754
+  _globals['_MILLISECONDS']._serialized_start=1756
+  _globals['_MILLISECONDS']._serialized_end=1820
+  _globals['_FRAMEERROR']._serialized_start=1822
+  _globals['_FRAMEERROR']._serialized_end=1881
+  _globals['_DETECTRESPONSE']._serialized_start=1884
+  _globals['_DETECTRESPONSE']._serialized_end=2075
+  _globals['_LISTMODELSREQUEST']._serialized_start=2077
+  _globals['_LISTMODELSREQUEST']._serialized_end=2096
+  _globals['_MODELINFO']._serialized_start=2098
+  _globals['_MODELINFO']._serialized_end=2173
+  _globals['_LISTMODELSRESPONSE']._serialized_start=2175
+  _globals['_LISTMODELSRESPONSE']._serialized_end=2232
+  _globals['_GETMODELREQUEST']._serialized_start=2234
+  _globals['_GETMODELREQUEST']._serialized_end=2291
+  _globals['_GETMODELRESPONSE']._serialized_start=2293
+  _globals['_GETMODELRESPONSE']._serialized_end=2363
+  _globals['_POSEDETECTOR']._serialized_start=2619
+  _globals['_POSEDETECTOR']._serialized_end=2905
 # @@protoc_insertion_point(module_scope)

@@ -77,7 +77,7 @@ class Region(_message.Message):
     def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., width: _Optional[float] = ..., height: _Optional[float] = ...) -> None: ...
 
 class DetectRequest(_message.Message):
-    __slots__ = ("request_id", "models", "encoded", "raw", "camera", "regions", "min_confidence", "max_detections", "apply_exif_rotation", "track", "max_instances")
+    __slots__ = ("request_id", "models", "encoded", "raw", "camera", "regions", "min_confidence", "max_detections", "apply_exif_rotation", "track", "max_instances", "views")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     MODELS_FIELD_NUMBER: _ClassVar[int]
     ENCODED_FIELD_NUMBER: _ClassVar[int]
@@ -89,6 +89,7 @@ class DetectRequest(_message.Message):
     APPLY_EXIF_ROTATION_FIELD_NUMBER: _ClassVar[int]
     TRACK_FIELD_NUMBER: _ClassVar[int]
     MAX_INSTANCES_FIELD_NUMBER: _ClassVar[int]
+    VIEWS_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     models: _containers.RepeatedCompositeFieldContainer[ModelSelector]
     encoded: bytes
@@ -100,7 +101,20 @@ class DetectRequest(_message.Message):
     apply_exif_rotation: bool
     track: Tracking
     max_instances: int
-    def __init__(self, request_id: _Optional[str] = ..., models: _Optional[_Iterable[_Union[ModelSelector, _Mapping]]] = ..., encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., regions: _Optional[_Iterable[_Union[Region, _Mapping]]] = ..., min_confidence: _Optional[float] = ..., max_detections: _Optional[int] = ..., apply_exif_rotation: bool = ..., track: _Optional[_Union[Tracking, _Mapping]] = ..., max_instances: _Optional[int] = ...) -> None: ...
+    views: _containers.RepeatedCompositeFieldContainer[View]
+    def __init__(self, request_id: _Optional[str] = ..., models: _Optional[_Iterable[_Union[ModelSelector, _Mapping]]] = ..., encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., regions: _Optional[_Iterable[_Union[Region, _Mapping]]] = ..., min_confidence: _Optional[float] = ..., max_detections: _Optional[int] = ..., apply_exif_rotation: bool = ..., track: _Optional[_Union[Tracking, _Mapping]] = ..., max_instances: _Optional[int] = ..., views: _Optional[_Iterable[_Union[View, _Mapping]]] = ...) -> None: ...
+
+class View(_message.Message):
+    __slots__ = ("encoded", "raw", "camera", "cam_from_rig")
+    ENCODED_FIELD_NUMBER: _ClassVar[int]
+    RAW_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    CAM_FROM_RIG_FIELD_NUMBER: _ClassVar[int]
+    encoded: bytes
+    raw: RawImage
+    camera: Camera
+    cam_from_rig: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., cam_from_rig: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Tracking(_message.Message):
     __slots__ = ("time_s", "keep_s", "num_objects", "search", "restart")
@@ -117,7 +131,7 @@ class Tracking(_message.Message):
     def __init__(self, time_s: _Optional[float] = ..., keep_s: _Optional[float] = ..., num_objects: _Optional[int] = ..., search: bool = ..., restart: bool = ...) -> None: ...
 
 class Detection(_message.Message):
-    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range", "track")
+    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range", "track", "views")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     TRANSLATION_M_FIELD_NUMBER: _ClassVar[int]
@@ -128,6 +142,7 @@ class Detection(_message.Message):
     BOX_PX_FIELD_NUMBER: _ClassVar[int]
     OUTSIDE_TRAINED_RANGE_FIELD_NUMBER: _ClassVar[int]
     TRACK_FIELD_NUMBER: _ClassVar[int]
+    VIEWS_FIELD_NUMBER: _ClassVar[int]
     object: str
     confidence: float
     translation_m: _containers.RepeatedScalarFieldContainer[float]
@@ -138,7 +153,8 @@ class Detection(_message.Message):
     box_px: _containers.RepeatedScalarFieldContainer[float]
     outside_trained_range: bool
     track: Track
-    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ..., track: _Optional[_Union[Track, _Mapping]] = ...) -> None: ...
+    views: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ..., track: _Optional[_Union[Track, _Mapping]] = ..., views: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class Track(_message.Message):
     __slots__ = ("track_id", "age_s", "unseen_s", "predicted", "translation_m", "rotation", "quaternion_xyzw", "velocity_m_s", "position_std_m", "rotation_std_rad")

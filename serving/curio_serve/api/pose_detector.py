@@ -14,6 +14,7 @@ from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer
 from curio_serve.api.admission import WorkQueue, check_is_wanted
 from curio_serve.api.messages import camera_from_message, frame_from_raw, region_from_message
 from curio_serve.api.registration import only_message
+from curio_serve.api.rig_request import check_views, rig_view, view_camera
 from curio_serve.api.status import CallLog, frame_error
 from curio_serve.api.streams import Streams
 from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError
@@ -21,6 +22,7 @@ from curio_serve.imaging import image
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.repository import Repository
+from curio_serve.rigs.detect_views import detect_views
 from curio_serve.telemetry import Metrics
 from curio_serve.tracking.stream import FollowingStream
 
@@ -123,9 +125,11 @@ class PoseService(PoseDetectorServicer):
         camera = camera_from_message(request.camera) if request.HasField("camera") else None
         regions = list(map(region_from_message, request.regions))
         min_confidence = request.min_confidence if request.HasField("min_confidence") else limits.min_confidence
+        if request.views:
+            return self._detect_views(request, detectors, waited_s, context)
         if request.HasField("track"):
             _check_following(request, following).check(request.track)
-        frame, camera = _decode(request, camera, detectors, limits)
+        frame, camera = _decode(request, camera, detectors, limits, apply_exif_rotation=request.apply_exif_rotation)
         decoded = time.perf_counter()
         answer, before_run = messages.DetectResponse(), partial(check_is_wanted, context)
         if request.HasField("track"):
@@ -152,6 +156,46 @@ class PoseService(PoseDetectorServicer):
                     results=answer.results,
                     before_run=before_run,
                 )
+        self._finish(answer, request, frame, (begun, decoded, waited_s))
+        return answer
+
+    def _detect_views(
+        self, request: messages.DetectRequest, detectors: list[Detector], waited_s: float, context: Context
+    ) -> messages.DetectResponse:
+        """Decode the views of a rig and find the poses that explain all of them.
+
+        Raises:
+            As :meth:`_detect`.
+        """
+        begun, limits = time.perf_counter(), self._limits
+        check_views(request, len(detectors), max(limits.max_models, limits.max_regions))
+        views, frames = [], []
+        for number, view in enumerate(request.views):
+            frame, camera = _decode(view, view_camera(request, number), detectors, limits)
+            views.append(rig_view(request, number, frame, camera, detectors))
+            frames.append(frame)
+        decoded, answer = time.perf_counter(), messages.DetectResponse()
+        for detector in detectors:
+            detect_views(
+                detector,
+                views,
+                min_confidence=request.min_confidence if request.HasField("min_confidence") else limits.min_confidence,
+                max_detections=request.max_detections or None,
+                results=answer.results,
+                before_run=partial(check_is_wanted, context),
+            )
+        self._finish(answer, request, frames[0], (begun, decoded, waited_s))
+        return answer
+
+    def _finish(
+        self,
+        answer: messages.DetectResponse,
+        request: messages.DetectRequest,
+        frame: image.Frame,
+        times_s: tuple[float, float, float],
+    ) -> None:
+        """Write what is not of the models into an answer, and count it; ``times_s``: begun, decoded, waited."""
+        begun, decoded, waited_s = times_s
         inferred = time.perf_counter()
         # Only now: what writes messages has gone cold by the time that a network has run.
         answer.request_id = request.request_id or new_request_id()
@@ -161,7 +205,6 @@ class PoseService(PoseDetectorServicer):
         self._metrics.queue_s.observe(waited_s)
         self._metrics.decode_s.observe(decoded - begun)
         self._metrics.inference_s.observe(inferred - decoded)
-        return answer
 
     def _detectors(self, request: messages.DetectRequest) -> list[Detector]:
         """The models that a request names; refuses what can be refused without work."""
@@ -210,11 +253,16 @@ def new_request_id() -> str:
 
 
 def _decode(
-    request: messages.DetectRequest, camera: PinholeCamera | None, detectors: list[Detector], limits: Limits
+    request: messages.DetectRequest | messages.View,
+    camera: PinholeCamera | None,
+    detectors: list[Detector],
+    limits: Limits,
+    *,
+    apply_exif_rotation: bool = False,
 ) -> tuple[image.Frame, PinholeCamera | None]:
     kind = request.WhichOneof("image")
     if kind is None:
-        raise ImageError("the request has no image; set encoded (JPEG, PNG, WebP) or raw")
+        raise ImageError("the request, or one of its views, has no image; set encoded (JPEG, PNG, WebP) or raw")
     if kind == "raw":
         return frame_from_raw(request.raw, limits.max_pixels), camera
     data = request.encoded  # each look at the field copies it
@@ -224,7 +272,7 @@ def _decode(
         data,
         header=header,
         max_reduction=min(reductions),
-        apply_exif_rotation=request.apply_exif_rotation,
+        apply_exif_rotation=apply_exif_rotation,
     )
     if camera is not None and frame.quarter_turns:
         camera = camera.turned(frame.quarter_turns, header.width, header.height)

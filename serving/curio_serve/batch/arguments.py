@@ -34,6 +34,9 @@ class DetectArguments:
     """Port that --video listens on."""
     camera: Path | None = None
     """Intrinsics: camera JSON, BOP's camera.json or scene_camera.json, OpenCV YAML. 2D worlds need none."""
+    rig: Path | None = None
+    """Several cameras: a file of --calibrate --rig-out. IMAGES are then a folder or video of each, in its order, and
+    poses are in the rig's frame."""
     topic: str | None = None
     """Topic of a recording's images. None: the only one that there is."""
     info_topic: str | None = None

@@ -68,6 +68,7 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.read_ahead import read_ahead
     from curio_serve.batch.refinement import refining
     from curio_serve.batch.remote_files import is_url
+    from curio_serve.batch.rig_images import run_rig
     from curio_serve.batch.sources import STANDARD_INPUT, PassedOver, Topics, check_arguments, images
     from curio_serve.batch.tracked import check_tracking, from_the_first
     from curio_serve.models.model_check import ChildCheck
@@ -79,6 +80,8 @@ def run(arguments: DetectArguments) -> int:
     if arguments.video is None:
         check_arguments(arguments.images)
     cv2.setNumThreads(1)  # the images are what runs in parallel
+    if arguments.rig is not None:
+        return run_rig(arguments, models)
     settings = _settings(arguments)
     for model in models:
         if os.path.exists(model):

@@ -48,6 +48,8 @@ class ImageResult:
     """EXIF asks for a rotation that was not applied."""
     recorded: RecordedAt | None = None
     """For an image of a robot's recording."""
+    views: Sequence[str] = ()
+    """Images of all cameras of a rig; poses are then in the rig's frame."""
 
     @property
     def detections(self) -> list[Detection]:
@@ -135,6 +137,7 @@ class JsonLines(ResultFormat):
         answer: dict[str, object] = {"detections": [_detection_json(detection) for detection in result.detections]}
         record = {
             "image": result.image,
+            **({"views": list(result.views)} if result.views else {}),
             "width": result.width,
             "height": result.height,
             "camera_matrix": _rows(result.camera_matrix, 3) or None,
@@ -269,7 +272,8 @@ def bop_object_ids(objects: Sequence[str], given: int | None) -> dict[str, int]:
 
 
 def _detection_json(detection: Detection) -> dict[str, object]:
-    track = {"track": _track_json(detection.track)} if detection.HasField("track") else {}
+    added: dict[str, object] = {"track": _track_json(detection.track)} if detection.HasField("track") else {}
+    added |= {"views": list(detection.views)} if detection.views else {}
     return {
         "object": detection.object,
         "confidence": round(detection.confidence, 6),
@@ -280,7 +284,7 @@ def _detection_json(detection: Detection) -> dict[str, object]:
         "color": list(detection.color) or None,
         "box_px": [[_finite(value) for value in corner] for corner in _rows(detection.box_px, 2)] or None,
         "outside_trained_range": detection.outside_trained_range,
-        **track,
+        **added,
     }
 
 

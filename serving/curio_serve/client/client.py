@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import grpc
+import numpy as np
 from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
 
-from curio_serve.client.request import CameraLike, ImageLike, RegionLike, detect_request, selector
+from curio_serve.client.request import CameraLike, ImageLike, RegionLike, detect_request, selector, views_request
 from curio_serve.client.retries import Attempts, error_from_call
 from curio_serve.errors import UsageError
 from curio_serve.files import read_given
@@ -149,6 +150,17 @@ class PoseClient(_Client):
         )
         return self._call(self._stub.Detect, request, timeout_s)
 
+    def detect_views(
+        self,
+        model: str | Iterable[str],
+        views: Iterable[tuple[ImageLike, CameraLike, np.ndarray]],
+        *,
+        timeout_s: float | None = None,
+        **options: Any,
+    ) -> messages.DetectResponse:
+        """Poses in the frame of a rig; arguments are those of :func:`~curio_serve.client.request.views_request`."""
+        return self._call(self._stub.Detect, views_request(model, views, **options), timeout_s)
+
     def detect_stream(
         self, requests: Iterable[messages.DetectRequest], *, timeout_s: float
     ) -> Iterator[messages.DetectResponse]:
@@ -224,6 +236,17 @@ class AsyncPoseClient(_Client):
     ) -> messages.DetectResponse:
         """Poses in one image; ``options`` are the keyword arguments of :meth:`PoseClient.detect`."""
         return await self._call(self._stub.Detect, detect_request(model, image, camera, **options), timeout_s)
+
+    async def detect_views(
+        self,
+        model: str | Iterable[str],
+        views: Iterable[tuple[ImageLike, CameraLike, np.ndarray]],
+        *,
+        timeout_s: float | None = None,
+        **options: Any,
+    ) -> messages.DetectResponse:
+        """Poses in the frame of a rig; see :meth:`PoseClient.detect_views`."""
+        return await self._call(self._stub.Detect, views_request(model, views, **options), timeout_s)
 
     async def detect_stream(
         self, requests: AsyncIterable[messages.DetectRequest], *, timeout_s: float

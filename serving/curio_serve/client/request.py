@@ -78,6 +78,45 @@ def detect_request(
     return request
 
 
+def views_request(
+    model: str | Iterable[str],
+    views: Iterable[tuple[ImageLike, CameraLike, np.ndarray]],
+    *,
+    min_confidence: float | None = None,
+    max_detections: int | None = None,
+    color: Literal["rgb", "bgr"] = "rgb",
+    request_id: str = "",
+) -> messages.DetectRequest:
+    """The message for what several cameras of a rig see at one instant.
+
+    Args:
+        model: Name, or ``name/version``; several for several objects in one call.
+        views: 2 to 16 of (image, camera, cam_from_rig [4, 4] in metres); images and cameras as in
+            :func:`detect_request`.
+        min_confidence: None: the server's own threshold.
+        max_detections: None: no limit.
+        color: Order of the channels of pixels.
+        request_id: Comes back with the answer; empty: the server makes one up.
+
+    Raises:
+        As :func:`detect_request`.
+    """
+    request = detect_request(
+        model, b"", min_confidence=min_confidence, max_detections=max_detections, request_id=request_id
+    )
+    request.ClearField("encoded")
+    for image, camera, cam_from_rig in views:
+        one = detect_request(model, image, camera, color=color)
+        view = request.views.add(cam_from_rig=np.asarray(cam_from_rig, float).ravel())
+        if one.HasField("raw"):
+            view.raw.CopyFrom(one.raw)
+        else:
+            view.encoded = one.encoded
+        if one.HasField("camera"):
+            view.camera.CopyFrom(one.camera)
+    return request
+
+
 def selector(model: str) -> messages.ModelSelector:
     """``name`` (the latest version) or ``name/version``.
 

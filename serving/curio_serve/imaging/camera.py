@@ -115,6 +115,12 @@ class PinholeCamera:
             camera = PinholeCamera(matrix, distortion, camera.size and (width, height))
         return camera
 
+    def reduced(self, reduction: int) -> "PinholeCamera":
+        """The camera of frames that were averaged down by a whole number."""
+        if reduction == 1:
+            return self
+        return PinholeCamera(scaling(1 / reduction, 1 / reduction) @ self.matrix, self.distortion)
+
     def ray(self, x: float, y: float) -> Array:
         """Unit direction [3], camera frame, of the ray through a pixel."""
         (fx, _, cx), (_, fy, cy), _ = self._rows

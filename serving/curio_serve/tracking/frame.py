@@ -7,9 +7,8 @@ from functools import cached_property
 import numpy as np
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
 from curio_proto.v1.detector_pb2 import Track as TrackMessage
-from scipy.spatial.transform import Rotation
 
-from curio_serve.imaging.camera import PinholeCamera, scaling
+from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.models.detector import Detector, transformed
 from curio_serve.models.instances import cover, enlarged
@@ -45,10 +44,7 @@ class StreamFrame:
     @cached_property
     def scaled_camera(self) -> PinholeCamera | None:
         """The camera of the pixels as they were decoded."""
-        if self.known_camera is None or self.reduction == 1:
-            return self.known_camera
-        scale = scaling(1 / self.reduction, 1 / self.reduction)
-        return PinholeCamera(scale @ self.known_camera.matrix, self.known_camera.distortion)
+        return None if self.known_camera is None else self.known_camera.reduced(self.reduction)
 
     def look(self, hidden: Sequence[Track]) -> tuple[list[Measurement], Sequence[float]]:
         """Run the whole model.
@@ -102,8 +98,9 @@ class StreamFrame:
         message.track_id, message.predicted = track.number, not track.is_seen
         message.age_s, message.unseen_s = self.time_s - track.first_s, self.time_s - track.seen_s
         message.translation_m.extend(pose.translation_m.tolist())
-        message.rotation.extend(pose.rotation.ravel().tolist())
-        message.quaternion_xyzw.extend(Rotation.from_matrix(pose.rotation).as_quat(canonical=True).tolist())
+        rows = pose.rotation.ravel().tolist()
+        message.rotation.extend(rows)
+        message.quaternion_xyzw.extend(quaternion_xyzw(rows))
         message.velocity_m_s.extend(pose.velocity_m_s.tolist())
         message.position_std_m.extend(pose.position_std_m.tolist())
         message.rotation_std_rad = pose.rotation_std_rad

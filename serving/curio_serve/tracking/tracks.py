@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectModel
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation
 
+from curio_serve.models.symmetries import symmetry_rotations
 from curio_serve.tracking.pose_filter import PoseFilter
 
 Array = np.ndarray
 _FLIP_RAD = math.radians(50)  # a rotation that changes by more between frames was misread
 _FLIPS_BELIEVED = 4  # in a row
-_SYMMETRY_STEP_RAD = math.radians(5)
 _DRIFT_M_S = 0.3  # speed at which an object that nobody sees may wander off
 _NEAR = 0.5  # diameters between an object and what is read of it, beside the uncertainty
 _SAME = 0.35  # diameters between two tracks that follow one object
@@ -115,18 +114,6 @@ class Track:
         candidates = rotation @ self._symmetries
         nearest: Array = candidates[np.tensordot(candidates, self.filter.rotation, 2).argmax()]
         return nearest
-
-
-def symmetry_rotations(kind: ObjectModel) -> Array:
-    """Rotations [n, 3, 3] of an object onto itself; continuous symmetries in steps."""
-    discrete = [np.reshape(s.transform, (4, 4))[:3, :3] for s in kind.symmetries if len(s.transform) == 16]
-    found = np.stack([np.eye(3), *discrete])
-    for symmetry in kind.symmetries:
-        if len(symmetry.axis) == 3:
-            angles = np.arange(0, 2 * math.pi, _SYMMETRY_STEP_RAD)
-            turns = Rotation.from_rotvec(angles[:, None] * np.array(symmetry.axis)).as_matrix()
-            found = (found[:, None] @ turns[None]).reshape(-1, 3, 3)
-    return found
 
 
 def assign(tracks: Sequence[Track], found: Sequence[Measurement], time_s: float, *, alone: bool) -> dict[int, int]:

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
+from curio_serve.consensus.poses import Predictions, angles_deg, consensus, position_covariance_m2
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from curio_train.data.photographs import CameraPoses
@@ -28,11 +28,9 @@ from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode, index
 
 _MIN_PHOTOGRAPHS = 3  # in a consensus
 _MIN_PREDICTIONS = 4  # in a consensus; a photograph has up to two, predicted and refined
-_MEAN_STEPS = 3  # times that a pose becomes the mean of the predictions near it
 _MAX_ANGLE_DEG = 20.0
 _ACROSS, _IN_DEPTH = 0.04, 0.04  # standard deviations of positions: diameters across the view, relative in depth
 _MOVED = 0.03  # standard deviation of movements in the scene, diameters
-_MAX_DISTANCE = 11.3  # squared Mahalanobis distance: 99 of 100 predictions of one position
 _MIN_PAIRS = 30  # of predictions, for a scale
 _MAX_GAP, _MIN_BASELINE = 0.6, 0.5  # diameters, of such pairs
 _SAME_SCALE = 0.05  # difference of logarithms within which scales support each other
@@ -178,60 +176,18 @@ def _clusters(
 ) -> list[Pose[np.ndarray]]:
     """Poses world_from_obj on which predictions of several photographs agree, those of most predictions first."""
     poses = scene.world_from_obj(predictions)
-    covariance = _covariance(scene, predictions, diameter_m)
-    gaps = poses.translation_m[None] - poses.translation_m[:, None]
-    agree = _mahalanobis(gaps, covariance[:, None] + covariance[None]) < _MAX_DISTANCE
-    agree &= _angles_deg(poses.rotation[:, None], poses.rotation, symmetries)[0] < _MAX_ANGLE_DEG
-    remaining, found = np.ones(len(agree), dtype=bool), []
-    while True:
-        seed = int((agree & remaining & remaining[:, None]).sum(axis=1).argmax())
-        members = np.flatnonzero(agree[seed] & remaining)
-        if len(members) < _MIN_PREDICTIONS:
-            break
-        for _ in range(_MEAN_STEPS):
-            mean = _mean(_rows(poses, members), covariance[members], symmetries)
-            near = _mahalanobis(poses.translation_m - mean.translation_m, covariance) < _MAX_DISTANCE
-            near &= _angles_deg(poses.rotation, mean.rotation, symmetries)[0] < _MAX_ANGLE_DEG
-            if (near & remaining).sum() < _MIN_PREDICTIONS:
-                break
-            members = np.flatnonzero(near & remaining)
-        remaining[members] = False
-        if len(np.unique(predictions.frame[members])) >= _MIN_PHOTOGRAPHS:
-            found.append(_mean(_rows(poses, members), covariance[members], symmetries))
-    return found
-
-
-def _covariance(scene: _StaticScene, predictions: _Predictions, diameter_m: float) -> Float[np.ndarray, "n 3 3"]:
-    """Covariance of each predicted position in the scene: positions are more accurate across the view than in depth."""
     rotation = _rows(scene.cam_from_world, predictions.frame).inverse().rotation
     rays_m = _rotated(rotation, predictions.cam_from_obj.translation_m)
-    distance_m = np.linalg.norm(rays_m, axis=1)
-    along = rays_m[:, :, None] * rays_m[:, None] / distance_m[:, None, None] ** 2
-    across = np.eye(3) - along
-    depth = (_IN_DEPTH * distance_m)[:, None, None] ** 2
-    result: np.ndarray = across * (_ACROSS * diameter_m) ** 2 + along * depth + np.eye(3) * (_MOVED * diameter_m) ** 2
-    return result
-
-
-def _mahalanobis(gaps: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Squared Mahalanobis distance."""
-    result: np.ndarray = (gaps * np.linalg.solve(covariance, gaps[..., None])[..., 0]).sum(axis=-1)
-    return result
-
-
-def _angles_deg(one: np.ndarray, other: np.ndarray, symmetries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least angle over the symmetries between rotations [..., 3, 3], and the number of that symmetry."""
-    cosines = np.stack([(np.einsum("...ij,...ij->...", one @ rotation, other) - 1) / 2 for rotation in symmetries])
-    return np.degrees(np.arccos(cosines.max(axis=0).clip(-1, 1))), cosines.argmax(axis=0)
-
-
-def _mean(poses: Pose[np.ndarray], covariance: np.ndarray, symmetries: np.ndarray) -> Pose[np.ndarray]:
-    """Mean of a batch of poses; positions are weighted by their inverse covariance."""
-    _, symmetry = _angles_deg(poses.rotation, poses.rotation[0], symmetries)
-    rotation = Rotation.from_matrix(poses.rotation @ symmetries[symmetry]).mean().as_matrix()
-    weight = np.linalg.inv(covariance)
-    weighted = np.einsum("nij,nj->i", weight, poses.translation_m)
-    return Pose(rotation, np.linalg.solve(weight.sum(axis=0), weighted))
+    covariance = (
+        position_covariance_m2(rays_m, _ACROSS * diameter_m, _IN_DEPTH) + np.eye(3) * (_MOVED * diameter_m) ** 2
+    )
+    found = consensus(
+        Predictions(predictions.frame, poses.rotation, poses.translation_m, covariance),
+        symmetries,
+        min_predictions=_MIN_PREDICTIONS,
+        min_views=_MIN_PHOTOGRAPHS,
+    )
+    return [Pose(one.rotation, one.translation_m) for one in found]
 
 
 def _verified(
@@ -253,7 +209,7 @@ def _verified(
     for pose in poses:
         cam_from_obj = scene.cam_from_world @ pose
         position_m = cam_from_obj.translation_m
-        rotated = _angles_deg(cam_from_obj.rotation, own.rotation, symmetries)[0] > 2 * _MAX_ANGLE_DEG
+        rotated = angles_deg(cam_from_obj.rotation, own.rotation, symmetries)[0] > 2 * _MAX_ANGLE_DEG
         own_at_depth = own.translation_m[:, :2] * (position_m[:, 2:] / own.translation_m[:, 2:])
         offset_m = np.linalg.norm(position_m[:, :2] - own_at_depth, axis=1)
         elsewhere = (own_ratio > _CREDIBLE) & (offset_m > _CONTRADICTION * refiner.diameter_m)

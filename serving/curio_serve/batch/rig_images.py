@@ -1,0 +1,179 @@
+"""``curio-detect --rig``: folders of several cameras, an instant at a time."""
+
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from itertools import zip_longest
+from pathlib import Path
+
+from curio_proto.v1.detector_pb2 import DetectResponse
+
+from curio_serve.batch.arguments import DetectArguments
+from curio_serve.batch.formats import ImageLines, ImageResult, JsonLines
+from curio_serve.batch.parallel import in_order
+from curio_serve.batch.progress import Progress
+from curio_serve.batch.remote_files import is_url
+from curio_serve.batch.result_file import ResultFile
+from curio_serve.batch.sources import PassedOver, SourceImage, images
+from curio_serve.errors import ArgumentError, CameraError, ImageError, InternalError, UsageError
+from curio_serve.imaging import image as decoding
+from curio_serve.models.detector import Detector
+from curio_serve.models.model import Model
+from curio_serve.models.model_check import ChildCheck
+from curio_serve.models.model_folder import open_model
+from curio_serve.models.runtime import Runtime, read_providers
+from curio_serve.rigs.detect_views import RigView, detect_views
+from curio_serve.rigs.rig import RigCamera, read_rig_file
+
+_OF_ONE_INSTANT = (ImageError, CameraError, ArgumentError, InternalError)
+
+
+@dataclass(frozen=True)
+class RigImage:
+    """The images of all cameras at one instant."""
+
+    name: str
+    """That of the first camera's image."""
+    images: tuple[SourceImage, ...]
+    """One a camera, in the rig's order."""
+
+
+class RigEstimator:
+    """Answers instants by one model on this machine; safe to share between threads."""
+
+    def __init__(self, model: Model, cameras: Sequence[RigCamera], min_confidence: float, most: int | None) -> None:
+        self._model, self._detector, self._cameras = model, Detector(model), cameras
+        self._min_confidence, self._most = min_confidence, most
+
+    def __call__(self, instant: RigImage) -> ImageResult:
+        """The poses in the rig's frame, or what is wrong with an image."""
+        begun = time.perf_counter()
+        names = tuple(image.name for image in instant.images)
+        try:
+            views = [self._view(*pair) for pair in zip(instant.images, self._cameras, strict=True)]
+            decoded, results = time.perf_counter(), DetectResponse().results
+            detect_views(
+                self._detector,
+                views,
+                min_confidence=self._min_confidence,
+                max_detections=self._most,
+                results=results,
+            )
+        except _OF_ONE_INSTANT as exc:
+            return ImageResult(instant.name, self._model.name, self._model.version, error=str(exc), views=names)
+        return ImageResult(
+            instant.name,
+            self._model.name,
+            self._model.version,
+            *views[0].size,
+            views[0].camera.matrix.ravel().tolist(),
+            results,
+            1e3 * (decoded - begun),
+            1e3 * (time.perf_counter() - decoded),
+            views=names,
+        )
+
+    def _view(self, image: SourceImage, of: RigCamera) -> RigView:
+        if image.pixels is not None:
+            of.camera.check_frame(image.pixels.shape[1], image.pixels.shape[0])
+            return RigView(image.pixels, of.camera, of.cam_from_rig)
+        try:
+            data = image.read()
+            header = decoding.open_header(data)
+            reduction = self._detector.reduction(of.camera, header.width, header.height)
+            frame = decoding.decode(data, header=header, max_reduction=reduction)
+        except ImageError as exc:
+            raise ImageError(f"{image.name}: {exc}") from exc
+        of.camera.check_frame(frame.width, frame.height)
+        return RigView(frame.pixels, of.camera, of.cam_from_rig, frame.reduction)
+
+
+def read_rig(arguments: DetectArguments, models: Sequence[str]) -> list[RigCamera]:
+    """The cameras of a call.
+
+    Raises:
+        UsageError: The file is no rig's, or the call asks for what is for one camera.
+    """
+    assert arguments.rig is not None
+    given = {
+        "--camera": arguments.camera,
+        "--overlays": arguments.overlays,
+        "--ray": arguments.ray,
+        "--video": arguments.video,
+        "--track": arguments.track,
+        "--exif-rotation": arguments.exif_rotation,
+        "--max-instances": arguments.max_instances,
+        "--refine": arguments.refine,
+    }
+    if wrong := [flag for flag, value in given.items() if value]:
+        raise UsageError(f"--rig and {wrong[0]} do not go together: the rig's file has the cameras; leave one out")
+    out = arguments.out or ""
+    if arguments.format != "jsonl" or out.lower().endswith(".mcap") or is_url(out):
+        raise UsageError("--rig writes JSON Lines into a file; leave out --format, and name --out so")
+    if remote := [model for model in models if not os.path.exists(model)]:
+        raise UsageError(f"--rig: {remote[0]} is behind a server; name a model on this machine, or set `views`")
+    try:
+        cameras = read_rig_file(Path(arguments.rig))
+    except CameraError as exc:
+        raise UsageError(f"--rig: {exc}") from exc
+    if len(arguments.images) != len(cameras):
+        names = ", ".join(camera.name for camera in cameras)
+        raise UsageError(
+            f"--rig {arguments.rig} has {len(cameras)} cameras ({names}), found {len(arguments.images)} IMAGES; "
+            "expected a folder, glob or video of each camera, in the file's order"
+        )
+    return cameras
+
+
+def instants(arguments: Sequence[str], passed_over: PassedOver) -> Iterator[RigImage]:
+    """The images of all cameras, an instant at a time, each camera's in the order of their names.
+
+    Raises:
+        UsageError: One camera has more images than another.
+    """
+    for number, found in enumerate(zip_longest(*(images([argument], passed_over) for argument in arguments))):
+        there = [image for image in found if image is not None]
+        if len(there) < len(arguments):
+            ended = arguments[next(index for index, image in enumerate(found) if image is None)]
+            raise UsageError(f"--rig: {ended} has {number} images, others have more; expected as many of each camera")
+        yield RigImage(there[0].name, tuple(there))
+
+
+def answer_instant(estimators: Sequence[RigEstimator], form: JsonLines, instant: RigImage) -> ImageLines:
+    """The lines of all models about an instant."""
+    return form.lines([estimator(instant) for estimator in estimators])
+
+
+def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
+    """Answer all instants; the exit status: 1 where one has no answer.
+
+    Raises:
+        UsageError: The call cannot be carried out.
+        CurioError: The work as a whole failed.
+    """
+    cameras = read_rig(arguments, models)
+    for model in models:
+        ChildCheck()(Path(model))
+    runtime = Runtime(read_providers(arguments.provider))
+    opened = [open_model(model, runtime) for model in models]
+    estimators = [RigEstimator(model, cameras, arguments.min_confidence, arguments.max_detections) for model in opened]
+    form, passed_over = JsonLines(), PassedOver()
+    names = [(model.name, model.version) for model in opened]
+    path = None if arguments.out is None else Path(arguments.out)
+    with ResultFile(path, form, names, overwrite=arguments.overwrite) as output:
+        remaining = output.unanswered(instants(arguments.images, passed_over))
+        results = in_order(partial(answer_instant, estimators, form), remaining, arguments.jobs)
+        with closing(results), Progress(output.num_images, output.num_errors, is_shown=path is not None) as progress:
+            for result in results:
+                output.write(result)
+                progress.count(result)
+        for line in passed_over.lines():
+            print(f"curio-detect: {line}", file=sys.stderr)
+        if output.num_images == 0:
+            raise UsageError(f"--rig: no images in {' '.join(arguments.images)}")
+        progress.report(output.label)
+        return 1 if output.num_errors else 0
