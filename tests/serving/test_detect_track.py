@@ -56,6 +56,7 @@ def test_a_video_says_when_its_frames_were_taken(
     [
         ({"format": "csv"}, "JSON Lines"),
         ({"ray": "local"}, "one machine"),
+        ({"refine": True}, "--refine"),
         ({"out": "poses.mcap"}, "JSON Lines"),
         ({"max_detections": 2}, "--track-objects"),
         ({"track_objects": 0}, "expected 1 to 16"),

@@ -28,9 +28,10 @@ def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectA
             f"--track: {remote[0]} is behind a server; name a model on this machine, or set `track` in DetectStream"
         )
     is_recording = arguments.out is not None and arguments.out.lower().endswith(".mcap")
-    if arguments.ray is not None or arguments.format != "jsonl" or is_recording:
+    if arguments.ray is not None or arguments.refine or arguments.format != "jsonl" or is_recording:
         raise UsageError(
-            "--track follows on one machine and writes JSON Lines; leave out --ray and --format, and name --out so"
+            "--track follows on one machine and writes JSON Lines; leave out --ray, --refine and --format, and name "
+            "--out so"
         )
     if arguments.max_detections is not None or arguments.max_instances is not None:
         raise UsageError(
