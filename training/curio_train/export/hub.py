@@ -161,8 +161,8 @@ def _as_our_errors(repository: str) -> Iterator[None]:
         raise ExportError(f"{failure}: the hub answers {status}: {said}") from exc
     except (HTTPError, ConnectionError, LocalEntryNotFoundError) as exc:
         raise ExportError(f"{failure}: the hub does not answer: {first_line(exc)}; try again later") from exc
-    except ValueError as exc:  # metadata that the hub does not take
-        raise ExportError(f"{failure}: the hub refuses the card: {' '.join(str(exc).split())}") from exc
+    except ValueError as exc:  # the hub does not take the card's metadata
+        raise ExportError(f"{failure}: {' '.join(str(exc).split())}") from exc
 
 
 _LOG_IN = "log in with a token that may write there (hf auth login), or set HF_TOKEN"
