@@ -115,6 +115,14 @@ def test_csv_has_a_row_for_each_detection_and_one_for_an_image_without() -> None
     assert rows[3]["width"] == ""
 
 
+def test_csv_says_which_positions_are_outside_of_the_trained_range() -> None:
+    form, far = Csv(), detection()
+    far.outside_trained_range = True
+    text = form.header + form.encode(answer("two.png", detection(), far)) + form.encode(answer("none.png"))
+    rows = list(csv.DictReader(io.StringIO(text.decode())))
+    assert [row["outside_trained_range"] for row in rows] == ["false", "true", ""]
+
+
 def test_bop_rows_are_millimetres_row_major_and_the_images_seconds() -> None:
     line = Bop({"ape": 1}).encode(answer("lmo/test/000002/rgb/000017.png", detection()))
     scene, image, obj, score, rotation, translation, seconds = line.decode().strip().split(",")

@@ -144,6 +144,10 @@ def test_true_codes_score_better_than_wrong_ones(folder: Path, world: TabletopWo
     assert right.verdict.startswith("Trust it: in 100% of 12")
     assert wrong.verdict.startswith("Do not trust it")
     assert [*right.columns][2:] == ["photograph, second camera", "prediction, second camera"]
+    names, parts = zip(*(caption.split("\n")[:2] for caption in right.captions), strict=True)
+    assert sorted(names) == sorted(world.photographs.own.names)
+    (kind,) = world.objects
+    assert set(parts) == {f"2 {kind.name}"}
 
 
 def test_draws_lie_where_photographs_show_parts(folder: Path, world: TabletopWorld) -> None:

@@ -169,6 +169,7 @@ class Csv(ResultFormat):
         *("qx", "qy", "qz", "qw", "red", "green", "blue"),
         *(f"box_{axis}{corner}_px" for corner in range(8) for axis in "uv"),
         *("light_x", "light_y", "light_z", "decode_ms", "inference_ms", "error"),
+        "outside_trained_range",
     )
     opening = header = (",".join(columns) + "\n").encode()
 
@@ -179,7 +180,7 @@ class Csv(ResultFormat):
         error = " ".join(result.error.split())
         end = (*_padded(result.light, 3), _rounded(result.decode_ms), _rounded(result.inference_ms), error)
         for index, detection in enumerate(result.detections or [None]):
-            rows.writerow((*start, index, *_detection_cells(detection), *end))
+            rows.writerow((*start, index, *_detection_cells(detection), *end, _is_outside(detection)))
         return text.getvalue().encode(errors="surrogateescape")
 
     def key(self, image: str) -> str:
@@ -313,6 +314,11 @@ def _detection_cells(detection: Detection | None) -> Iterator[object]:
     yield from _padded(found.quaternion_xyzw, 4)
     yield from _padded(found.color, 3)
     yield from _padded([_finite(value) for value in found.box_px], 16)
+
+
+def _is_outside(detection: Detection | None) -> str:
+    """The last column, as JSON writes it; empty for None."""
+    return "" if detection is None else json.dumps(detection.outside_trained_range)
 
 
 def _rows(values: Sequence[float], width: int) -> list[list[float]]:

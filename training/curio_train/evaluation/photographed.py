@@ -24,7 +24,7 @@ from curio_train.evaluation.agreement import differing, draw, inlier_ratio, insi
 from curio_train.evaluation.closeups import closeups, outlined
 from curio_train.evaluation.subject import Predict
 from curio_train.metrics.images import blurred, dssim
-from curio_train.scene_code import CONFIDENCE, SceneCode
+from curio_train.scene_code import CONFIDENCE, TRANSLATION, SceneCode
 from curio_train.worlds.base import PhotographSet, World
 from curio_train.worlds.single_object.capture import CapturePhotographs
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
@@ -54,7 +54,7 @@ class Judgement:
     columns: Mapping[str, Tensor]
     """Photographs, close-ups and re-renderings by heading, [num, 3, height, width] in [0, 1], worst first."""
     captions: Sequence[str]
-    """The file, in free space, and the figures of each row."""
+    """The file and the figures of each row; on a plane also how many of which parts were found."""
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -104,7 +104,20 @@ def _on_plane(world: TabletopWorld, predict: Predict) -> Judgement:
         columns["prediction" + heading] = images[order]
     verdict = _verdict(metrics["better_than_plate"], len(worst), len(views) > 1)
     verdict += f" Drawn parts and the difference from the background overlap by {metrics['own_view_overlap']:.2f}."
-    return Judgement(metrics, verdict, columns, _captions(agreed | {"blurred DSSIM": worst}, order))
+    found, names = _found(world, code), views[0].names or [""] * len(worst)
+    figures = _captions(agreed | {"blurred DSSIM": worst}, order)
+    captions = [
+        "\n".join(line for line in (names[row], found[row], text) if line)
+        for row, text in zip(order.tolist(), figures, strict=True)
+    ]
+    return Judgement(metrics, verdict, columns, captions)
+
+
+def _found(world: World, code: SceneCode) -> list[str]:
+    """How many of which parts were found in each image, such as "2 bracket, 1 cube"."""
+    there = _certain(code).get(CONFIDENCE, torch.ones_like(code[TRANSLATION][..., :1]))[..., 0]
+    counts = {kind.name: there[:, list(kind.slots)].sum(dim=1).long().tolist() for kind in world.objects}
+    return [", ".join(f"{count[row]} {name}" for name, count in counts.items()) for row in range(len(there))]
 
 
 def _in_space(

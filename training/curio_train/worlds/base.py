@@ -77,6 +77,8 @@ class PhotographSet:
     """uint8 [num, 3, height, width], in the size of the world's camera."""
     background_image: Tensor
     """uint8 [3, height, width]: the empty scene."""
+    names: Sequence[str] = ()
+    """Of the photographs' files; empty where they are none."""
 
 
 class ImageSource(ABC):

@@ -120,7 +120,7 @@ def _photographs(
         judged, others = _pairs(options.second, judged)
         second = PhotographSet(_frames(others, intrinsics), _frames([options.second_background], intrinsics)[0])
         second_pose = Pose.from_matrix(cameras.pose_above_plane(options.second_background))
-    own = PhotographSet(_frames(judged, intrinsics), images[background])
+    own = PhotographSet(_frames(judged, intrinsics), images[background], [path.name for path in judged])
     differ = any(path != background for path in own_backgrounds)
     return TabletopPhotographs(training, backgrounds if differ else None, own, second, second_pose, occupied, position)
 
