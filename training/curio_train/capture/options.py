@@ -34,6 +34,9 @@ class CalibrateCommand:
     """For poses in metres, too: folder with a model or run for each LineMOD object that the scene shows."""
     data: Path | None = None
     """Their data folder."""
+    rig_out: Path | None = None
+    """Several cameras: the folder has one of each, which show --board at the same instants under the same names. File
+    to write for curio-detect --rig: each camera and where it stands."""
     camera_out: Path = Path("camera.json")
     """The camera file to write."""
     views_out: Path | None = None

@@ -5,10 +5,13 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from curio_train.camera import load_intrinsics, save_intrinsics
 from curio_train.capture.calibration import Board, calibrate
 from curio_train.capture.ground import scale_by_distance, to_world
 from curio_train.capture.options import CalibrateCommand
+from curio_train.capture.rig import calibrate_rig, save_rig
 from curio_train.capture.structure import Structure, every_nth, recover
 from curio_train.data.photographs import Photographs
 from curio_train.errors import DataError, UsageError
@@ -33,14 +36,15 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
     if command.every < 1:
         raise UsageError(f"--every {command.every}, expected 1 or more")
     _check_scale(command)
+    if command.rig_out is not None:
+        return _rig(command, command.rig_out)
     if command.board is None:
         return _from_scene(command, by_objects)
     if command.views_out is not None or command.camera is not None:
         raise UsageError(
             "--views-out and --camera are for photographs of a scene; leave them out, or leave out --board"
         )
-    marker_m = None if command.marker_mm is None else command.marker_mm / 1000
-    board = Board(*command.board, command.square_mm / 1000, marker_m, command.dictionary)
+    board = _board(command, command.board)
     found = calibrate(command.images, board)
     save_intrinsics(command.camera_out, found.camera)
     unused = f", not found in {', '.join(path.name for path in found.unused[:5])}" if found.unused else ""
@@ -49,6 +53,33 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
         f"corners off by {found.error_px:.2f} pixels in {found.num_views} photographs{unused}"
         + _reading(board, found.board)
     )
+
+
+def _board(command: CalibrateCommand, size: tuple[int, int]) -> Board:
+    marker_m = None if command.marker_mm is None else command.marker_mm / 1000
+    return Board(*size, command.square_mm / 1000, marker_m, command.dictionary)
+
+
+def _rig(command: CalibrateCommand, path: Path) -> str:
+    if command.board is None:
+        raise UsageError("--rig-out needs photographs of a board: say which by --board")
+    if command.views_out is not None or command.camera is not None:
+        raise UsageError(
+            "--views-out and --camera are for photographs of a scene; leave them out, or leave out --rig-out"
+        )
+    found = calibrate_rig(command.images, _board(command, command.board))
+    save_rig(path, found)
+    lines = [f"{path}: {len(found.names)} cameras, corners off by at most {found.error_px:.2f} pixels"]
+    for name, camera, pose, count in zip(
+        found.names, found.cameras, found.cam_from_rig, found.num_instants, strict=True
+    ):
+        away_m = float(np.linalg.norm(pose[:3, 3]))
+        angle = float(np.degrees(np.arccos(np.clip((np.trace(pose[:3, :3]) - 1) / 2, -1, 1))))
+        lines.append(
+            f"  {name}: focal length {camera.camera.matrix[0, 0]:.1f} pixels, {away_m:.3f} m and {angle:.1f} degrees "
+            f"from {found.names[0]}, by {count} photographs"
+        )
+    return "\n".join(lines)
 
 
 def _reading(given: Board, found: Board) -> str:

@@ -1,0 +1,189 @@
+"""How the cameras of a rig stand to each other, from photographs that they took of one board at the same instants.
+
+Each camera's K and lens are found from all its photographs (:mod:`~curio_train.capture.calibration`). Then the first
+camera and each other one are related by the instants in which both see the board (OpenCV's stereo calibration).
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from curio_serve.consensus.poses import angles_deg
+
+from curio_train.camera import Intrinsics
+from curio_train.capture.calibration import Board, Calibration, calibrate
+from curio_train.data.photographs import Photographs, read_photograph
+from curio_train.errors import CameraError, DataError
+
+LEAST_CAMERAS, MOST_CAMERAS = 2, 16
+_FEWEST_INSTANTS = 4
+_FEWEST_POINTS = 6
+_LARGEST_ERROR_PX = 1.5
+
+Corners = tuple[np.ndarray, np.ndarray]
+"""Points of the board [n, 3], metres, and where they are seen [n, 2], pixels."""
+
+
+@dataclass(frozen=True)
+class RigCalibration:
+    """The cameras of a rig, the first of which is its frame."""
+
+    names: tuple[str, ...]
+    """Of the folders."""
+    cameras: tuple[Calibration, ...]
+    """Intrinsics of each."""
+    cam_from_rig: tuple[np.ndarray, ...]
+    """Pose of each [4, 4], metres."""
+    num_instants: tuple[int, ...]
+    """In which the first and this camera see the board; of the first its own."""
+    error_px: float
+    """Largest root mean square distance of corners from where a pair of cameras should see them."""
+
+
+def calibrate_rig(folder: Path, board: Board) -> RigCalibration:
+    """The rig whose cameras took a folder of photographs each.
+
+    Args:
+        folder: Holds a folder a camera; photographs of one instant have the same name in each.
+        board: That they show.
+
+    Raises:
+        DataError: A wrong number of folders, or photographs that cannot be used.
+        CameraError: They do not determine a camera, or too few instants show the board to a pair.
+    """
+    folders = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    if not LEAST_CAMERAS <= len(folders) <= MOST_CAMERAS:
+        raise DataError(
+            f"{folder} has {len(folders)} folders; expected one a camera, {LEAST_CAMERAS} to {MOST_CAMERAS}, with "
+            "photographs of the same names"
+        )
+    cameras = [calibrate(path, board) for path in folders]
+    seen = [_corners(path, camera.board) for path, camera in zip(folders, cameras, strict=True)]
+    poses, counts, errors = [np.eye(4)], [len(seen[0])], [0.0]
+    for number in range(1, len(folders)):
+        names = f"{folders[0].name} and {folders[number].name}"
+        pose, count, error = _relative(names, seen[0], seen[number], cameras[0].camera, cameras[number].camera)
+        poses.append(pose)
+        counts.append(count)
+        errors.append(error)
+    return RigCalibration(
+        tuple(path.name for path in folders), tuple(cameras), tuple(poses), tuple(counts), max(errors)
+    )
+
+
+def save_rig(path: Path, rig: RigCalibration) -> None:
+    """Write a rig file (:mod:`curio_serve.rigs.rig` reads it), whole or not at all.
+
+    Raises:
+        CameraError: The file cannot be written.
+    """
+    entries = [
+        {
+            "name": name,
+            "camera_matrix": found.camera.matrix.tolist(),
+            "width": found.camera.width,
+            "height": found.camera.height,
+            "distortion": list(found.camera.distortion or (0.0,) * 5),
+            "cam_from_rig": pose.tolist(),
+        }
+        for name, found, pose in zip(rig.names, rig.cameras, rig.cam_from_rig, strict=True)
+    ]
+    draft = path.with_name(f"{path.name}.part")
+    try:
+        draft.write_text(json.dumps({"cameras": entries}, indent=2) + "\n", encoding="utf-8")
+        os.replace(draft, path)
+    except OSError as exc:
+        raise CameraError(f"{path}: cannot be written ({exc.strerror}); name another file: --rig-out") from exc
+
+
+def _corners(folder: Path, board: Board) -> dict[str, Corners]:
+    """The board's corners by the name of the photograph, where it is seen."""
+    found = {
+        path.stem: board.find(cv2.cvtColor(read_photograph(path), cv2.COLOR_RGB2GRAY))
+        for path in Photographs(folder).paths
+    }
+    return {name: corners for name, corners in found.items() if corners is not None}
+
+
+def _relative(
+    names: str, first: Mapping[str, Corners], other: Mapping[str, Corners], one: Intrinsics, two: Intrinsics
+) -> tuple[np.ndarray, int, float]:
+    """Pose of the other camera in the first one's frame (other_from_first), instants, error in pixels."""
+    pairs = [_common(first[name], other[name]) for name in sorted(first.keys() & other.keys())]
+    pairs = [pair for pair in pairs if len(pair[0]) >= _FEWEST_POINTS]
+    if len(pairs) < _FEWEST_INSTANTS:
+        raise CameraError(
+            f"{names} both see the board in {len(pairs)} photographs of the same name; expected {_FEWEST_INSTANTS} or "
+            "more: hold it where both cameras see it, and name the photographs of one instant alike"
+        )
+    found = [_solve(_turned(pairs, reference, one, two), one, two) for reference in (False, True)]
+    pose, error = min(found, key=lambda one: one[1])
+    if not error <= _LARGEST_ERROR_PX:
+        raise CameraError(
+            f"{names}: corners lie {error:.2g} pixels from where the best pair of cameras sees them, expected at most "
+            f"{_LARGEST_ERROR_PX:g}; did a camera or the board move between the two photographs of an instant?"
+        )
+    return pose, len(pairs), error
+
+
+_Pair = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _common(first: Corners, other: Corners) -> _Pair:
+    """Points that both see [n, 3], and their pixels in either [n, 2]."""
+    rows = {tuple(point): row for row, point in enumerate(other[0].round(6).tolist())}
+    shared = [(row, rows[tuple(point)]) for row, point in enumerate(first[0].round(6).tolist()) if tuple(point) in rows]
+    mine, theirs = np.array(shared, int).reshape(-1, 2).T
+    return first[0][mine], first[1][mine], other[1][theirs]
+
+
+def _turned(pairs: list[_Pair], reference: bool, one: Intrinsics, two: Intrinsics) -> list[_Pair]:
+    """The pairs with the other camera's corners so ordered that the cameras stand alike in all of them.
+
+    A chessboard looks the same after half a turn, so its corners may be counted from the other end in one of two
+    photographs. That is told by the pose of the cameras, which has to be the same at every instant.
+
+    Args:
+        pairs: As found.
+        reference: Whether the first pair is to be turned.
+        one: The first camera.
+        two: The other camera.
+    """
+    expected, chosen = None, []
+    for points, mine, theirs in pairs:
+        orders = [theirs, theirs[::-1]]
+        poses = [_rotation(points, order, two) @ _rotation(points, mine, one).T for order in orders]
+        if expected is None:
+            expected = poses[int(reference)]
+        nearest = int(angles_deg(np.stack(poses), expected, np.eye(3)[None])[0].argmin())
+        chosen.append((points, mine, orders[nearest]))
+    return chosen
+
+
+def _rotation(points: np.ndarray, pixels: np.ndarray, camera: Intrinsics) -> np.ndarray:
+    """cam_from_board."""
+    is_found, turn, _ = cv2.solvePnP(points, pixels, camera.matrix, np.array(camera.distortion or (0.0,) * 5))
+    return np.asarray(cv2.Rodrigues(turn)[0]) if is_found else np.eye(3)
+
+
+def _solve(pairs: list[_Pair], one: Intrinsics, two: Intrinsics) -> tuple[np.ndarray, float]:
+    points, mine, theirs = (list(values) for values in zip(*pairs, strict=True))
+    lenses = [np.array(camera.distortion or (0.0,) * 5) for camera in (one, two)]
+    error, *_, rotation, translation, _, _ = cv2.stereoCalibrate(
+        points,
+        mine,
+        theirs,
+        one.matrix,
+        lenses[0],
+        two.matrix,
+        lenses[1],
+        (one.width, one.height),
+        flags=cv2.CALIB_FIX_INTRINSIC,
+    )
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, translation.ravel()
+    return pose, float(error)
