@@ -1,14 +1,19 @@
 """Importing does nothing but define, and the heavy packages wait until a command needs them."""
 
+import ast
 import importlib
+import importlib.metadata
 import json
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 TRAINING_ONLY = {"curio_train", "torch", "mitsuba", "drjit", "onnx", "onnxscript", "trimesh"}
+TRAINING_EXTRAS = {"train", "usd", "rerun", "cad", "capture", "dev"}
 HEAVY = TRAINING_ONLY - {"curio_train"} | {"onnxruntime", "cv2", "scipy", "skimage", "matplotlib", "tensorboard"}
 
 # Imports the modules named on its command line, then tells what that changed besides defining them.
@@ -63,6 +68,33 @@ def test_importing_has_no_side_effect(root: Path, tmp_path: Path, package: str) 
 def test_serving_imports_nothing_of_training(root: Path, tmp_path: Path) -> None:
     loaded = probe(modules(root, "serving/curio_serve"), tmp_path)["loaded"]
     assert not TRAINING_ONLY & set(loaded)
+
+
+def test_serving_needs_what_its_install_brings(root: Path) -> None:
+    """What a module of serving imports at its head comes with the base install, or with an extra of serving's own."""
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    declared = [
+        *project["dependencies"],
+        *(line for name, lines in extras.items() if name not in TRAINING_EXTRAS for line in lines),
+    ]
+    brought = {re.split(r"[^A-Za-z0-9_.-]", line)[0].lower() for line in declared}
+    of_module = importlib.metadata.packages_distributions()
+    missing = {
+        f"{file.relative_to(root)}: {name}"
+        for file in sorted((root / "serving").rglob("*.py"))
+        for name in head_imports(ast.parse(file.read_text()))
+        if name not in sys.stdlib_module_names and not name.startswith("curio_")
+        if not brought & {distribution.lower().replace("_", "-") for distribution in of_module[name]}
+    }
+    assert not missing
+
+
+def head_imports(tree: ast.Module) -> set[str]:
+    """Packages that a module imports as it is imported itself; not those for type checkers or within functions."""
+    plain = {name.name for node in tree.body if isinstance(node, ast.Import) for name in node.names}
+    named = {node.module for node in tree.body if isinstance(node, ast.ImportFrom) and node.module}
+    return {name.partition(".")[0] for name in plain | named}
 
 
 def test_messages_need_protobuf_and_grpc_alone(root: Path, tmp_path: Path) -> None:
