@@ -9,13 +9,13 @@ import pytest
 import torch
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.export.onnx import to_onnx
-from curio_train.templates.alignment import Aligned, align, with_gradient
+from curio_train.networks.templates.alignment import Aligned, align, with_gradient
 from curio_train.templates.build import template_network
-from curio_train.templates.descriptors import Descriptors
-from curio_train.templates.geometry import Geometry, viewpoints
-from curio_train.templates.localiser import RANK, Localiser
-from curio_train.templates.network import STEPS, TemplateNetwork
-from curio_train.templates.trunk import FINE_WIDTH, Trunk
+from curio_train.networks.templates.descriptors import Descriptors
+from curio_train.networks.templates.geometry import Geometry, viewpoints
+from curio_train.networks.templates.localiser import RANK, Localiser
+from curio_train.networks.templates.network import STEPS, TemplateNetwork
+from curio_train.networks.templates.trunk import FINE_WIDTH, Trunk
 from curio_train.worlds import build
 from curio_train.worlds.options import CirclesOptions
 
@@ -110,7 +110,7 @@ def test_the_localiser_finds_the_template_it_holds() -> None:
 def _random_network(steps: tuple[int, int] = STEPS) -> TemplateNetwork:
     network, random = TemplateNetwork(GEOMETRY, steps), torch.Generator().manual_seed(0)
     network.trunk.load_state_dict(Trunk.pretrained().state_dict())
-    for name, buffer in (*network.localiser.named_buffers(), *network.bank.named_buffers()):
+    for name, buffer in (*network.localiser.named_buffers(), *network.reader.banks.named_buffers()):
         if name.startswith(("filters", "weights", "points")):
             buffer.copy_(torch.randn(buffer.shape, generator=random) * (0.2 if name == "points" else 0.05))
         if name == "described":

@@ -147,8 +147,8 @@ def index(code: SceneCode, rows: Tensor | slice) -> dict[str, Tensor]:
     return {name: value[rows] for name, value in code.items()}
 
 
-def poses(code: SceneCode) -> list[Pose]:
-    """cam_from_obj of each image's object, in codes with one object."""
-    rotations = matrix_from_rotation_6d(code[ROTATION_6D][:, 0].double()).numpy()
-    translations = code[TRANSLATION][:, 0].double().numpy()
+def poses(code: SceneCode, slot: int = 0) -> list[Pose]:
+    """cam_from_obj of the object in one slot of each image."""
+    rotations = matrix_from_rotation_6d(code[ROTATION_6D][:, slot].double()).numpy()
+    translations = code[TRANSLATION][:, slot].double().numpy()
     return [Pose(rotation, translation) for rotation, translation in zip(rotations, translations, strict=True)]

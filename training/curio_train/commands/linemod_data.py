@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from curio_train.errors import UsageError
-from curio_train.worlds.options import LinemodOptions
+from curio_train.worlds.options import ALL_CLASSES, LinemodOptions
 
 MODELS = Path("models")
 """Where curio-export puts models, and where this repository has those of LM-O."""
@@ -29,8 +29,10 @@ def with_linemod(options: LinemodOptions, cache: Path, tell: Callable[[str], Non
     """
     from curio_train.data.bop import BopDataset
 
-    BopDataset.object_id(options.class_name)  # before anything is fetched
-    _name_models(options.class_name, tell)
+    names = [] if options.class_name == ALL_CLASSES else options.class_name.split(",")
+    for name in names:
+        BopDataset.object_id(name)  # before anything is fetched
+        _name_models(name, tell)
     if options.data is not None:
         return options
     return replace(options, data=fetched_linemod(cache, tell, ask=not options.download), download=False)

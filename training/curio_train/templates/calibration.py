@@ -13,8 +13,9 @@ from torch import Tensor
 from curio_train.geometry import Pose
 from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
+from curio_train.networks.templates.network import TemplateNetwork
+from curio_train.networks.templates.reader import CalibrationFeatures
 from curio_train.scene_code import poses
-from curio_train.templates.network import CalibrationFeatures, TemplateNetwork
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _NUM_FRAMES, _BATCH_SIZE = 160, 2  # larger batches take longer a frame
@@ -49,9 +50,9 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -
 
     errors_m = map(add_or_add_s_m, found, true, repeat(points), repeat(kind.info))
     right = [error_m < ADD_THRESHOLD * kind.diameter_m for error_m in errors_m]
-    network.pose_correct.copy_(_fit([features.right for features in full], right))
+    network.reader.pose_correct[0] = _fit([features.right[:, 0] for features in full], right)
     there = [True] * len(right) + [False] * len(right)
-    network.presence.copy_(_fit([features.there for features in (*full, *empty)], there))
+    network.reader.presence[0] = _fit([features.there[:, 0] for features in (*full, *empty)], there)
 
 
 def _fit(features: list[Tensor], is_so: list[bool]) -> Tensor:

@@ -60,6 +60,10 @@ class LightOptions(WorldOptions):
     """Two to ten capsules, boxes and cones on the ground: all of the above, and where the sun is. Needs no data."""
 
 
+ALL_CLASSES = "all"
+"""Names every object of a data set."""
+
+
 @dataclass(frozen=True)
 class LinemodOptions(WorldOptions):
     """One object of the LineMOD data set in six degrees of freedom, over cluttered backgrounds."""
@@ -68,7 +72,8 @@ class LinemodOptions(WorldOptions):
     default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     class_name: Annotated[str, tyro.conf.arg(name="class")]
-    """The object: ape, benchvise, can, cat, …"""
+    """The object: ape, benchvise, can, cat, … Several, as in ape,can, or all of the data set make one detector with a
+    slot for each."""
     data: Path | None = None
     """Folder in BOP's layout (lm or lmo) with models, models_info.json and camera.json. Without it LineMOD's own are
     downloaded, after a question."""

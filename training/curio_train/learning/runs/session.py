@@ -1,5 +1,6 @@
 """One session of training: from a configuration to a run folder, new or resumed."""
 
+import time
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Literal
@@ -15,8 +16,20 @@ from curio_train.learning.runs.progress import reporting
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress
 from curio_train.learning.trainer import Trainer
+from curio_train.networks.several_objects.network import ObjectsNetwork
+from curio_train.templates.build import fill_objects
 from curio_train.worlds import build
 from curio_train.worlds.base import StagedWorld, stages_of
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+
+
+def _draw_templates(trainer: Trainer, cache: Path) -> None:
+    """Detectors for several objects read poses by templates, which are drawn before training begins."""
+    network, world = trainer.state.pose.network, trainer.world
+    if isinstance(network, ObjectsNetwork) and isinstance(world, SeveralObjectsWorld):
+        begin = time.monotonic()
+        fill_objects(network, world, cache)
+        trainer.state.progress.seconds += time.monotonic() - begin
 
 
 def learn(
@@ -65,8 +78,10 @@ def learn(
             choose_threads(trainer.warm_up, reserved=int(not config.terms.reads_images))
         if resume and run.checkpoints():
             run.restore(trainer.state)
-        elif config.init is not None:
-            begin_with(trainer.state, config.init)
+        else:
+            if config.init is not None:
+                begin_with(trainer.state, config.init)
+            _draw_templates(trainer, cache)
 
         def finish() -> None:
             if isinstance(world, StagedWorld):

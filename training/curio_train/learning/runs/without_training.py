@@ -9,9 +9,9 @@ from curio_train.config import RunConfig
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress, TrainState
+from curio_train.networks.templates.network import TemplateNetwork
 from curio_train.templates.build import fill, without_scan_excess
 from curio_train.templates.calibration import calibrate
-from curio_train.templates.network import TemplateNetwork
 from curio_train.worlds import build
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 

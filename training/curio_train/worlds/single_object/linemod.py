@@ -12,7 +12,7 @@ Constants fixed before any training:
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +24,9 @@ from curio_train.data.backgrounds import Backgrounds, ClutterBackgrounds, Photog
 from curio_train.data.bop import BopDataset
 from curio_train.data.photographs import MAX_UNLABELLED, CameraPoses, Photographs, UnlabelledPhotographs, spread
 from curio_train.errors import CameraError, CurioError, UsageError
-from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.options import LinemodOptions
+from curio_train.worlds.base import ObjectKind, World
+from curio_train.worlds.options import ALL_CLASSES, LinemodOptions
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object, SingleObjectWorld, pose_layout, position_field, squeezed
 
@@ -94,8 +95,8 @@ def read_camera_poses(file: Path, paths: Sequence[Path]) -> CameraPoses:
     return cameras
 
 
-def build(options: LinemodOptions) -> SingleObjectWorld:
-    """The world of one LineMOD class, for a two-stage detector or for the paper's network.
+def build(options: LinemodOptions) -> World:
+    """The world of one LineMOD class, for a two-stage detector or for the paper's network; or of several classes.
 
     Raises:
         UsageError: Unknown class or no data.
@@ -108,26 +109,18 @@ def build(options: LinemodOptions) -> SingleObjectWorld:
             "layout (lm or lmo), --download fetches LineMOD from BOP's repository"
         )
     dataset = BopDataset(options.data)
-    name = options.class_name
-    mesh, info = dataset.mesh(name), dataset.model_info(name)
-    kind = ObjectKind(
-        name,
-        (0,),
-        info.diameter_m,
-        mesh.box_corners_m,
-        mesh.sha256,
-        info.symmetries,
-        info.symmetry_axes,
-        dataset.attribution,
-    )
+    names = dataset.classes if options.class_name == ALL_CLASSES else options.class_name.split(",")
 
     def backgrounds(cache: Path) -> Backgrounds:
         if options.backgrounds:
             return PhotographBackgrounds(Photographs(options.backgrounds))
-        others = [dataset.mesh(other) for other in dataset.classes if other != name]
+        others = [dataset.mesh(other) for other in dataset.classes if other not in names]
         return ClutterBackgrounds.cached(cache, others)
 
-    object_ = Object(kind, mesh, dataset.camera, NEAR_M, FAR_M, backgrounds, scan_excess_m=SCAN_EXCESS_M)
+    members = [_object(dataset, name, slot, backgrounds) for slot, name in enumerate(names)]
+    if len(members) > 1:
+        return SeveralObjectsWorld("linemod", [member.without_scan_excess() for member in members])
+    (object_,) = members
     if not options.gaze:
         layout = pose_layout(position_field(object_), confidence=False)
         return SingleObjectWorld("linemod", object_, squeezed(dataset.camera, SIDE_PX), layout)
@@ -135,3 +128,19 @@ def build(options: LinemodOptions) -> SingleObjectWorld:
     if options.photos is not None:
         photographs = LinemodPhotographs(options.photos, dataset.camera, options.views)
     return TwoStageWorld("linemod", object_, photographs)
+
+
+def _object(dataset: BopDataset, name: str, slot: int, backgrounds: Callable[[Path], Backgrounds]) -> Object:
+    """One class of the data set."""
+    mesh, info = dataset.mesh(name), dataset.model_info(name)
+    kind = ObjectKind(
+        name,
+        (slot,),
+        info.diameter_m,
+        mesh.box_corners_m,
+        mesh.sha256,
+        info.symmetries,
+        info.symmetry_axes,
+        dataset.attribution,
+    )
+    return Object(kind, mesh, dataset.camera, NEAR_M, FAR_M, backgrounds, scan_excess_m=SCAN_EXCESS_M)

@@ -8,10 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.geometry import rotation_between
+from curio_train.networks.templates.geometry import MAX_ROLL_DEG
 from curio_train.rendering.materials import log_uniform
 from curio_train.scene_code import Field
 
-MAX_ROLL_DEG = 45.0
 MIN_LIGHT, MAX_LIGHT = 0.2, 2.0
 MIN_LIGHT_OF_KNOWN_SCENE = 0.5
 """Strong enough over the ambient light to tell one face from another, as a lamp or a window is."""

@@ -1,7 +1,7 @@
 """Worlds of one known object in six degrees of freedom, over backgrounds of any kind."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -14,12 +14,13 @@ from curio_train.camera import Intrinsics, scale_matrix
 from curio_train.data.augmentation import KNOWN_SCENE, UNKNOWN_SCENE, AugmentationStrength, augment
 from curio_train.data.backgrounds import Backgrounds
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.meshes.inset import inset
 from curio_train.meshes.meshes import Mesh
-from curio_train.rendering.materials import random_appearances
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
-from curio_train.worlds.base import SPLITS, Batch, Camera, ImageSource, ObjectKind, Split, World, jitter_seed
+from curio_train.worlds.base import SPLITS, Camera, ObjectKind, Split, World, jitter_seed
 from curio_train.worlds.generated.fields import COLOR_FIELD, CONFIDENCE_FIELD
+from curio_train.worlds.rendered_stream import APPEARANCE, RenderedStream
 from curio_train.worlds.single_object.base_colors import BaseColorPrior, any_base_color
 from curio_train.worlds.single_object.viewpoints import (
     AMBIENT,
@@ -42,11 +43,6 @@ RotationPrior = Callable[[int, np.random.Generator], Float[Tensor, "count 3 3"]]
 EXPOSURE = "exposure"
 """Key beside the code of an object with colours of its own: factors on them, [batch, 1, 3], never predicted. Cameras
 see a part on a desk darker, and of another tint, than its mesh's colours."""
-
-APPEARANCE = "appearance"
-"""Key beside the code of training images: random surface properties other than colour, never predicted."""
-
-_APPEARANCE_DRAWS = 1  # keeps these draws of a step apart from its others
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +71,10 @@ class Object:
     """Its background and the light there are known."""
     scan_excess_m: float = 0.0
     """How far the mesh's surface lies outside the real one: depth fusion makes scanned objects too thick."""
+
+    def without_scan_excess(self) -> "Object":
+        """The object as thick as the real one."""
+        return replace(self, mesh=inset(self.mesh, self.scan_excess_m), scan_excess_m=0.0)
 
 
 class SingleObjectWorld(World):
@@ -144,11 +144,18 @@ class SingleObjectWorld(World):
             return {COLOR: self.object.base_colors(count, random)}
         return {EXPOSURE: random_exposures(count, random, self.exposure)}
 
-    def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> "RenderedStream":
+    def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> RenderedStream:
         """An endless stream of renderings; the splits differ in poses and in backgrounds."""
         training = split == "train"
         backgrounds = self.backgrounds(cache).split(training)
-        return RenderedStream(self, backgrounds, (SPLITS.index(split), seed), with_code=with_code, training=training)
+        return RenderedStream(
+            self,
+            backgrounds,
+            (SPLITS.index(split), seed),
+            with_code=with_code,
+            given=self.given,
+            random_appearance=training and self.random_appearance and not self.object.known_scene,
+        )
 
     def backgrounds(self, cache: Path) -> Backgrounds:
         """The backgrounds of its images."""
@@ -172,41 +179,6 @@ class SingleObjectWorld(World):
             appearance=code.get(APPEARANCE),
             seed=jitter_seed(code),
         )
-
-
-class RenderedStream(ImageSource):
-    """Images of a world over random backgrounds, rendered when they are asked for and never stored."""
-
-    def __init__(
-        self,
-        world: SingleObjectWorld,
-        backgrounds: Backgrounds,
-        seed: tuple[int, ...],
-        *,
-        with_code: bool,
-        training: bool,
-    ) -> None:
-        self._world, self._backgrounds, self._seed, self._with_code = world, backgrounds, seed, with_code
-        self._random_appearance = training and world.random_appearance and not world.object.known_scene
-
-    @torch.no_grad()
-    def batch(self, step: int, size: int) -> Batch:
-        """The images of one step, a function of seed and step alone."""
-        seed = (*self._seed, step)
-        code = self._world.sample(size, seed)
-        if self._random_appearance:
-            count, slots = code[TRANSLATION].shape[:2]
-            drawn = random_appearances(count * slots, np.random.default_rng((*seed, _APPEARANCE_DRAWS)))
-            code[APPEARANCE] = drawn.reshape(count, slots, -1)
-        backgrounds = self.backgrounds(step, size)
-        images = self._world.render(code, backgrounds)
-        given = {name: code[name] for name in self._world.given}
-        return Batch(images, backgrounds, code if self._with_code else None, given)
-
-    def backgrounds(self, step: int, size: int) -> Tensor:
-        """The backgrounds of one step's batch, without rendering the images."""
-        camera = self._world.camera
-        return self._backgrounds.draw(size, camera.width, camera.height, (*self._seed, step))
 
 
 def pose_code(
@@ -236,12 +208,12 @@ def position_field(object_: Object) -> Field:
     )
 
 
-def pose_layout(position: Field, *, confidence: bool, color: bool = False) -> Layout:
+def pose_layout(position: Field, *, confidence: bool, color: bool = False, num_slots: int = 1) -> Layout:
     """The paper's R¹² of one object: position 3, rotation 6, light 3; confidence and colour are not the paper's."""
     rotation = Field(ROTATION_6D, 6, frame="camera", lower=(-1.0,) * 6, upper=(1.0,) * 6)
     bounds = (-MAX_LIGHT,) * 3, (MAX_LIGHT,) * 3
     light = Field(LIGHT, 3, per_object=False, frame="camera", lower=bounds[0], upper=bounds[1])
-    return Layout((position, rotation, *[CONFIDENCE_FIELD] * confidence, *[COLOR_FIELD] * color, light))
+    return Layout((position, rotation, *[CONFIDENCE_FIELD] * confidence, *[COLOR_FIELD] * color, light), num_slots)
 
 
 def resized(camera: Intrinsics, width: int, height: int) -> Camera:

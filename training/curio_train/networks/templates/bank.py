@@ -1,13 +1,11 @@
-"""The templates of an object seen from all sides: compared with crops as a whole, and point by point."""
+"""The templates of one object seen from all sides, to be compared with crops as a whole and point by point."""
 
 import torch
-import torch.nn.functional as F
-from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from curio_train.templates.descriptors import Descriptors
-from curio_train.templates.geometry import CROP_PX, NUM_ROLLS, NUM_VIEWS, viewpoints
-from curio_train.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH
+from curio_train.networks.templates.descriptors import Descriptors
+from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, NUM_VIEWS, viewpoints
+from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH
 
 COARSE_SIZE = 24
 RANK = 96
@@ -16,7 +14,8 @@ RANK = 96
 NUM_POINTS = 80
 """Surface points a template that poses are aligned by."""
 
-_LARGEST_BYTE = 127
+LARGEST_BYTE = 127
+"""Of a stored descriptor: signed bytes."""
 
 
 class Bank(nn.Module):
@@ -35,7 +34,7 @@ class Bank(nn.Module):
     described: Tensor
     """Fine descriptors of the points, times 127, [templates, points, FINE_WIDTH]."""
     rotations: Tensor
-    """cam_from_obj of an object on the optical axis, [templates, 3, 3]."""
+    """cam_from_obj of an object on the optical axis, [templates, 3, 3]; the same for every object."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,18 +47,7 @@ class Bank(nn.Module):
         self.register_buffer("described", torch.zeros(num, NUM_POINTS, FINE_WIDTH, dtype=torch.int8))
         self.register_buffer("rotations", viewpoints(NUM_VIEWS, NUM_ROLLS), persistent=False)
 
-    def match(self, descriptors: Float[Tensor, "batch size rows columns"]) -> Float[Tensor, "batch templates shifts"]:
-        """Mean cosine over each template's silhouette, at every shift of whole cells."""
-        filtered = F.conv2d(descriptors, self.filters.float()).flatten(2)
-        return self.weights.float() @ filtered
-
-    def surface(
-        self, templates: Int[Tensor, " batch"]
-    ) -> tuple[Float[Tensor, "batch points 3"], Float[Tensor, "batch points size"]]:
-        """Points of templates, diameters, and their descriptors."""
-        return self.points[templates].float(), self.described[templates].float() / _LARGEST_BYTE
-
     def store(self, points: Tensor, described: Tensor) -> None:
-        """Round what :meth:`surface` gives back."""
+        """Round points [templates, points, 3] and descriptors [templates, points, FINE_WIDTH], and keep them."""
         self.points.copy_(points)
-        self.described.copy_((_LARGEST_BYTE * described).round().clamp(-_LARGEST_BYTE, _LARGEST_BYTE))
+        self.described.copy_((LARGEST_BYTE * described).round().clamp(-LARGEST_BYTE, LARGEST_BYTE))

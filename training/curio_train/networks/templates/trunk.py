@@ -52,6 +52,10 @@ class Trunk(nn.Module):
             coarse = block(coarse)
         return fine, coarse
 
+    def train(self, mode: bool = True) -> "Trunk":
+        """Stay in evaluation mode: batch norm's statistics are frozen, too."""
+        return super().train(False)
+
     @classmethod
     def pretrained(cls, path: Path | None = None) -> "Trunk":
         """The trunk with ImageNet's weights, frozen.

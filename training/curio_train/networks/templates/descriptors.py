@@ -26,8 +26,7 @@ class Descriptors(nn.Module):
         self, features: Float[Tensor, "batch inputs height width"]
     ) -> Float[Tensor, "batch outputs height width"]:
         """Descriptors of unit length."""
-        centred = F.conv2d(features - self.mean[:, None, None], self.projection[..., None, None])
-        return centred / centred.square().sum(dim=1, keepdim=True).clamp(min=_SHORTEST**2).sqrt()
+        return normalised(F.conv2d(features - self.mean[:, None, None], self.projection[..., None, None]), dim=1)
 
     def centre(self, background: Float[Tensor, "batch inputs height width"]) -> None:
         """Take the mean of background; nothing is projected away."""
@@ -58,3 +57,8 @@ class Descriptors(nn.Module):
         rows = (full(features) * mask).movedim(1, 0).flatten(1)
         _, vectors = torch.linalg.eigh(rows @ rows.T)
         self.projection.copy_(vectors[:, -len(self.projection) :].T @ whitening)
+
+
+def normalised(descriptors: Tensor, dim: int) -> Tensor:
+    """Descriptors, whose channels are dimension ``dim``, scaled to unit length."""
+    return descriptors / descriptors.square().sum(dim=dim, keepdim=True).clamp(min=_SHORTEST**2).sqrt()

@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from curio_train.templates.trunk import COARSE_STRIDE
-from curio_train.worlds.single_object.viewpoints import MAX_ROLL_DEG
+from curio_train.networks.templates.trunk import COARSE_STRIDE
+
+MAX_ROLL_DEG = 45.0
+"""By which cameras that look at an upright object are rolled, to either side."""
 
 NUM_VIEWS, NUM_ROLLS = 220, 7
 """Directions on the upper hemisphere, about 10 degrees apart, and rolls of 15 degrees for each."""

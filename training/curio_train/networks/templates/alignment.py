@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from curio_train.templates.trunk import FINE_STRIDE, FINE_WIDTH
+from curio_train.networks.templates.trunk import FINE_STRIDE, FINE_WIDTH
 
 _DAMPING = 1e-2  # of the Hessian's diagonal
 _RIDGE = 1e-6

@@ -8,9 +8,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from curio_train.templates.descriptors import Descriptors
-from curio_train.templates.geometry import FRAME_STRIDE, LOCALISING_ROLLS, LOCALISING_VIEWS, Geometry
-from curio_train.templates.trunk import COARSE_STRIDE, COARSE_WIDTH
+from curio_train.networks.templates.descriptors import Descriptors
+from curio_train.networks.templates.geometry import FRAME_STRIDE, LOCALISING_ROLLS, LOCALISING_VIEWS, Geometry
+from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH
 
 NUM_CANDIDATES = 6
 DESCRIPTOR_SIZE = 24

@@ -1,0 +1,49 @@
+"""Whole frame to pose by templates alone, in one graph: nothing in it was trained but the frozen trunk."""
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from curio_train.networks.templates.geometry import FRAME_STRIDE, Geometry
+from curio_train.networks.templates.localiser import Localiser
+from curio_train.networks.templates.reader import STEPS, CalibrationFeatures, Places, PoseReader
+from curio_train.networks.templates.trunk import Trunk
+
+
+class TemplateNetwork(nn.Module):
+    """Localise, match, align."""
+
+    trunk: Trunk
+    """Frozen features."""
+    localiser: Localiser
+    """Finds centre proposals in the frame."""
+    reader: PoseReader
+    """From places to a pose."""
+    geometry: Geometry
+    """Of frames and object."""
+
+    def __init__(self, geometry: Geometry, steps: tuple[int, int] = STEPS) -> None:
+        """Build for frames and an object; all templates are still empty.
+
+        Args:
+            geometry: Of frames and object.
+            steps: See :data:`STEPS`.
+        """
+        super().__init__()
+        self.trunk, self.localiser, self.reader = Trunk(), Localiser(geometry), PoseReader([geometry], steps)
+        self.geometry = geometry
+        self.requires_grad_(False)
+        self.eval()
+
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
+        """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
+        code: dict[str, Tensor] = self.reader(self.trunk, images, self._places(images))
+        return code
+
+    def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], CalibrationFeatures]:
+        """The code without its confidence, and what that is made of."""
+        return self.reader.read(self.trunk, images, self._places(images))
+
+    def _places(self, images: Tensor) -> Places:
+        position_m, score = self.localiser(self.trunk(F.avg_pool2d(images, FRAME_STRIDE))[1])
+        return Places(position_m[:, None], score[:, None])

@@ -1,0 +1,29 @@
+"""Templates out of pictures: features, mean cosines over silhouettes, and their compression."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from curio_train.networks.templates.trunk import Trunk
+
+_BATCH = 8  # pictures: larger feature maps are allocated anew each time, which takes five times as long
+
+
+def features(trunk: Trunk, pictures: Tensor) -> tuple[Tensor, Tensor]:
+    """Both feature maps of pictures, a few at a time."""
+    fine, coarse = zip(*(trunk(some) for some in pictures.split(_BATCH)), strict=True)
+    return torch.cat(fine), torch.cat(coarse)
+
+
+def mean_cosine(descriptors: Tensor, mask: Float[Tensor, "templates 1 height width"]) -> Tensor:
+    """Templates whose product with a picture's descriptors is the mean cosine over their silhouettes."""
+    return F.normalize(descriptors, dim=1) * mask / mask.sum(dim=(1, 2, 3), keepdim=True).clamp(min=1e-6)
+
+
+def low_rank(templates: Float[Tensor, "templates size height width"], rank: int) -> tuple[Tensor, Tensor]:
+    """Filters [rank, size, height, width] and weights [templates, rank] whose products are nearly the templates."""
+    rows = templates.flatten(1)
+    _, vectors = torch.linalg.eigh(rows @ rows.T)  # the largest are last
+    weights = vectors[:, -rank:]
+    return (weights.T @ rows).unflatten(1, templates.shape[1:]), weights

@@ -1,0 +1,62 @@
+"""Calibrates the confidences of a detector for several objects as probabilities, on renderings."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from curio_train.metrics.calibration import fit_calibration
+from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
+from curio_train.networks.several_objects.network import ObjectsNetwork
+from curio_train.networks.templates.reader import CalibrationFeatures
+from curio_train.scene_code import CONFIDENCE, SceneCode, poses
+from curio_train.worlds.several_objects.scenes import ObjectScenes
+
+_NUM_FRAMES, _BATCH_SIZE = 160, 2  # larger batches take longer a frame
+_NUM_POINTS = 500  # vertices that ADD is measured at, about
+
+
+@torch.no_grad()
+def calibrate(network: ObjectsNetwork, world: ObjectScenes, cache: Path) -> None:
+    """Make each object's confidence the probability of a correct pose, in place.
+
+    Frames that show the object tell whether its pose is correct; those that don't show its absence.
+
+    Raises:
+        DataError: The backgrounds cannot be read.
+    """
+    source = world.source("validation", 0, with_code=True, cache=cache)
+    network.eval()
+    features: list[CalibrationFeatures] = []
+    present: list[Tensor] = []
+    correct: list[np.ndarray] = []
+    for step in range(_NUM_FRAMES // _BATCH_SIZE):
+        batch = source.batch(step, _BATCH_SIZE)
+        assert batch.code is not None
+        code, found = network.read(world.augment(batch.images, (0, step)).clamp(0, 1))
+        features.append(found)
+        present.append(batch.code[CONFIDENCE][..., 0] > 0)
+        correct.append(_correct(world, code, batch.code))
+    right, there = (torch.cat(parts).numpy() for parts in zip(*features, strict=True))
+    shown, hit = torch.cat(present).numpy(), np.concatenate(correct)
+    for number in range(len(world.members)):
+        seen = shown[:, number]
+        network.reader.pose_correct[number] = _fit(right[seen, number], hit[seen, number])
+        network.reader.presence[number] = _fit(there[:, number], seen)
+
+
+def _correct(world: ObjectScenes, found: SceneCode, true: SceneCode) -> np.ndarray:
+    """Which objects' poses are correct, [batch, objects]."""
+    by_object = []
+    for number, member in enumerate(world.members):
+        vertices = member.mesh.vertices_m
+        points = vertices[:: max(1, len(vertices) // _NUM_POINTS)]
+        pairs = zip(poses(found, number), poses(true, number), strict=True)
+        errors_m = [add_or_add_s_m(one, other, points, member.kind.info) for one, other in pairs]
+        by_object.append([error_m < ADD_THRESHOLD * member.kind.diameter_m for error_m in errors_m])
+    return np.array(by_object).T
+
+
+def _fit(features: np.ndarray, is_so: np.ndarray) -> Tensor:
+    return torch.tensor(fit_calibration(features, is_so.tolist())).float()
