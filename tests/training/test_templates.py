@@ -10,12 +10,12 @@ import torch
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.export.onnx import to_onnx
 from curio_train.networks.templates.alignment import Aligned, align, with_gradient
-from curio_train.templates.build import template_network
 from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import Geometry, viewpoints
 from curio_train.networks.templates.localiser import RANK, Localiser
 from curio_train.networks.templates.network import STEPS, TemplateNetwork
 from curio_train.networks.templates.trunk import FINE_WIDTH, Trunk
+from curio_train.templates.build import template_network
 from curio_train.worlds import build
 from curio_train.worlds.options import CirclesOptions
 
