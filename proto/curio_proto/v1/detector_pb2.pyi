@@ -21,6 +21,13 @@ class RegionStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REGION_STATUS_DETECTED: _ClassVar[RegionStatus]
     REGION_STATUS_NO_OBJECT: _ClassVar[RegionStatus]
     REGION_STATUS_OUTSIDE_FRAME: _ClassVar[RegionStatus]
+    REGION_STATUS_UNSURE: _ClassVar[RegionStatus]
+
+class DetectionStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    DETECTION_STATUS_UNSPECIFIED: _ClassVar[DetectionStatus]
+    DETECTION_STATUS_SURE: _ClassVar[DetectionStatus]
+    DETECTION_STATUS_UNSURE: _ClassVar[DetectionStatus]
 PIXEL_FORMAT_UNSPECIFIED: PixelFormat
 PIXEL_FORMAT_RGB8: PixelFormat
 PIXEL_FORMAT_BGR8: PixelFormat
@@ -29,6 +36,10 @@ REGION_STATUS_UNSPECIFIED: RegionStatus
 REGION_STATUS_DETECTED: RegionStatus
 REGION_STATUS_NO_OBJECT: RegionStatus
 REGION_STATUS_OUTSIDE_FRAME: RegionStatus
+REGION_STATUS_UNSURE: RegionStatus
+DETECTION_STATUS_UNSPECIFIED: DetectionStatus
+DETECTION_STATUS_SURE: DetectionStatus
+DETECTION_STATUS_UNSURE: DetectionStatus
 
 class ModelSelector(_message.Message):
     __slots__ = ("name", "version")
@@ -130,8 +141,20 @@ class Tracking(_message.Message):
     restart: bool
     def __init__(self, time_s: _Optional[float] = ..., keep_s: _Optional[float] = ..., num_objects: _Optional[int] = ..., search: bool = ..., restart: bool = ...) -> None: ...
 
+class PoseInterval(_message.Message):
+    __slots__ = ("level", "lateral_m", "depth_m", "rotation_deg")
+    LEVEL_FIELD_NUMBER: _ClassVar[int]
+    LATERAL_M_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_M_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_DEG_FIELD_NUMBER: _ClassVar[int]
+    level: float
+    lateral_m: float
+    depth_m: float
+    rotation_deg: float
+    def __init__(self, level: _Optional[float] = ..., lateral_m: _Optional[float] = ..., depth_m: _Optional[float] = ..., rotation_deg: _Optional[float] = ...) -> None: ...
+
 class Detection(_message.Message):
-    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range", "track", "views")
+    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range", "track", "views", "status", "interval")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     TRANSLATION_M_FIELD_NUMBER: _ClassVar[int]
@@ -143,6 +166,8 @@ class Detection(_message.Message):
     OUTSIDE_TRAINED_RANGE_FIELD_NUMBER: _ClassVar[int]
     TRACK_FIELD_NUMBER: _ClassVar[int]
     VIEWS_FIELD_NUMBER: _ClassVar[int]
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    INTERVAL_FIELD_NUMBER: _ClassVar[int]
     object: str
     confidence: float
     translation_m: _containers.RepeatedScalarFieldContainer[float]
@@ -154,7 +179,9 @@ class Detection(_message.Message):
     outside_trained_range: bool
     track: Track
     views: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ..., track: _Optional[_Union[Track, _Mapping]] = ..., views: _Optional[_Iterable[int]] = ...) -> None: ...
+    status: DetectionStatus
+    interval: PoseInterval
+    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ..., track: _Optional[_Union[Track, _Mapping]] = ..., views: _Optional[_Iterable[int]] = ..., status: _Optional[_Union[DetectionStatus, str]] = ..., interval: _Optional[_Union[PoseInterval, _Mapping]] = ...) -> None: ...
 
 class Track(_message.Message):
     __slots__ = ("track_id", "age_s", "unseen_s", "predicted", "translation_m", "rotation", "quaternion_xyzw", "velocity_m_s", "position_std_m", "rotation_std_rad")

@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class ModelSpec(_message.Message):
-    __slots__ = ("schema_version", "name", "world", "num_slots", "fields", "objects", "camera", "parity_max_abs_error", "recipe", "commit", "images_seen", "training_seconds")
+    __slots__ = ("schema_version", "name", "world", "num_slots", "fields", "objects", "camera", "parity_max_abs_error", "recipe", "commit", "images_seen", "training_seconds", "reliability")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     WORLD_FIELD_NUMBER: _ClassVar[int]
@@ -20,6 +20,7 @@ class ModelSpec(_message.Message):
     COMMIT_FIELD_NUMBER: _ClassVar[int]
     IMAGES_SEEN_FIELD_NUMBER: _ClassVar[int]
     TRAINING_SECONDS_FIELD_NUMBER: _ClassVar[int]
+    RELIABILITY_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     name: str
     world: str
@@ -32,7 +33,40 @@ class ModelSpec(_message.Message):
     commit: str
     images_seen: int
     training_seconds: float
-    def __init__(self, schema_version: _Optional[int] = ..., name: _Optional[str] = ..., world: _Optional[str] = ..., num_slots: _Optional[int] = ..., fields: _Optional[_Iterable[_Union[Field, _Mapping]]] = ..., objects: _Optional[_Iterable[_Union[ObjectModel, _Mapping]]] = ..., camera: _Optional[_Union[CanonicalCamera, _Mapping]] = ..., parity_max_abs_error: _Optional[float] = ..., recipe: _Optional[str] = ..., commit: _Optional[str] = ..., images_seen: _Optional[int] = ..., training_seconds: _Optional[float] = ...) -> None: ...
+    reliability: Reliability
+    def __init__(self, schema_version: _Optional[int] = ..., name: _Optional[str] = ..., world: _Optional[str] = ..., num_slots: _Optional[int] = ..., fields: _Optional[_Iterable[_Union[Field, _Mapping]]] = ..., objects: _Optional[_Iterable[_Union[ObjectModel, _Mapping]]] = ..., camera: _Optional[_Union[CanonicalCamera, _Mapping]] = ..., parity_max_abs_error: _Optional[float] = ..., recipe: _Optional[str] = ..., commit: _Optional[str] = ..., images_seen: _Optional[int] = ..., training_seconds: _Optional[float] = ..., reliability: _Optional[_Union[Reliability, _Mapping]] = ...) -> None: ...
+
+class Reliability(_message.Message):
+    __slots__ = ("level", "num_images", "objects")
+    LEVEL_FIELD_NUMBER: _ClassVar[int]
+    NUM_IMAGES_FIELD_NUMBER: _ClassVar[int]
+    OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    level: float
+    num_images: int
+    objects: _containers.RepeatedCompositeFieldContainer[ObjectReliability]
+    def __init__(self, level: _Optional[float] = ..., num_images: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectReliability, _Mapping]]] = ...) -> None: ...
+
+class ObjectReliability(_message.Message):
+    __slots__ = ("object", "min_confidence", "bounds")
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    BOUNDS_FIELD_NUMBER: _ClassVar[int]
+    object: str
+    min_confidence: float
+    bounds: _containers.RepeatedCompositeFieldContainer[PoseBounds]
+    def __init__(self, object: _Optional[str] = ..., min_confidence: _Optional[float] = ..., bounds: _Optional[_Iterable[_Union[PoseBounds, _Mapping]]] = ...) -> None: ...
+
+class PoseBounds(_message.Message):
+    __slots__ = ("min_confidence", "lateral_m", "depth_fraction", "rotation_deg")
+    MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    LATERAL_M_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_FRACTION_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_DEG_FIELD_NUMBER: _ClassVar[int]
+    min_confidence: float
+    lateral_m: float
+    depth_fraction: float
+    rotation_deg: float
+    def __init__(self, min_confidence: _Optional[float] = ..., lateral_m: _Optional[float] = ..., depth_fraction: _Optional[float] = ..., rotation_deg: _Optional[float] = ...) -> None: ...
 
 class Field(_message.Message):
     __slots__ = ("name", "size", "per_object", "unit", "frame", "lower", "upper", "activation")

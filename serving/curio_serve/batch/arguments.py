@@ -54,7 +54,7 @@ class DetectArguments:
     """Folder for pictures with boxes and axes drawn in, laid out like the images. An exported model holds no mesh,
     and a box looks the same after half a turn: curio-render --mesh --over-photograph draws the mesh."""
     min_confidence: float = 0.0
-    """Leave out detections below, 0 to 1."""
+    """Leave out detections below, 0 to 1. Those below the model's own threshold say that they are unsure."""
     max_detections: int | None = None
     """Keep that many of an image, the most confident. None: all."""
     max_instances: int | None = None

@@ -8,14 +8,14 @@ itself is :mod:`curio_serve.batch.result_file`'s.
 import csv
 import io
 import json
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import PurePath
 
-from curio_proto.v1.detector_pb2 import Detection, RegionResult, Track
+from curio_proto.v1.detector_pb2 import Detection, RegionResult
 
+from curio_serve.batch.detection_json import STATUS, detection_json, finite, rows
 from curio_serve.batch.sources import RecordedAt
 from curio_serve.bop import LINEMOD_IDS
 from curio_serve.errors import UsageError
@@ -134,13 +134,13 @@ class JsonLines(ResultFormat):
     is_one_line_an_image = True
 
     def encode(self, result: ImageResult) -> bytes:
-        answer: dict[str, object] = {"detections": [_detection_json(detection) for detection in result.detections]}
+        answer: dict[str, object] = {"detections": [detection_json(detection) for detection in result.detections]}
         record = {
             "image": result.image,
             **({"views": list(result.views)} if result.views else {}),
             "width": result.width,
             "height": result.height,
-            "camera_matrix": _rows(result.camera_matrix, 3) or None,
+            "camera_matrix": rows(result.camera_matrix, 3) or None,
             **({"error": result.error} if result.error else answer),
             "light": result.light or None,
             "model": {"name": result.model, "version": result.version},
@@ -169,7 +169,7 @@ class Csv(ResultFormat):
         *("qx", "qy", "qz", "qw", "red", "green", "blue"),
         *(f"box_{axis}{corner}_px" for corner in range(8) for axis in "uv"),
         *("light_x", "light_y", "light_z", "decode_ms", "inference_ms", "error"),
-        "outside_trained_range",
+        *("outside_trained_range", "status"),
     )
     opening = header = (",".join(columns) + "\n").encode()
 
@@ -180,7 +180,7 @@ class Csv(ResultFormat):
         error = " ".join(result.error.split())
         end = (*_padded(result.light, 3), _rounded(result.decode_ms), _rounded(result.inference_ms), error)
         for index, detection in enumerate(result.detections or [None]):
-            rows.writerow((*start, index, *_detection_cells(detection), *end, _is_outside(detection)))
+            rows.writerow((*start, index, *_detection_cells(detection), *end, *_last_cells(detection)))
         return text.getvalue().encode(errors="surrogateescape")
 
     def key(self, image: str) -> str:
@@ -272,38 +272,6 @@ def bop_object_ids(objects: Sequence[str], given: int | None) -> dict[str, int]:
     return {name: LINEMOD_IDS[name] for name in objects}
 
 
-def _detection_json(detection: Detection) -> dict[str, object]:
-    added: dict[str, object] = {"track": _track_json(detection.track)} if detection.HasField("track") else {}
-    added |= {"views": list(detection.views)} if detection.views else {}
-    return {
-        "object": detection.object,
-        "confidence": round(detection.confidence, 6),
-        "translation_m": list(detection.translation_m),
-        "rotation": _rows(detection.rotation, 3) or None,
-        "rotation_6d": list(detection.rotation_6d) or None,
-        "quaternion_xyzw": list(detection.quaternion_xyzw) or None,
-        "color": list(detection.color) or None,
-        "box_px": [[_finite(value) for value in corner] for corner in _rows(detection.box_px, 2)] or None,
-        "outside_trained_range": detection.outside_trained_range,
-        **added,
-    }
-
-
-def _track_json(track: Track) -> dict[str, object]:
-    return {
-        "track_id": track.track_id,
-        "age_s": round(track.age_s, 6),
-        "unseen_s": round(track.unseen_s, 6),
-        "predicted": track.predicted,
-        "translation_m": list(track.translation_m),
-        "rotation": _rows(track.rotation, 3),
-        "quaternion_xyzw": list(track.quaternion_xyzw),
-        "velocity_m_s": list(track.velocity_m_s),
-        "position_std_m": list(track.position_std_m),
-        "rotation_std_rad": track.rotation_std_rad,
-    }
-
-
 def _detection_cells(detection: Detection | None) -> Iterator[object]:
     """The columns of one detection; empty for None."""
     found = Detection() if detection is None else detection
@@ -313,26 +281,19 @@ def _detection_cells(detection: Detection | None) -> Iterator[object]:
     yield from _padded(found.rotation, 9)
     yield from _padded(found.quaternion_xyzw, 4)
     yield from _padded(found.color, 3)
-    yield from _padded([_finite(value) for value in found.box_px], 16)
+    yield from _padded([finite(value) for value in found.box_px], 16)
 
 
-def _is_outside(detection: Detection | None) -> str:
-    """The last column, as JSON writes it; empty for None."""
-    return "" if detection is None else json.dumps(detection.outside_trained_range)
-
-
-def _rows(values: Sequence[float], width: int) -> list[list[float]]:
-    return [list(values[start : start + width]) for start in range(0, len(values), width)]
+def _last_cells(detection: Detection | None) -> tuple[str, str]:
+    """The last columns, as JSON writes them; empty for None."""
+    if detection is None:
+        return "", ""
+    return json.dumps(detection.outside_trained_range), STATUS.get(detection.status, "")
 
 
 def _padded(values: Sequence[float | None], length: int) -> list[float | None]:
     """The values, or that many empty cells where there are none."""
     return list(values) or [None] * length
-
-
-def _finite(value: float) -> float | None:
-    """JSON has no NaN: a corner behind the camera is null."""
-    return value if math.isfinite(value) else None
 
 
 def _rounded(milliseconds: float | None) -> float | None:

@@ -9,7 +9,7 @@ from itertools import combinations
 
 import cv2
 import numpy as np
-from curio_proto.v1.detector_pb2 import Detection, RegionResult
+from curio_proto.v1.detector_pb2 import DETECTION_STATUS_UNSURE, Detection, RegionResult
 from curio_proto.v1.model_spec_pb2 import ModelSpec, ObjectModel
 from numpy.typing import NDArray
 
@@ -27,6 +27,7 @@ _PALETTE: tuple[Rgb, ...] = (
     (190, 160, 255),
 )
 _AXES: tuple[Rgb, ...] = ((255, 64, 64), (64, 224, 64), (80, 128, 255))  # x, y, z
+_UNSURE: Rgb = (176, 176, 176)
 _HALO: Rgb = (16, 16, 16)
 _TEXT: Rgb = (255, 255, 255)
 _SUBPIXEL_BITS = 4  # OpenCV draws at sixteenths of a pixel
@@ -38,7 +39,8 @@ def draw(
 ) -> Pixels:
     """A copy of the frame with every detection drawn on it, but those whose confidence is 0 to two digits.
 
-    These are the slots of a model for several objects that it knows to be empty.
+    These are the slots of a model for several objects that it knows to be empty. Detections that are unsure are grey,
+    with a question mark.
 
     Args:
         pixels: [height, width, 3] RGB.
@@ -57,12 +59,14 @@ def draw(
         if round(detection.confidence, 2) == 0:
             continue
         kind, color = objects.get(detection.object, (ObjectModel(), _PALETTE[0]))
+        is_unsure = detection.status == DETECTION_STATUS_UNSURE
+        color = _UNSURE if is_unsure else color
         corners_px = np.array(detection.box_px, float).reshape(-1, 2)
         if camera is None:
             _draw_disc(canvas, corners_px, color, stroke_px)
         else:
             _draw_solid(canvas, corners_px, detection, kind, camera, color, stroke_px)
-        _draw_label(canvas, corners_px, f"{detection.object} {detection.confidence:.2f}", color)
+        _draw_label(canvas, corners_px, f"{detection.object}{'?' * is_unsure} {detection.confidence:.2f}", color)
     return canvas
 
 

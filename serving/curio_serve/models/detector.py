@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from curio_proto.v1.detector_pb2 import (
-    REGION_STATUS_DETECTED,
-    REGION_STATUS_NO_OBJECT,
     REGION_STATUS_OUTSIDE_FRAME,
     DetectResponse,
     RegionResult,
 )
-from curio_proto.v1.model_spec_pb2 import ModelSpec
+from curio_proto.v1.model_spec_pb2 import ModelSpec, Reliability
 
 from curio_serve.errors import ArgumentError, CameraError, CameraMissing, ImageError
 from curio_serve.imaging.camera import PinholeCamera
@@ -21,6 +19,7 @@ from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
 from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Values
 from curio_serve.models.model import Model, Slot
+from curio_serve.models.reliability import add_interval, region_status, status_of
 
 if TYPE_CHECKING:
     from google.protobuf.internal.containers import RepeatedCompositeFieldContainer
@@ -105,6 +104,7 @@ class Detector:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
                 _fill(result, crop, self.model.slots, next(readings), limits, self.depths_m)
+                _judge(result, self.model.spec.reliability)
         return results
 
     def _readings(self, images: list[Array], max_instances: int | None, before_run: Callable[[], None]) -> list[Values]:
@@ -227,10 +227,6 @@ def _fill(
     slots = [*slots] * (len(values["translation_m"]) // len(slots))
     confidences = [min(max(c, 0.0), 1.0) for c in values.get("confidence", [1.0] * len(slots))]
     confident = [row for row, confidence in enumerate(confidences) if confidence >= limits.min_confidence]
-    if not confident:
-        result.status = REGION_STATUS_NO_OBJECT
-        return
-    result.status = REGION_STATUS_DETECTED
     confident.sort(key=confidences.__getitem__, reverse=True)
     if limits.max_instances is not None:
         confident = _first_of_each(confident, slots, limits.max_instances)
@@ -250,6 +246,14 @@ def _fill(
             box_px=crop.project(transformed(slots[row].box_corners, rotation or _UPRIGHT, translation)),
             outside_trained_range=not depths_m[0] <= values["translation_m"][row][2] <= depths_m[1],
         )
+
+
+def _judge(result: RegionResult, reliability: Reliability) -> None:
+    """Write into a result which of its detections are sure, and within which intervals."""
+    for detection in result.detections:
+        detection.status = status_of(reliability, detection.object, detection.confidence)
+        add_interval(detection, reliability)
+    result.status = region_status(result.detections)
 
 
 def transformed(

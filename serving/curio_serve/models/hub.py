@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.models.model_folder import CONFIG_FILE, MODEL_FILE, SUMS_FILE, listed_sums
+from curio_serve.models.reliability import RELIABILITY_FILE
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -24,7 +25,14 @@ _PART = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,95}"
 _REPOSITORY = re.compile(rf"{_PART}/{_PART}")
 _MODEL = re.compile(rf"(?P<name>{_PART})/(?P<version>[1-9][0-9]{{0,8}})/{re.escape(MODEL_FILE)}")
 # weights.safetensors is for training
-_FETCHED = ["*/config.pbtxt", "*/CARD.md", "*/SHA256SUMS", f"*/*/{MODEL_FILE}", "*/*/golden.npz"]
+_FETCHED = [
+    "*/config.pbtxt",
+    "*/CARD.md",
+    "*/SHA256SUMS",
+    f"*/*/{MODEL_FILE}",
+    "*/*/golden.npz",
+    f"*/*/{RELIABILITY_FILE}",
+]
 
 
 def is_on_hub(model: str) -> bool:

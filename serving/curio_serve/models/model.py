@@ -16,6 +16,7 @@ from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.view import CanonicalCamera
 from curio_serve.models.batching import Batcher
 from curio_serve.models.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote
+from curio_serve.models.reliability import RELIABILITY_FILE, parse_reliability
 from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime, open_session, runtime_errors
 from curio_serve.models.spec import read_metadata, read_spec
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 INPUT = "image"
 MAX_BYTES = 1 << 30
+_MAX_RELIABILITY_BYTES = 1 << 20
 Outputs = Mapping[str, np.ndarray]
 
 # Shape of each output after [batch, num_slots] or [batch], and whether it is one a slot.
@@ -57,7 +59,7 @@ class Model:
     version: int
     """Of the model folder; 0 for a file outside one."""
     spec: ModelSpec
-    """As stored in the file."""
+    """As stored in the file, with the reliability from beside it."""
     camera: CanonicalCamera
     """The canonical camera, of which its input is an image."""
     slots: Sequence[Slot]
@@ -136,7 +138,23 @@ def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAUL
         data = read_file(path, MAX_BYTES)
     except OSError as exc:
         raise ModelError(f"model file {path} cannot be read: {exc.strerror}; expected an .onnx file") from exc
-    return from_bytes(data, str(path), name, version, runtime)
+    model = from_bytes(data, str(path), name, version, runtime)
+    _add_reliability(model, path.with_name(RELIABILITY_FILE))
+    return model
+
+
+def _add_reliability(model: Model, path: Path) -> None:
+    """Add to a model's specification what was measured of it, if the file is there."""
+    try:
+        text = read_file(path, _MAX_RELIABILITY_BYTES)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as exc:
+        raise ModelError(
+            f"{path} cannot be read: {exc.strerror}; expected what curio-export --intervals writes"
+        ) from exc
+    objects = [kind.name for kind in model.spec.objects]
+    model.spec.reliability.CopyFrom(parse_reliability(text, objects, str(path)))
 
 
 def from_bytes(data: bytes, where: str, name: str = "", version: int = 0, runtime: Runtime = DEFAULT_RUNTIME) -> Model:

@@ -7,6 +7,7 @@ network gives those outputs on this machine.
 A version's folder is named 1 to 999999999 in ASCII digits without a leading zero; as in Triton, others are passed over.
 """
 
+import hashlib
 import re
 import stat
 from pathlib import Path
@@ -18,6 +19,7 @@ from curio_serve.errors import ModelError
 from curio_serve.files import read_file
 from curio_serve.models.golden import GOLDEN_FILE, check_golden
 from curio_serve.models.model import INPUT, Model, load
+from curio_serve.models.reliability import RELIABILITY_FILE
 from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime
 
 CONFIG_FILE = "config.pbtxt"
@@ -67,6 +69,8 @@ def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME)
     model = load(path, folder.name, version, runtime)
     try:
         _check_sum(folder, f"{version}/{MODEL_FILE}", model.sha256)
+        if model.spec.HasField("reliability"):
+            _check_file_sum(folder, f"{version}/{RELIABILITY_FILE}")
         _check_config(folder, model)
         check_golden(folder / str(version) / GOLDEN_FILE, model)
     except OSError as exc:
@@ -124,6 +128,10 @@ def _check_sum(folder: Path, file: str, sha256: str) -> None:
             f"{folder / file} has SHA-256 {sha256[:12]}…, but SHA256SUMS says {expected[file][:12]}…: "
             "the file is damaged or was replaced; copy it again"
         )
+
+
+def _check_file_sum(folder: Path, file: str) -> None:
+    _check_sum(folder, file, hashlib.sha256((folder / file).read_bytes()).hexdigest())
 
 
 def _check_config(folder: Path, model: Model) -> None:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from curio_proto.v1.detector_pb2 import REGION_STATUS_DETECTED, REGION_STATUS_NO_OBJECT
 from curio_proto.v1.model_spec_pb2 import ObjectModel
 
 from curio_serve.consensus.poses import Consensus, Predictions, consensus, position_covariance_m2
@@ -18,6 +17,7 @@ from curio_serve.errors import ArgumentError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.models.detector import Detector, transformed
+from curio_serve.models.reliability import region_status, status_of
 from curio_serve.models.symmetries import symmetry_rotations
 
 if TYPE_CHECKING:
@@ -97,7 +97,6 @@ def detect_views(
         found += _explained(own, kind)
     found = sorted((one for one in found if one[0] >= min_confidence), key=lambda one: -one[0])[:max_detections]
     result = results.add(model=model.name, model_version=model.version)
-    result.status = REGION_STATUS_DETECTED if found else REGION_STATUS_NO_OBJECT
     for confidence, pose, own in found:
         rows, position = pose.rotation.ravel().tolist(), pose.translation_m.tolist()
         in_first = views[0].cam_from_rig @ _matrix(pose.rotation, pose.translation_m)
@@ -112,7 +111,9 @@ def detect_views(
             quaternion_xyzw=quaternion_xyzw(rows),
             box_px=views[0].camera.pixels(corners),
             views=sorted({own[row].view for row in pose.members}),
+            status=status_of(model.spec.reliability, own[0].object, confidence),
         )
+    result.status = region_status(result.detections)
 
 
 def _whole(

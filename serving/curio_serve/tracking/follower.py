@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from curio_proto.v1.detector_pb2 import REGION_STATUS_DETECTED, REGION_STATUS_NO_OBJECT, RegionResult
+from curio_proto.v1.detector_pb2 import RegionResult
 
 from curio_serve.errors import ArgumentError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
+from curio_serve.models.reliability import region_status
 from curio_serve.tracking.frame import StreamFrame
 from curio_serve.tracking.tracks import Measurement, Track, assign, without_doubles
 
@@ -192,13 +193,12 @@ class Follower:
         results: "Results",
     ) -> RegionResult:
         model = frame.detector.model
-        result = results.add(model=model.name, model_version=model.version, status=REGION_STATUS_NO_OBJECT)
+        result = results.add(model=model.name, model_version=model.version)
         result.light.extend(light)
         for track in sorted(self._tracks, key=lambda t: (-t.measured.confidence, t.number)):
             unseen_s = frame.time_s - track.seen_s
             if track.is_seen and track.measured.confidence < min_confidence:
                 continue
-            result.status = REGION_STATUS_DETECTED
             pose = track.filter
             raw = track.measured if track.is_seen else None
             fading = 1.0 if raw is not None else max(0.0, 1 - unseen_s / max(following.keep_s, 1e-9))
@@ -210,4 +210,5 @@ class Follower:
                 track.measured.confidence * fading,
             )
             frame.describe(detection.track, track)
+        result.status = region_status(result.detections)
         return result

@@ -12,6 +12,7 @@ from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.models.detector import Detector, transformed
 from curio_serve.models.instances import cover, enlarged
+from curio_serve.models.reliability import status_of
 from curio_serve.tracking.tracks import Measurement, Track
 
 Array = np.ndarray
@@ -90,6 +91,7 @@ class StreamFrame:
             quaternion_xyzw=quaternion_xyzw(rows),
             box_px=[] if self.known_camera is None else self.known_camera.pixels(corners),
             outside_trained_range=not nearest <= position[2] <= farthest,
+            status=status_of(self.detector.model.spec.reliability, object_, confidence),
         )
 
     def describe(self, message: TrackMessage, track: Track) -> None:

@@ -20,7 +20,7 @@ class ExportCommand:
     """Write a run's network as the next version of a model that any ONNX runtime can serve."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The run folder; its training images are not needed. With --push also a model's folder, such as models/ape."""
+    """The run folder; its training images are not needed. With --push or --intervals also a model's folder."""
     out: Path = Path("models")
     """Folder of models; the model goes to OUT/NAME/VERSION/model.onnx."""
     name: str | None = None
@@ -30,7 +30,11 @@ class ExportCommand:
     int8: FlagCreatePairsOff[bool] = False
     """Convolutions in int8: a third of the size, and faster. Draws renderings; refused if accuracy falls by a point."""
     cache: Path = CACHE
-    """Where image sets that a world draws once are kept, for --int8."""
+    """Where image sets that a world draws once are kept, for --int8 and --intervals."""
+    intervals: FlagCreatePairsOff[bool] = False
+    """Measure on renderings when answers are sure and how far off they are: 90 % intervals. Minutes."""
+    data: Path | None = None
+    """Data set of a LineMOD model's folder, for --intervals."""
     push: Annotated[str | None, arg(metavar="ORG/NAME")] = None
     """Put the model on a Hugging Face hub, where hf://ORG/NAME names it. A new repository is private."""
     license: str | None = None
@@ -46,28 +50,61 @@ def export(arguments: Sequence[str] | None = None) -> None:
 def _export(command: ExportCommand) -> int:
     if command.half and command.int8:
         raise UsageError("--half and --int8 are two ways to store the same weights; give one of them")
-    if command.push is None:
-        if command.license is not None:
-            raise UsageError("--license is for the hub's card: give it together with --push")
+    if command.push is None and command.license is not None:
+        raise UsageError("--license is for the hub's card: give it together with --push")
+    if command.push is None and not command.intervals:
         _write(command)
         return 0
     from curio_train.export.folder import ModelFolder
-    from curio_train.export.hub import check_repository, push
 
-    check_repository(command.push)
+    if command.push is not None:
+        from curio_train.export.hub import check_repository
+
+        check_repository(command.push)
     is_written = bool(ModelFolder(command.run).versions())
     if is_written and (command.half or command.int8 or command.name is not None):
-        raise UsageError(f"{command.run} is a model and pushed as it is; --half, --int8 and --name are for run folders")
+        raise UsageError(f"{command.run} is a model and used as it is; --half, --int8 and --name are for run folders")
     folder = command.run if is_written else _write(command).parent
     try:
-        with Console(stderr=True).status(f"pushing {folder}"):
-            print(push(folder, command.push, command.license))
+        if command.intervals:
+            _measure(command, folder)
+        if command.push is not None:
+            _push(folder, command.push, command.license)
     except CurioError as exc:
         if is_written:
             raise
-        again = shlex.join(["curio-export", str(folder), "--push", command.push])
-        raise type(exc)(f"{exc}\n{folder} was written; to push it again: {again}") from exc
+        asked = [*(["--intervals"] if command.intervals else []), *(["--push", command.push] if command.push else [])]
+        again = shlex.join(["curio-export", str(folder), *asked])
+        raise type(exc)(f"{exc}\n{folder} was written; to go on from it: {again}") from exc
     return 0
+
+
+def _push(folder: Path, repository: str, licence: str | None) -> None:
+    from curio_train.export.hub import push
+
+    with Console(stderr=True).status(f"pushing {folder}"):
+        print(push(folder, repository, licence))
+
+
+def _measure(command: ExportCommand, folder: Path) -> None:
+    """Measure the latest version of a model on renderings, and write what was found beside it."""
+    from curio_train.evaluation.reliability import NUM_IMAGES, fit_reliability, held_out_answers
+    from curio_train.evaluation.subject import load_subject, model_reader
+    from curio_train.export.folder import ModelFolder
+    from curio_train.exported_model import ExportedModel, find_model
+
+    world = load_subject(command.run, command.data).world
+    predict = model_reader(ExportedModel.open(find_model(folder)), world)
+    with Console(stderr=True).status("") as status:
+        cache = command.cache.expanduser()
+        answers = held_out_answers(world, predict, "validation", NUM_IMAGES, cache, status.update)
+    found, target = fit_reliability(answers), ModelFolder(folder)
+    path = target.put_reliability(target.versions()[-1], found)
+    for one, of in zip(found.objects, answers, strict=True):
+        print(
+            f"{path}: {one.object} is sure from a confidence of {one.min_confidence:.2g}, as in "
+            f"{(of.confidences >= one.min_confidence).mean():.0%} of {len(of.confidences)} renderings that show it"
+        )
 
 
 def _write(command: ExportCommand) -> Path:

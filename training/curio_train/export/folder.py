@@ -4,11 +4,12 @@
 
     OUT/NAME/config.pbtxt        the tensors, the same for all versions
              CARD.md             where each version comes from, newest first
-             SHA256SUMS          of every model.onnx, golden.npz and weights.safetensors
+             SHA256SUMS          of every file of the versions
              1/  2/  …           versions; none is ever overwritten
                  model.onnx           what is served
                  golden.npz           an image and its outputs, which a server asks again before it serves the version
                  weights.safetensors  the network as it was trained, to train it further; no server reads it
+                 reliability.json     when its answers are sure, and how far off they are, where that was measured
 """
 
 import hashlib
@@ -19,14 +20,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from curio_proto.v1.model_spec_pb2 import Reliability
 from curio_serve.models.golden import GOLDEN_FILE
 from curio_serve.models.model_folder import CONFIG_FILE, MODEL_FILE, SUMS_FILE, is_model_name, versions
+from curio_serve.models.reliability import RELIABILITY_FILE
+from google.protobuf import json_format
 
 from curio_train.errors import ExportError, UsageError
 from curio_train.exported_model import WEIGHTS_FILE
 
 _CARD = "CARD.md"
-_LISTED = (MODEL_FILE, GOLDEN_FILE, WEIGHTS_FILE)
+_LISTED = (MODEL_FILE, GOLDEN_FILE, WEIGHTS_FILE, RELIABILITY_FILE)
 _MAX_BATCH_SIZE = 64
 
 
@@ -120,6 +124,26 @@ class ModelFolder:
         except OSError as exc:
             raise ExportError(f"cannot write {target}: {exc.strerror}; name another folder: --out") from exc
         return target
+
+    def put_reliability(self, version: int, found: Reliability) -> Path:
+        """Write what was measured of a version beside its model, in place of an earlier measurement.
+
+        Returns:
+            The file.
+
+        Raises:
+            ExportError: It could not be written.
+        """
+        path, listed = self.path / str(version) / RELIABILITY_FILE, f"{version}/{RELIABILITY_FILE}"
+        text = json_format.MessageToJson(found, preserving_proto_field_name=True) + "\n"
+        lines = [line for line in _text(self.path / SUMS_FILE).splitlines() if not line.endswith(f"  {listed}")]
+        lines.append(f"{hashlib.sha256(text.encode()).hexdigest()}  {listed}")
+        try:
+            _replace(path, text)
+            _replace(self.path / SUMS_FILE, "".join(f"{line}\n" for line in lines))
+        except OSError as exc:
+            raise ExportError(f"cannot write {path}: {exc.strerror}") from exc
+        return path
 
     def _add_version(self, draft: Path, target: Path, files: Mapping[str, bytes], card: str) -> None:
         """Beside earlier versions: first what speaks of it, at last the version itself, by one rename."""

@@ -1,0 +1,103 @@
+"""How far a model's answers may be trusted, as measured on renderings and stored beside the model.
+
+``reliability.json`` holds a ``Reliability`` message: for each object the confidence from which an answer counts as
+sure, and bounds of the pose error by confidence (split conformal prediction). Models without the file answer as they
+did, with neither a status nor intervals.
+"""
+
+import math
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
+
+from curio_proto.v1.detector_pb2 import (
+    DETECTION_STATUS_SURE,
+    DETECTION_STATUS_UNSPECIFIED,
+    DETECTION_STATUS_UNSURE,
+    REGION_STATUS_DETECTED,
+    REGION_STATUS_NO_OBJECT,
+    REGION_STATUS_UNSURE,
+    Detection,
+    DetectionStatus,
+    RegionStatus,
+)
+from curio_proto.v1.model_spec_pb2 import ObjectReliability, PoseBounds, Reliability
+from google.protobuf import json_format
+
+from curio_serve.errors import ModelError
+
+RELIABILITY_FILE = "reliability.json"
+
+
+def parse_reliability(text: bytes, objects: Sequence[str], where: str) -> Reliability:
+    """What was measured of a model.
+
+    Args:
+        text: Content of the file.
+        objects: Names of the model's objects.
+        where: The file, for messages.
+
+    Raises:
+        ModelError: It is no Reliability, has impossible values, or is about other objects.
+    """
+    try:
+        found = json_format.Parse(text, Reliability(), ignore_unknown_fields=True, max_recursion_depth=20)
+    except (json_format.ParseError, UnicodeDecodeError) as exc:
+        raise ModelError(f"{where} is not what curio-export --intervals writes: {exc}") from exc
+    if sorted(one.object for one in found.objects) != sorted(objects):
+        raise ModelError(
+            f"{where} is about {sorted(one.object for one in found.objects)}, the model finds {sorted(objects)}; "
+            "write it again with curio-export --intervals"
+        )
+    if not 0 < found.level < 1 or not all(map(_is_possible, found.objects)):
+        raise ModelError(f"{where} has impossible values; write it again with curio-export --intervals")
+    return found
+
+
+def _is_possible(one: ObjectReliability) -> bool:
+    starts = [bounds.min_confidence for bounds in one.bounds]
+    errors = [value for b in one.bounds for value in (b.lateral_m, b.depth_fraction, b.rotation_deg)]
+    return (
+        math.isfinite(one.min_confidence)
+        and one.min_confidence >= 0
+        and all(map(math.isfinite, (*starts, *errors)))
+        and all(value > 0 for value in errors)
+        and starts == sorted(starts)
+        and (not starts or starts[0] <= one.min_confidence)
+    )
+
+
+def bounds_of(one: ObjectReliability, confidence: float) -> PoseBounds | None:
+    """The bounds for an answer of that confidence; None: it is unsure, or there are none."""
+    row = bisect_right([bounds.min_confidence for bounds in one.bounds], confidence) - 1
+    return one.bounds[row] if row >= 0 and confidence >= one.min_confidence else None
+
+
+def status_of(reliability: Reliability, object_: str, confidence: float) -> DetectionStatus:
+    """Whether an answer is sure; unspecified for a model that was not measured."""
+    one = _of(reliability, object_)
+    if one is None:
+        return DETECTION_STATUS_UNSPECIFIED
+    return DETECTION_STATUS_SURE if confidence >= one.min_confidence else DETECTION_STATUS_UNSURE
+
+
+def add_interval(detection: Detection, reliability: Reliability) -> None:
+    """Write the interval of a pose of one whole frame into its detection, if the model has one for it."""
+    one = _of(reliability, detection.object)
+    bounds = None if one is None else bounds_of(one, detection.confidence)
+    if bounds is not None:
+        interval = detection.interval
+        interval.level, interval.lateral_m = reliability.level, bounds.lateral_m
+        interval.depth_m = bounds.depth_fraction * math.hypot(*detection.translation_m)
+        interval.rotation_deg = bounds.rotation_deg
+
+
+def region_status(detections: Iterable[Detection]) -> RegionStatus:
+    """What the detections of a region come to."""
+    found = [detection.status for detection in detections]
+    if not found:
+        return REGION_STATUS_NO_OBJECT
+    return REGION_STATUS_UNSURE if set(found) == {DETECTION_STATUS_UNSURE} else REGION_STATUS_DETECTED
+
+
+def _of(reliability: Reliability, object_: str) -> ObjectReliability | None:
+    return next((one for one in reliability.objects if one.object == object_), None)
