@@ -9,12 +9,14 @@ swaps                sequences in which two equal objects that do not touch chan
 one_object_ms        CPU a frame of one followed object, beyond decoding, looks at whole frames included
 eight_objects_ms     the same for each of eight objects, one of each model
 full_look_ms         CPU of one look at a whole frame
+one_camera_depth_mm, two_cameras_depth_mm
+                     median error along the first camera's axis, of it alone and with another 60 degrees apart
 """
 
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,8 +27,10 @@ from curio_proto.v1.detector_pb2 import Detection, DetectResponse, Tracking
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
+from curio_serve.rigs.detect_views import RigView, detect_views
 from curio_serve.tracking.stream import FollowingStream
 from curio_train.data.bop import BopDataset
+from scipy.spatial.transform import Rotation
 from synthetic_video import motions
 from synthetic_video.sequences import MATRIX, Sequence6, Studio
 
@@ -36,6 +40,7 @@ _SETTLING = 15  # frames that do not count
 _OCCLUSION = slice(20, 50)
 _REFOUND_FRAMES, _REFOUND_DIAMETERS = 5, 0.5
 _WARM, _TIMED = 10, 90
+_APART_DEG, _LOOKED_AT_M = 60, np.array([0, 0, 0.8])  # angle between two cameras, and where their axes meet
 _EIGHT = ("ape", "can", "cat", "driller", "duck", "eggbox", "glue", "holepuncher")
 
 
@@ -48,7 +53,7 @@ class Arguments:
     data: Path = Path(os.environ.get("CURIO_DATA", "data")) / "lmo"
     """LineMOD's data, for the mesh."""
     sequences: int = 100
-    """Of occlusion, and of two equal objects; a fifth of that of the others."""
+    """Of occlusion, of two equal objects, and scenes of two cameras; a fifth of that of the others."""
     model: Path = ROOT / "models" / "ape"
     """Model of the object."""
     seed: int = 0
@@ -74,6 +79,8 @@ def main() -> None:
     found = [value for value in refound if value is not None]
     followed = [value for value in swapped if value is not None]
     jitter = np.nanmedian(rest, axis=0)
+    depths = each(arguments.sequences, 4, lambda random: depth_errors_m(detector, studio, random))
+    one_m, two_m = np.median(np.array(depths, float), axis=0)
     figures = {
         "jitter_ratio": round(float(jitter[1] / jitter[0]), 3),
         "jitter_raw_mm": round(1e3 * float(jitter[0]), 3),
@@ -87,6 +94,8 @@ def main() -> None:
         "one_object_ms": round(one_object_ms(detector, studio), 2),
         "eight_objects_ms": round(eight_objects_ms(BopDataset(arguments.data)), 2),
         "full_look_ms": round(full_look_ms(detector), 1),
+        "one_camera_depth_mm": round(1e3 * float(one_m), 2),
+        "two_cameras_depth_mm": round(1e3 * float(two_m), 2),
     }
     print(json.dumps(figures) if arguments.json else "\n".join(f"{k:20} {v}" for k, v in figures.items()))
 
@@ -163,6 +172,25 @@ def is_swapped(detector: Detector, studio: Studio, random: np.random.Generator) 
                 owner = int(np.argmin(gaps))
                 swapped |= owners.setdefault(one.track.track_id, owner) != owner
     return swapped if len(set(owners.values())) == 2 else None
+
+
+def depth_errors_m(detector: Detector, studio: Studio, random: np.random.Generator) -> tuple[float, float]:
+    """Error along the first camera's axis, of it alone and of both; infinite where nothing is found."""
+    path = motions.at_rest(1, random)
+    turn = Rotation.from_euler("y", _APART_DEG, degrees=True).as_matrix()
+    cam_from_rig = np.eye(4)
+    cam_from_rig[:3, :3], cam_from_rig[:3, 3] = turn, _LOOKED_AT_M - turn @ _LOOKED_AT_M
+    first, second = (studio.film([pose @ path], random) for pose in (np.eye(4), cam_from_rig))
+    camera, answer = PinholeCamera(first.matrix), DetectResponse()
+    alone = detector.detect(first.frames[0], camera)[0].detections
+    views = [RigView(first.frames[0], camera, np.eye(4)), RigView(second.frames[0], camera, cam_from_rig)]
+    detect_views(detector, views, results=answer.results)
+    truth = path[0, 2, 3]
+    return _depth_error_m(alone, truth), _depth_error_m(answer.results[0].detections, truth)
+
+
+def _depth_error_m(found: Sequence[Detection], truth_m: float) -> float:
+    return abs(found[0].translation_m[2] - truth_m) if found else float("inf")
 
 
 def one_object_ms(detector: Detector, studio: Studio) -> float:
