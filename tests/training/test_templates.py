@@ -9,12 +9,14 @@ import pytest
 import torch
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.export.onnx import to_onnx
-from curio_train.networks.templates.alignment import Aligned, align, with_gradient
+from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
+from curio_train.networks.templates.bank import COARSE_SIZE, NUM_POINTS, Bank
+from curio_train.networks.templates.bank import RANK as BANK_RANK
 from curio_train.networks.templates.descriptors import Descriptors
-from curio_train.networks.templates.geometry import Geometry, viewpoints
+from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, NUM_VIEWS, Geometry, viewpoints
 from curio_train.networks.templates.localiser import RANK, Localiser
 from curio_train.networks.templates.network import STEPS, TemplateNetwork
-from curio_train.networks.templates.trunk import FINE_WIDTH, Trunk
+from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
 from curio_train.templates.build import template_network
 from curio_train.worlds import build
 from curio_train.worlds.options import CirclesOptions
@@ -78,13 +80,13 @@ def test_a_pose_is_aligned_with_the_crop_that_it_belongs_to() -> None:
         values = torch.sin(cells @ waves.T + phases)
         return values / values.norm(dim=-1, keepdim=True)
 
-    maps = with_gradient(seen(torch.stack([u, v], dim=-1)).permute(2, 0, 1)[None])
+    maps = FeatureMaps.of(seen(torch.stack([u, v], dim=-1)).permute(2, 0, 1)[None])
     points = torch.from_numpy(random.uniform(-0.4, 0.4, (1, 200, 3))).float()
     focal, true = torch.tensor([400.0]), torch.tensor([[0.02, -0.01, 4.4]])
     at = points + true[:, None]
     wanted = seen((focal * at[..., :2] / at[..., 2:] + 63.5) / 4)
     start = Aligned(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 4.2]]), torch.zeros(1))
-    found = align(maps, points, wanted, start, focal, 12)
+    found = align(maps, torch.tensor([0]), points, wanted, start, focal, 12)
     torch.testing.assert_close(found.position, true, atol=0.02, rtol=0)
     torch.testing.assert_close(found.rotation, torch.eye(3)[None], atol=0.02, rtol=0)
     assert float(found.score) > 0.98
@@ -111,11 +113,22 @@ def _random_network(steps: tuple[int, int] = STEPS) -> TemplateNetwork:
     network, random = TemplateNetwork(GEOMETRY, steps), torch.Generator().manual_seed(0)
     network.trunk.load_state_dict(Trunk.pretrained().state_dict())
     for name, buffer in (*network.localiser.named_buffers(), *network.reader.banks.named_buffers()):
-        if name.startswith(("filters", "weights", "points")):
-            buffer.copy_(torch.randn(buffer.shape, generator=random) * (0.2 if name == "points" else 0.05))
-        if name == "described":
-            buffer.copy_(torch.randint(-40, 40, buffer.shape, generator=random))
+        if buffer.is_floating_point() and name.startswith(("filters", "weights")):
+            buffer.copy_(torch.randn(buffer.shape, generator=random) * 0.05)
+    network.reader.banks.put(0, _random_bank(random))
     return network
+
+
+def _random_bank(random: torch.Generator) -> Bank:
+    coarse, num, cells = Descriptors(COARSE_WIDTH, COARSE_SIZE), NUM_VIEWS * NUM_ROLLS, CROP_PX // COARSE_STRIDE
+    return Bank(
+        coarse,
+        Descriptors(FINE_WIDTH, FINE_WIDTH),
+        torch.randn(BANK_RANK, COARSE_SIZE, cells, cells, generator=random) * 0.05,
+        torch.randn(num, BANK_RANK, generator=random) * 0.05,
+        torch.randn(num, NUM_POINTS, 3, generator=random) * 0.2,
+        torch.randn(num, NUM_POINTS, FINE_WIDTH, generator=random) * 0.2,
+    )
 
 
 def test_a_frame_is_read_the_same_alone_and_among_others() -> None:

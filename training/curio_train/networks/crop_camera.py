@@ -13,8 +13,6 @@ from torch import Tensor
 
 from curio_train.geometry import rotation_between
 
-_OVERSAMPLING = 2  # samples a pixel of a crop, across and down: near objects do not alias
-
 
 def project(points: Float[Tensor, "*#batch n 3"], matrix: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "... n 2"]:
     """Pixels of points in the camera frame (metres). Points must lie in front: z > 0."""
@@ -103,8 +101,9 @@ def cut_crops(
     position_m: Float[Tensor, "images num 3"],
     focal_px: Float[Tensor, "images*num"],
     side: int,
+    oversampling: int = 2,
 ) -> tuple[Float[Tensor, "images*num 3 {side} {side}"], Float[Tensor, "images*num 3 3"]]:
-    """Crops by virtual cameras that look at positions, each pixel the mean of four samples.
+    """Crops by virtual cameras that look at positions.
 
     Args:
         images: Of one camera.
@@ -112,16 +111,17 @@ def cut_crops(
         position_m: Of the crops' middles, camera frame.
         focal_px: Of the crops, pixels; those of one image after the other.
         side: Of the crops, pixels.
+        oversampling: Samples a pixel, across and down; with two, near objects do not alias.
 
     Returns:
         The crops, and crop_from_cam.
     """
-    num, fine_side = position_m.shape[1], _OVERSAMPLING * side
+    num, fine_side = position_m.shape[1], oversampling * side
     matrices = matrix.expand(focal_px.shape[0], 3, 3)
-    camera = crop_camera_at(position_m.flatten(0, 1), _OVERSAMPLING * focal_px, fine_side, matrices)
+    camera = crop_camera_at(position_m.flatten(0, 1), oversampling * focal_px, fine_side, matrices)
     grid = sampling_grid(camera, matrices, fine_side, images.shape[3], images.shape[2])
     # The crops of an image in one tall grid: no image is copied.
     tall = grid.view(-1, num * fine_side, fine_side, 2)
     fine = F.grid_sample(images, tall, padding_mode="border", align_corners=False)
     crops = fine.unflatten(2, (num, fine_side)).transpose(1, 2).flatten(0, 1)
-    return F.avg_pool2d(crops, _OVERSAMPLING), camera.rotation
+    return (F.avg_pool2d(crops, oversampling) if oversampling > 1 else crops), camera.rotation

@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from curio_train.meshes.meshes import Mesh
-from curio_train.networks.templates.bank import NUM_POINTS, RANK, Bank
-from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
-from curio_train.networks.templates.trunk import COARSE_STRIDE, FINE_STRIDE, Trunk
+from curio_train.networks.templates.bank import COARSE_SIZE, NUM_POINTS, RANK, Bank
+from curio_train.networks.templates.descriptors import Descriptors
+from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS, NUM_VIEWS, Geometry, viewpoints
+from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_STRIDE, FINE_WIDTH, Trunk
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.templates.describe import features, low_rank, mean_cosine
 from curio_train.templates.drawing import APPEARANCES, CropTemplateRenderer
@@ -33,12 +34,13 @@ def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> 
     Raises:
         RendererError: The mesh cannot be rendered.
     """
-    bank = Bank()
+    of_crop, of_surface = Descriptors(COARSE_WIDTH, COARSE_SIZE), Descriptors(FINE_WIDTH, FINE_WIDTH)
+    views = viewpoints(NUM_VIEWS, NUM_ROLLS)
     depth, random = geometry.typical_m, np.random.default_rng(_SEED)
     focal_px = FILL * CROP_PX * depth / geometry.diameter_m
     renderer = CropTemplateRenderer(mesh, depth, geometry.focal_px, focal_px, CROP_PX)
     fine, coarse, alphas = [], [], []  # features of every look, batch after batch
-    for rotations in bank.rotations.split(_BATCH):
+    for rotations in views.split(_BATCH):
         drawn = renderer.draw(rotations)
         behind = [crops[torch.from_numpy(random.integers(0, len(crops), len(rotations)))] for _ in APPEARANCES]
         seen = [features(trunk, drawn.over(n, behind[n], exposure)) for n, (_, exposure) in enumerate(APPEARANCES)]
@@ -48,17 +50,15 @@ def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> 
     fine_background, coarse_background = features(trunk, crops)
     alpha, of_coarse = torch.cat(alphas), torch.cat(coarse, dim=1)
     covered = alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE]
-    bank.coarse.compress(bank.coarse.whiten(coarse_background), of_coarse[0], covered)
-    filters, weights = low_rank(mean_cosine(_sum(bank.coarse(seen) for seen in of_coarse), covered), RANK)
-    bank.filters.copy_(filters)
-    bank.weights.copy_(weights)
+    of_crop.compress(of_crop.whiten(coarse_background), of_coarse[0], covered)
+    filters, weights = low_rank(mean_cosine(_sum(of_crop(seen) for seen in of_coarse), covered), RANK)
     inside = _inside(alpha)
     of_object = torch.cat([some[0] for some in fine]).movedim(1, 0)[:, inside].mean(dim=1)
-    bank.fine.mean.copy_((fine_background.mean(dim=(0, 2, 3)) + of_object) / 2)
-    described = torch.cat([F.normalize(_sum(bank.fine(seen) for seen in some), dim=1) for some in fine])
-    points = _surface_points(mesh, bank.rotations, depth, focal_px)
-    _store_points(bank, inside, described, points / geometry.diameter_m)
-    return bank
+    of_surface.mean.copy_((fine_background.mean(dim=(0, 2, 3)) + of_object) / 2)
+    described = torch.cat([F.normalize(_sum(of_surface(seen) for seen in some), dim=1) for some in fine])
+    points = _surface_points(mesh, views, depth, focal_px)
+    on_surface = _chosen(inside, points / geometry.diameter_m, described)
+    return Bank(of_crop, of_surface, filters, weights, *on_surface)
 
 
 def _sum(of_appearances: Iterable[Tensor]) -> Tensor:
@@ -88,15 +88,13 @@ def _surface_points(
     return torch.cat(found) * surface.half_extent_m + torch.from_numpy(surface.center_m).float()[:, None, None]
 
 
-def _store_points(bank: Bank, inside: Tensor, described: Tensor, points: Tensor) -> None:
-    """A random choice of each template's cells, all of them and some twice where they are few."""
+def _chosen(
+    inside: Bool[Tensor, "templates cells cells"], *of_cells: Float[Tensor, "templates size cells cells"]
+) -> list[Float[Tensor, "templates points size"]]:
+    """Values at a random choice of each template's cells, all of them and some twice where they are few."""
     random, chosen = np.random.default_rng(_SEED), []
     for mask in inside.flatten(1).numpy():
         cells = random.permutation(np.flatnonzero(mask))
         chosen.append(np.resize(cells, NUM_POINTS))
     index = torch.from_numpy(np.stack(chosen))[:, None]
-    of_cells = (
-        values.flatten(2).gather(2, index.expand(-1, values.shape[1], -1)).transpose(1, 2)
-        for values in (points, described)
-    )
-    bank.store(*of_cells)
+    return [values.flatten(2).gather(2, index.expand(-1, values.shape[1], -1)).transpose(1, 2) for values in of_cells]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from curio_train.networks.templates.trunk import FINE_STRIDE, FINE_WIDTH
@@ -20,6 +20,36 @@ _LARGEST_STEP = 0.2  # radians and diameters together
 _OUTLIER = 0.5  # squared distance of descriptors at which a point counts a quarter (Geman and McClure 1985)
 _CROSS = [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]]
 """A vector times this is its cross-product matrix, row by row."""
+
+
+class FeatureMaps(NamedTuple):
+    """Descriptors of crops, and their derivatives across and down a cell; cell (i, j) lies at crop pixel (4 i, 4 j)."""
+
+    values: Float[Tensor, "crops*side*side 3*size"]
+    """Cell after cell, row after row, crop after crop."""
+    side: int
+    """Cells."""
+
+    @classmethod
+    def of(cls, descriptors: Float[Tensor, "crops size side side"]) -> "FeatureMaps":
+        """The maps of descriptors."""
+        padded = F.pad(descriptors, (1, 1, 1, 1), mode="replicate")
+        across = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
+        down = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
+        together = torch.cat([descriptors, across, down], dim=1)
+        return cls(together.permute(0, 2, 3, 1).flatten(0, 2), descriptors.shape[-1])
+
+    def at(
+        self, crop: Int[Tensor, " batch"], column: Float[Tensor, "batch points"], row: Float[Tensor, "batch points"]
+    ) -> Float[Tensor, "batch points 3*size"]:
+        """Bilinear values; those of the border where a point lies outside."""
+        column, row = column.clamp(0, self.side - 1), row.clamp(0, self.side - 1)
+        left, top = column.floor().clamp(max=self.side - 2), row.floor().clamp(max=self.side - 2)
+        right, below = (column - left)[..., None], (row - top)[..., None]
+        first = (crop[:, None] * self.side + top.long()) * self.side + left.long()
+        upper = torch.lerp(self.values[first], self.values[first + 1], right)
+        lower = torch.lerp(self.values[first + self.side], self.values[first + self.side + 1], right)
+        return torch.lerp(upper, lower, below)
 
 
 class Aligned(NamedTuple):
@@ -33,16 +63,9 @@ class Aligned(NamedTuple):
     """Mean cosine of template and crop over the points."""
 
 
-def with_gradient(descriptors: Float[Tensor, "batch size side side"]) -> Float[Tensor, "batch 3*size side side"]:
-    """Descriptors, then their derivatives across and down, a cell."""
-    padded = F.pad(descriptors, (1, 1, 1, 1), mode="replicate")
-    across = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
-    down = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
-    return torch.cat([descriptors, across, down], dim=1)
-
-
 def align(
-    maps: Float[Tensor, "batch 3*size side side"],
+    maps: FeatureMaps,
+    crop: Int[Tensor, " batch"],
     points: Float[Tensor, "batch points 3"],
     wanted: Float[Tensor, "batch points size"],
     start: Aligned,
@@ -52,41 +75,46 @@ def align(
     """Move poses to where the crops look most like the templates.
 
     Args:
-        maps: Of :func:`with_gradient`; cell (i, j) lies at crop pixel (4 i, 4 j).
+        maps: Of all crops.
+        crop: In which of them each pose is looked at.
         points: Object frame, diameters.
         wanted: Descriptors of the points.
         start: Poses to begin with.
-        focal_px: Of the crops, whose principal point is their middle.
+        focal_px: Of each pose's crop, whose principal point is their middle.
         num_steps: How many steps to take.
     """
     rotation, position = start.rotation, start.position
     for _ in range(num_steps):
-        step = _step(maps, points, wanted, rotation, position, focal_px)
+        step = _step(maps, crop, points, wanted, rotation, position, focal_px)
         rotation, position = _turn(step[:, :3]) @ rotation, position + step[:, 3:]
-    _, seen = _sample(maps, points, rotation, position, focal_px)
+    _, seen = _sample(maps, crop, points, rotation, position, focal_px)
     here = seen[..., :FINE_WIDTH]
     cosine = (here * wanted).sum(dim=-1) / here.square().sum(dim=-1).clamp(min=1e-12).sqrt()
     return Aligned(rotation, position, cosine.mean(dim=1))
 
 
 def _sample(
-    maps: Tensor, points: Tensor, rotation: Tensor, position: Tensor, focal_px: Tensor
+    maps: FeatureMaps, crop: Tensor, points: Tensor, rotation: Tensor, position: Tensor, focal_px: Tensor
 ) -> tuple[Float[Tensor, "batch points 3"], Float[Tensor, "batch points 3*size"]]:
     """Points in the crop's camera, and the maps where it sees them."""
     seen = points @ rotation.transpose(1, 2) + position[:, None]
-    side = maps.shape[-1]
-    middle = (side * FINE_STRIDE - 1) / 2
-    cells = (focal_px[:, None, None] * seen[..., :2] / seen[..., 2:].clamp(min=1e-3) + middle) / FINE_STRIDE
-    grid = ((2 * cells + 1) / side - 1)[:, :, None]
-    found = F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
-    return seen, found[..., 0].transpose(1, 2)
+    middle = (maps.side * FINE_STRIDE - 1) / 2
+    x, y, z = seen.unbind(-1)
+    scale = focal_px[:, None] / z.clamp(min=1e-3)
+    return seen, maps.at(crop, (scale * x + middle) / FINE_STRIDE, (scale * y + middle) / FINE_STRIDE)
 
 
 def _step(
-    maps: Tensor, points: Tensor, wanted: Tensor, rotation: Tensor, position: Tensor, focal_px: Tensor
+    maps: FeatureMaps,
+    crop: Tensor,
+    points: Tensor,
+    wanted: Tensor,
+    rotation: Tensor,
+    position: Tensor,
+    focal_px: Tensor,
 ) -> Float[Tensor, "batch 6"]:
     """A rotation vector about the object's centre, then a shift in diameters."""
-    seen, found = _sample(maps, points, rotation, position, focal_px)
+    seen, found = _sample(maps, crop, points, rotation, position, focal_px)
     here, across, down = found.split(FINE_WIDTH, dim=-1)
     residual = here - wanted
     weight = 1 / (1 + residual.square().sum(dim=-1) / _OUTLIER).square()

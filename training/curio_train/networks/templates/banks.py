@@ -1,18 +1,22 @@
-"""The templates of several objects side by side, so that a graph reads all objects in one batch."""
+"""The templates of several objects side by side, compressed, so that a graph reads all objects in one batch."""
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from curio_train.networks.templates.bank import COARSE_SIZE, LARGEST_BYTE, NUM_POINTS, RANK, Bank
+from curio_train.networks.templates.bank import COARSE_SIZE, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import normalised
 from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, NUM_VIEWS, viewpoints
+from curio_train.networks.templates.quantisation import CODEWORDS, to_bytes, to_codes
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH
+
+_PARTS = 4
+"""Of a fine descriptor, each stored as the number of a codeword."""
 
 
 class Banks(nn.Module):
-    """One :class:`Bank` an object; the first axis of every buffer is the object's."""
+    """One :class:`Bank` an object, in 1.3 MB; the first axis of every buffer is the object's."""
 
     coarse_mean: Tensor
     """Of the features at stride 8, [objects, COARSE_WIDTH]."""
@@ -21,15 +25,21 @@ class Banks(nn.Module):
     fine_mean: Tensor
     """Of the features at stride 4, [objects, FINE_WIDTH]."""
     filters: Tensor
-    """[objects, RANK, COARSE_SIZE, cells, cells]."""
+    """Bytes [objects, RANK, COARSE_SIZE, cells, cells]."""
     weights: Tensor
-    """[objects, templates, RANK]."""
+    """Bytes [objects, templates, RANK]."""
+    match_scale: Tensor
+    """Of filters and weights together, [objects, RANK]."""
     points: Tensor
-    """[objects, templates, points, 3], diameters."""
-    described: Tensor
-    """[objects, templates, points, FINE_WIDTH], times 127."""
+    """Bytes [objects, templates, points, 3]."""
+    points_scale: Tensor
+    """Diameters a unit, [objects]."""
+    codes: Tensor
+    """Bytes [objects, templates, points, parts]: codewords of the points' fine descriptors."""
+    codewords: Tensor
+    """[objects, parts, CODEWORDS, FINE_WIDTH / parts]."""
     rotations: Tensor
-    """[templates, 3, 3], see :class:`Bank`."""
+    """cam_from_obj of an object on the optical axis, [templates, 3, 3]; the same for every object."""
 
     def __init__(self, num_objects: int) -> None:
         super().__init__()
@@ -39,21 +49,33 @@ class Banks(nn.Module):
             ("coarse_mean", (COARSE_WIDTH,), torch.float32),
             ("coarse_projection", (COARSE_SIZE, COARSE_WIDTH), torch.float32),
             ("fine_mean", (FINE_WIDTH,), torch.float32),
-            ("filters", (RANK, COARSE_SIZE, side, side), torch.float16),
-            ("weights", (num, RANK), torch.float16),
-            ("points", (num, NUM_POINTS, 3), torch.float16),
-            ("described", (num, NUM_POINTS, FINE_WIDTH), torch.int8),
+            ("filters", (RANK, COARSE_SIZE, side, side), torch.int8),
+            ("weights", (num, RANK), torch.int8),
+            ("match_scale", (RANK,), torch.float32),
+            ("points", (num, NUM_POINTS, 3), torch.int8),
+            ("points_scale", (), torch.float32),
+            ("codes", (num, NUM_POINTS, _PARTS), torch.uint8),
+            ("codewords", (_PARTS, CODEWORDS, FINE_WIDTH // _PARTS), torch.float16),
         ):
             self.register_buffer(name, torch.zeros(num_objects, *shape, dtype=dtype))
         self.register_buffer("rotations", viewpoints(NUM_VIEWS, NUM_ROLLS), persistent=False)
 
     def put(self, number: int, bank: Bank) -> None:
-        """Copy the templates of one object."""
+        """Compress and keep the templates of one object."""
         self.coarse_mean[number] = bank.coarse.mean
         self.coarse_projection[number] = bank.coarse.projection
         self.fine_mean[number] = bank.fine.mean
-        for name in ("filters", "weights", "points", "described"):
-            getattr(self, name)[number] = getattr(bank, name)
+        filters, of_filters = to_bytes(bank.filters.flatten(1))
+        weights, of_weights = to_bytes(bank.weights.T)
+        points, of_points = to_bytes(bank.points.flatten()[None])
+        self.filters[number] = filters.view_as(self.filters[number])
+        self.weights[number] = weights.T
+        self.match_scale[number] = of_filters * of_weights
+        self.points[number] = points.view_as(self.points[number])
+        self.points_scale[number] = of_points[0]
+        codes, codewords = to_codes(bank.described.flatten(0, 1), _PARTS)
+        self.codes[number] = codes.view_as(self.codes[number])
+        self.codewords[number] = codewords
 
     def match(
         self, features: Float[Tensor, "batch objects num channels rows columns"]
@@ -67,7 +89,7 @@ class Banks(nn.Module):
         described = normalised(projected, dim=2).flatten(1, 2)
         filtered = F.conv2d(described, self.filters.float().flatten(0, 1), groups=objects)
         filtered = filtered.unflatten(1, (objects, RANK)).flatten(3)  # [batch * num, objects, RANK, shifts]
-        found = self.weights.float() @ filtered
+        found = self.weights.float() @ (filtered * self.match_scale[..., None])
         return found.unflatten(0, (batch, num)).transpose(1, 2)
 
     def fine(
@@ -81,10 +103,10 @@ class Banks(nn.Module):
         self, templates: Int[Tensor, "batch*objects num"]
     ) -> tuple[Float[Tensor, "batch*objects*num points 3"], Float[Tensor, "batch*objects*num points size"]]:
         """Points of templates, diameters, and their descriptors."""
-        count = self.points.shape[1]
-        of_objects = torch.arange(self.num_objects, device=templates.device)[:, None] * count
-        index = (templates.unflatten(0, (-1, self.num_objects)) + of_objects).flatten()
-        return (
-            self.points.flatten(0, 1)[index].float(),
-            self.described.flatten(0, 1)[index].float() / LARGEST_BYTE,
-        )
+        count, by_object = self.points.shape[1], templates.unflatten(0, (-1, self.num_objects))
+        number = torch.arange(self.num_objects, device=templates.device)[:, None].expand_as(by_object).flatten()
+        row = number * count + by_object.flatten()
+        points = self.points.flatten(0, 1)[row].float() * self.points_scale[number][:, None, None]
+        first = number[:, None, None] * _PARTS + torch.arange(_PARTS, device=templates.device)
+        codeword = first * CODEWORDS + self.codes.flatten(0, 1)[row].long()
+        return points, self.codewords.flatten(0, 2)[codeword].float().flatten(2)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_between
 from curio_train.networks.crop_camera import cut_crops
-from curio_train.networks.templates.alignment import Aligned, align, with_gradient
+from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.banks import Banks
 from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
@@ -50,30 +50,30 @@ class CalibrationFeatures(NamedTuple):
     """Ten times the final score, and the score of the place that it was found at."""
 
 
-class _Poses(NamedTuple):
-    """Hypotheses in the frame's camera, a row each: image after image, and in each image object after object."""
-
-    rotation: Float[Tensor, "rows 3 3"]
-    """cam_from_obj."""
-    position_m: Float[Tensor, "rows 3"]
-    """Of the object's centre."""
-    score: Float[Tensor, " rows"]
-    """Of the templates."""
-    place: Float[Tensor, " rows"]
-    """Score of the place that it was found at."""
-
-
 class _Crops(NamedTuple):
-    """Crops of cameras that look at positions, a row a position."""
+    """Crops of cameras that look at places: image after image, object after object, place after place."""
 
-    images: Tensor
-    """[rows, 3, side, side]."""
-    cam_from_crop: Tensor
-    """[rows, 3, 3]."""
-    distance_m: Tensor
-    """[rows]."""
-    focal_px: Tensor
-    """[rows]."""
+    fine: FeatureMaps
+    """Descriptors of the object that is looked for, at stride 4."""
+    coarse: Float[Tensor, "batch objects num channels rows columns"]
+    """Features at stride 8."""
+    cam_from_crop: Float[Tensor, "crops 3 3"]
+    """Camera frame of the image."""
+    distance_m: Float[Tensor, " crops"]
+    """Of the places."""
+    focal_px: Float[Tensor, " crops"]
+    """Of the crops' cameras."""
+
+
+class _Hypotheses(NamedTuple):
+    """Poses in the cameras of their crops, a row each."""
+
+    pose: Aligned
+    """Positions in diameters."""
+    crop: Int[Tensor, " rows"]
+    """In which the object is seen."""
+    place_score: Float[Tensor, " rows"]
+    """Of the place that the crop looks at."""
 
 
 class PoseReader(nn.Module):
@@ -120,39 +120,57 @@ class PoseReader(nn.Module):
         self, trunk: Trunk, images: Float[Tensor, "batch 3 height width"], places: Places
     ) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code without its confidence, and what that is made of."""
-        found = self._aligned(trunk, images, self._hypotheses(trunk, images, places))
-        last, spread = self._averaged(trunk, images, _best(found))
+        crops = self._crops(trunk, images, places)
+        best = _best(self._aligned(crops, self._hypotheses(crops, places)))
+        pose, spread = self._averaged(crops, best)
 
         def by_object(values: Tensor) -> Tensor:
             return values.unflatten(0, (-1, self.banks.num_objects))
 
-        score, spread, place = by_object(10 * last.score), by_object(-100 * spread), by_object(last.place)
+        turn = crops.cam_from_crop[best.crop]
+        position_m = by_object((turn @ pose.position[..., None])[..., 0]) * self._diameter_m[:, None]
+        score, spread, place = by_object(10 * pose.score), by_object(-100 * spread), by_object(best.place_score)
         return {
-            TRANSLATION: by_object(last.position_m),
-            ROTATION_6D: by_object(rotation_6d_from_matrix(last.rotation)),
+            TRANSLATION: position_m,
+            ROTATION_6D: by_object(rotation_6d_from_matrix(turn @ pose.rotation)),
             LIGHT: self._lamp.expand(images.shape[0], 3),
         }, CalibrationFeatures(torch.stack([score, spread], dim=2), torch.stack([score, place], dim=2))
 
-    def _hypotheses(self, trunk: Trunk, images: Tensor, places: Places) -> _Poses:
+    def _crops(self, trunk: Trunk, images: Tensor, places: Places) -> _Crops:
+        """Crops in which templates can be shifted."""
+        num, side = places.score.shape[2], CROP_PX + 2 * _MARGIN_PX
+        by_image = places.position_m.flatten(1, 2)
+        rows = by_image.shape[0] * by_image.shape[1]
+        nearest, diameter_m = (self._of_rows(one, rows, num) for one in (self._nearest_m, self._diameter_m))
+        distance_m = torch.maximum(by_image.flatten(0, 1).square().sum(dim=1).sqrt(), nearest)
+        focal_px = FILL * CROP_PX * distance_m / diameter_m
+        pictures, crop_from_cam = cut_crops(images, self._matrix, by_image, focal_px, side, oversampling=1)
+        fine, coarse = trunk(pictures)
+        by_object = coarse.unflatten(0, (-1, self.banks.num_objects, num))
+        maps = FeatureMaps.of(self.banks.fine(fine, num))
+        return _Crops(maps, by_object, crop_from_cam.transpose(1, 2), distance_m, focal_px)
+
+    def _hypotheses(self, crops: _Crops, places: Places) -> _Hypotheses:
         """The best match, the best of those that differ from it, and so on, of each object in each image."""
         num = places.score.shape[2]
-        crops = self._crops(images, places.position_m.flatten(0, 2), num, CROP_PX + 2 * _MARGIN_PX)
-        coarse = trunk(crops.images)[1].unflatten(0, (-1, self.banks.num_objects, num))
-        scores, shift = (found.flatten(0, 1) for found in self.banks.match(coarse).max(dim=4))
-        turn, distance_m, focal_px = (of_all.unflatten(0, (-1, num)) for of_all in crops[1:])
-        positions_m, place_scores = places.position_m.flatten(0, 1), places.score.flatten(0, 1)
-        shifts = _shifts().to(images)
-        found: list[_Poses] = []
-        row = torch.arange(scores.shape[0], device=images.device)
+        scores, shift = (found.flatten(0, 1) for found in self.banks.match(crops.coarse).max(dim=4))
+        positions_m, place_scores = places.position_m.flatten(0, 1), places.score.flatten()
+        shifts, diameter_m = _shifts().to(scores), self._of_rows(self._diameter_m, scores.shape[0], 1)
+        found: list[_Hypotheses] = []
+        row = torch.arange(scores.shape[0], device=scores.device)
         for place, template, score in self._pick(scores, positions_m):
-            slope = shifts[shift[row, place, template]] / focal_px[row, place][:, None]
+            crop = row * num + place
+            slope = shifts[shift[row, place, template]] / crops.focal_px[crop][:, None]
             ray = torch.cat([slope, torch.ones_like(slope[:, :1])], dim=1)
-            ray = ray / ray.square().sum(dim=1, keepdim=True).sqrt() * distance_m[row, place][:, None]
-            position = (turn[row, place] @ ray[..., None])[..., 0]
-            axis = position.new_tensor([0.0, 0.0, 1.0]).expand_as(position)
-            rotation = rotation_between(axis, position) @ self.banks.rotations[template]
-            found.append(_Poses(rotation, position, score, place_scores[row, place]))
-        return _Poses(*(torch.stack(values, dim=1).flatten(0, 1) for values in zip(*found, strict=True)))
+            far = crops.distance_m[crop] / diameter_m
+            position = ray / ray.square().sum(dim=1, keepdim=True).sqrt() * far[:, None]
+            rotation = _seen_along(position) @ self.banks.rotations[template]
+            found.append(_Hypotheses(Aligned(rotation, position, score), crop, place_scores[crop]))
+        pose = Aligned(
+            *(torch.stack(values, dim=1).flatten(0, 1) for values in zip(*(one.pose for one in found), strict=True))
+        )
+        of_crops = (torch.stack(values, dim=1).flatten() for values in zip(*(one[1:] for one in found), strict=True))
+        return _Hypotheses(pose, *of_crops)
 
     def _pick(
         self, scores: Float[Tensor, "rows num templates"], positions_m: Float[Tensor, "rows num 3"]
@@ -160,7 +178,7 @@ class PoseReader(nn.Module):
         """Place, template and score of each hypothesis; hypotheses at one place differ in rotation."""
         turns = self.banks.rotations.flatten(1)
         count, picked = turns.shape[0], []
-        apart_m = (_ONE_PLACE * self._diameter_m).repeat(scores.shape[0] // self.banks.num_objects)
+        apart_m = _ONE_PLACE * self._of_rows(self._diameter_m, scores.shape[0], 1)
         for _ in range(NUM_HYPOTHESES):
             score, best = scores.flatten(1).max(dim=1)
             place, template = torch.div(best, count, rounding_mode="floor"), best % count
@@ -171,25 +189,19 @@ class PoseReader(nn.Module):
             scores = torch.where(beside[:, :, None] & alike[:, None], _SUPPRESSED, scores)
         return picked
 
-    def _aligned(self, trunk: Trunk, images: Tensor, poses: _Poses) -> _Poses:
+    def _aligned(self, crops: _Crops, found: _Hypotheses) -> _Hypotheses:
         """Each hypothesis moved to where the template nearest to it fits best."""
-        crops = self._crops(images, poses.position_m, NUM_HYPOTHESES, CROP_PX)
-        maps = with_gradient(self.banks.fine(trunk(crops.images)[0], NUM_HYPOTHESES))
-        start = self._in_crop(poses.rotation, crops, NUM_HYPOTHESES)
-        nearest = (start.rotation.flatten(1) @ self.banks.rotations.flatten(1).T).argmax(dim=1)
-        surface = self.banks.surface(nearest.unflatten(0, (-1, NUM_HYPOTHESES)))
-        found = align(maps, *surface, start, crops.focal_px, self._steps[0])
-        return _Poses(*self._in_frame(found, crops, NUM_HYPOTHESES), found.score, poses.place)
+        templates = self._nearest(found.pose, 1).unflatten(0, (-1, NUM_HYPOTHESES))[..., 0]
+        surface = self.banks.surface(templates)
+        pose = align(crops.fine, found.crop, *surface, found.pose, crops.focal_px[found.crop], self._steps[0])
+        return found._replace(pose=pose)
 
-    def _averaged(self, trunk: Trunk, images: Tensor, best: _Poses) -> tuple[_Poses, Float[Tensor, " rows"]]:
+    def _averaged(self, crops: _Crops, best: _Hypotheses) -> tuple[Aligned, Float[Tensor, " rows"]]:
         """The mean of what the templates around a pose answer, and the spread of the logarithm of their distances."""
-        crops = self._crops(images, best.position_m, 1, CROP_PX)
-        maps = with_gradient(self.banks.fine(trunk(crops.images)[0], 1))
-        start = self._in_crop(best.rotation, crops, 1)
-        near = (start.rotation.flatten(1) @ self.banks.rotations.flatten(1).T).topk(NUM_NEIGHBOURS, dim=1).indices
-        start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in start))
-        maps, focal_px = (of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in (maps, crops.focal_px))
-        found = align(maps, *self.banks.surface(near), start, focal_px, self._steps[1])
+        surface = self.banks.surface(self._nearest(best.pose, NUM_NEIGHBOURS))
+        start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in best.pose))
+        crop = best.crop.repeat_interleave(NUM_NEIGHBOURS)
+        found = align(crops.fine, crop, *surface, start, crops.focal_px[crop], self._steps[1])
         rotation, position, score = (of_all.unflatten(0, (-1, NUM_NEIGHBOURS)) for of_all in found)
         weight = (_SHARPNESS * score).softmax(dim=1)
         log_depth = position[..., 2].clamp(min=1e-3).log()
@@ -199,41 +211,28 @@ class PoseReader(nn.Module):
         turn = matrix_from_rotation_6d(rotation_6d_from_matrix(turn))
         placed = torch.cat([slope * mean.exp(), mean.exp()], dim=1)
         spread = (weight * (log_depth - mean).square()).sum(dim=1).clamp(min=1e-12).sqrt()
-        total = (weight * score).sum(dim=1)
-        return _Poses(*self._in_frame(Aligned(turn, placed, total), crops, 1), total, best.place), spread
+        return Aligned(turn, placed, (weight * score).sum(dim=1)), spread
+
+    def _nearest(self, pose: Aligned, num: int) -> Int[Tensor, "rows num"]:
+        """Templates whose rotations are nearest to what poses show."""
+        turn = _seen_along(pose.position).transpose(1, 2) @ pose.rotation
+        return (turn.flatten(1) @ self.banks.rotations.flatten(1).T).topk(num, dim=1).indices
 
     def _of_rows(self, of_objects: Float[Tensor, " objects"], rows: int, num: int) -> Float[Tensor, " rows"]:
         """What belongs to the object of each row; an object has ``num`` rows in an image."""
         return of_objects.repeat_interleave(num).repeat(rows // (num * self.banks.num_objects))
 
-    def _crops(self, images: Tensor, positions_m: Float[Tensor, "rows 3"], num: int, side: int) -> _Crops:
-        """Crops of this side around positions, ``num`` an object."""
-        rows = positions_m.shape[0]
-        nearest, diameter_m = (self._of_rows(one, rows, num) for one in (self._nearest_m, self._diameter_m))
-        distance_m = torch.maximum(positions_m.square().sum(dim=1).sqrt(), nearest)
-        focal_px = FILL * CROP_PX * distance_m / diameter_m
-        by_image = positions_m.unflatten(0, (images.shape[0], -1))
-        crops, crop_from_cam = cut_crops(images, self._matrix, by_image, focal_px, side)
-        return _Crops(crops, crop_from_cam.transpose(1, 2), distance_m, focal_px)
 
-    def _in_crop(self, rotation: Tensor, crops: _Crops, num: int) -> Aligned:
-        """Poses in the cameras of crops that look at their positions."""
-        zero = torch.zeros_like(crops.distance_m)
-        diameter_m = self._of_rows(self._diameter_m, zero.shape[0], num)
-        position = torch.stack([zero, zero, crops.distance_m / diameter_m], dim=1)
-        return Aligned(crops.cam_from_crop.transpose(1, 2) @ rotation, position, zero)
-
-    def _in_frame(self, found: Aligned, crops: _Crops, num: int) -> tuple[Tensor, Tensor]:
-        position_m = found.position * self._of_rows(self._diameter_m, found.position.shape[0], num)[:, None]
-        turn = crops.cam_from_crop
-        return turn @ found.rotation, (turn @ position_m[..., None])[..., 0]
+def _seen_along(position: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3 3"]:
+    """What turns an object on the optical axis so that it shows the same side at a position beside it."""
+    return rotation_between(position.new_tensor([0.0, 0.0, 1.0]).expand_as(position), position)
 
 
-def _best(poses: _Poses) -> _Poses:
+def _best(found: _Hypotheses) -> _Hypotheses:
     """The hypothesis of each object in each image that has the highest score."""
-    by_object = poses.score.unflatten(0, (-1, NUM_HYPOTHESES))
+    by_object = found.pose.score.unflatten(0, (-1, NUM_HYPOTHESES))
     row = torch.arange(by_object.shape[0], device=by_object.device) * NUM_HYPOTHESES + by_object.argmax(dim=1)
-    return _Poses(*(of_all[row] for of_all in poses))
+    return _Hypotheses(Aligned(*(of_all[row] for of_all in found.pose)), found.crop[row], found.place_score[row])
 
 
 def _shifts() -> Float[Tensor, "shifts 2"]:
