@@ -12,7 +12,8 @@ from curio_train.data.bop import Annotation, BopDataset
 from curio_train.data.bop_split import scored_frames
 from curio_train.data.photographs import read_photograph
 from curio_train.errors import UsageError
-from curio_train.evaluation.real_frames import VISIBLE, estimate_frames
+from curio_train.evaluation.real_frames import estimate_frames
+from curio_train.evaluation.real_scores import VISIBLE
 from curio_train.evaluation.subject import Subject
 from curio_train.geometry import Pose
 

@@ -109,16 +109,6 @@ def test_scaling_keeps_the_borders() -> None:
         np.testing.assert_allclose(np.linalg.inv(small) @ [*after, 1], ray, atol=1e-12)
 
 
-def test_projection_is_the_inverse_of_rays() -> None:
-    matrix = torch.tensor(LINEMOD)
-    seen = crop_camera.rays(matrix, 5, 4)
-    assert seen.shape == (4, 5, 3)
-    pixels = crop_camera.project(seen.flatten(0, 1) * 3.7, matrix).view(4, 5, 2)
-    for row in range(4):
-        for column in range(5):
-            assert pixels[row, column].tolist() == pytest.approx([column, row], abs=1e-9)
-
-
 def test_gaze_puts_the_direction_in_the_centre() -> None:
     matrix = torch.tensor(LINEMOD)[None]
     point = torch.tensor([[0.2, -0.15, 1.1]], dtype=torch.float64)

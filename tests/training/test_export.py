@@ -149,7 +149,7 @@ def test_versions_stand_beside_each_other(single: Exported, half: Exported, mode
 def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Exported, tmp_path: Path) -> None:
     spec = ExportedModel.open(single.path / "model.onnx").spec
     config, progress = RunConfig(CirclesOptions(), method="noncur"), TrainingProgress(step=2, images=64, seconds=1.5)
-    made = Provenance(tmp_path, config, [this_session()], progress, "float32")
+    made = Provenance(tmp_path, config, [this_session()], progress, "float32", pretrained=False)
     result = {"split": "test", "num_images": 500, "metrics": {"position_px": 1.25}, "untrained": {"position_px": 40.0}}
     for images_seen, quoted in ((32, False), (64, True)):
         (tmp_path / EVALUATION_FILE).write_text(json.dumps(result | {"images_seen": images_seen}))

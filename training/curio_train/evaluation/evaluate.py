@@ -14,6 +14,7 @@ from curio_train.evaluation.real_frames import evaluate_real_frames
 from curio_train.evaluation.report import write_report
 from curio_train.evaluation.results import keep
 from curio_train.evaluation.scores import add_errors, pose_scores, scene_errors, scene_scores
+from curio_train.evaluation.several_objects import several_objects_scores
 from curio_train.evaluation.subject import Predict, Subject, load_subject
 from curio_train.export.card import EVALUATION_FILE
 from curio_train.learning.runs.configuration import CONFIG_FILE, world_name
@@ -24,6 +25,7 @@ from curio_train.metrics.poses import ADD_THRESHOLD
 from curio_train.refinement.render_and_compare import with_refinement
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
 from curio_train.worlds.base import Split, World
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 QUICK, ALL = 100, 500
@@ -87,10 +89,10 @@ def evaluate(
     if bop_results is not None and data is None:
         raise UsageError("--bop-results needs the real frames that it is about: --data DIR")
     subject = load_subject(path, data)
-    if data is not None and not isinstance(subject.world, SingleObjectWorld):
+    if data is not None and not isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld):
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
     if num_images is None:
-        num_images = QUICK if isinstance(subject.world, SingleObjectWorld) else ALL
+        num_images = QUICK if isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld) else ALL
     better = replace(subject, predict=with_refinement(subject.predict, subject.world)) if refine else None
     progress(f"{num_images} images of the {split} split")
     held_out = draw(subject.world, split, num_images, cache)
@@ -154,6 +156,8 @@ def score(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, floa
     if isinstance(world, SingleObjectWorld):
         info = world.objects[0].info
         scores |= pose_scores(poses(predicted), poses(true), world.object.mesh.vertices_m, info)
+    if isinstance(world, SeveralObjectsWorld):
+        scores |= several_objects_scores(world, predicted, true)
     return scores
 
 

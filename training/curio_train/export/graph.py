@@ -31,6 +31,7 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
 from curio_train.learning.runs.initial import weights_file
 from curio_train.learning.runs.provenance import run_sessions
+from curio_train.networks.templates.trunk import Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import Field
 from curio_train.worlds import build
@@ -156,10 +157,8 @@ def export(
     put_spec(model, spec)
 
     images = images[known]
-    found, weights = (
-        ExportedModel(model.SerializeToString(), "the exported graph")(images),
-        _weights(half, rounding_error),
-    )
+    found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
+    weights = _weights(half, rounding_error)
     parity_error = refuse_disparity({name: v[known] for name, v in (expected if half else learned).items()}, found)
     if reduce is not None:
         exact, reduced = found, reduce(world, model)
@@ -170,7 +169,8 @@ def export(
     spec.parity_max_abs_error = parity_error if reduce is None else rounding_error
     put_spec(model, spec)
     version = target.next_version()
-    made = Provenance(run, folder.config, sessions, state.progress, weights)
+    pretrained = any(isinstance(module, Trunk) for module in state.pose.network.modules())
+    made = Provenance(run, folder.config, sessions, state.progress, weights, pretrained)
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),

@@ -20,12 +20,6 @@ def project(points: Float[Tensor, "*#batch n 3"], matrix: Float[Tensor, "*#batch
     return homogeneous[..., :2] / homogeneous[..., 2:]
 
 
-def rays(matrix: Float[Tensor, "*batch 3 3"], width: int, height: int) -> Float[Tensor, "*batch {height} {width} 3"]:
-    """The point at depth z = 1 that each pixel's centre sees, camera frame."""
-    pixels = _pixel_centres(matrix, width, height)
-    return (pixels @ inverse(matrix).transpose(-1, -2)).unflatten(-2, (height, width))
-
-
 def inverse(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """K⁻¹, written out: exact for K's triangle, and without a solver in an exported graph."""
     fx, skew, cx = matrix[..., 0, :].unbind(-1)
@@ -87,12 +81,15 @@ def sampling_grid(
     ``align_corners=False`` puts -1 and 1 at the image's borders, which lie half a pixel outside the pixel centres. The
     inverse homography K Rᵀ K_crop⁻¹ is written out: no solver then enters an exported graph.
     """
-    seen = rays(crop.matrix, size, size).flatten(1, 2)
-    frame = seen @ crop.rotation @ matrix.transpose(-1, -2)
+    pixels = _pixel_centres(matrix, size, size).T
+    # From crop pixels to the grid at once: with few pixels' arithmetic left, an exported graph is fast.
+    border = matrix.new_tensor(
+        [[2 / frame_width, 0, 1 / frame_width - 1], [0, 2 / frame_height, 1 / frame_height - 1], [0, 0, 1]]
+    )
+    x, y, depth = (border @ matrix @ crop.rotation.transpose(1, 2) @ inverse(crop.matrix) @ pixels).unbind(1)
     # Behind the frame's camera there is nothing to see: such pixels are sent far outside instead of mirrored into it.
-    depth = frame[..., 2:].clamp(min=1e-6)
-    border = frame.new_tensor([frame_width, frame_height])
-    return ((2 * frame[..., :2] / depth + 1) / border - 1).unflatten(1, (size, size))
+    scale = 1 / depth.clamp(min=1e-6)
+    return torch.stack([x * scale, y * scale], dim=-1).unflatten(1, (size, size))
 
 
 def cut_crops(

@@ -9,7 +9,7 @@ from pathlib import Path
 from curio_serve.files import check_regular
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, CurioError, ExportError, UsageError
@@ -17,6 +17,7 @@ from curio_train.exported_model import WEIGHTS_FILE, find_model
 from curio_train.learning.runs.checkpoint import MAX_TENSOR_BYTES, RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, load_config
 from curio_train.learning.state import TrainState, under
+from curio_train.networks.several_objects.network import ObjectsNetwork
 
 _IMAGES, _SECONDS, _SYNTHETIC_LABELS = "images_seen", "training_seconds", "synthetic_labels"
 
@@ -41,8 +42,10 @@ def begin_with(state: TrainState, path: Path) -> None:
             images, seconds = int(notes[_IMAGES]), float(notes[_SECONDS])
         except ValueError as exc:
             raise CheckpointError(f"{path}: its {WEIGHTS_FILE} says {notes}; export the model anew") from exc
+    network = state.pose.network
+    drawn = {name: value for name, value in network.state_dict().items() if name not in _learned(network)}
     try:
-        state.pose.network.load_state_dict(tensors)
+        network.load_state_dict(tensors | drawn)
     except RuntimeError as exc:
         raise UsageError(
             f"--init {path}: its network does not fit this world ({str(exc).splitlines()[-1].strip()}); "
@@ -62,7 +65,7 @@ def weights_file(state: TrainState, config: RunConfig, *, half: bool) -> bytes:
     Raises:
         ExportError: A weight is too large for float16.
     """
-    tensors = {name: value.contiguous() for name, value in state.pose.network.state_dict().items()}
+    tensors = {name: value.contiguous() for name, value in _learned(state.pose.network).items()}
     if half:
         tensors = {
             name: value.half() if value.dim() > 1 and value.is_floating_point() else value
@@ -93,6 +96,12 @@ def uses_synthetic_labels(config: RunConfig) -> bool:
         return _weights_and_notes(config.init)[1][_SYNTHETIC_LABELS] != str(False)
     except CurioError:
         return True
+
+
+def _learned(network: nn.Module) -> dict[str, Tensor]:
+    """The state of a network but templates, which are drawn anew."""
+    drawn = ObjectsNetwork.DRAWN if isinstance(network, ObjectsNetwork) else ()
+    return {name: value for name, value in network.state_dict().items() if not name.startswith(drawn)}
 
 
 def _is_run(path: Path) -> bool:

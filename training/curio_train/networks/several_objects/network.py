@@ -1,6 +1,7 @@
 """Whole frame to the poses of several objects: places by a trained head, poses by templates, in one graph."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -17,6 +18,8 @@ NUM_PLACES = 3
 class ObjectsNetwork(nn.Module):
     """Locate, match, align; one slot an object."""
 
+    DRAWN: Final = ("reader.",)
+    """Beginnings of the names of what is drawn and calibrated instead of trained."""
     locator: LocatorNetwork
     """Finds places; its trunk's features are the reader's, too."""
     reader: PoseReader

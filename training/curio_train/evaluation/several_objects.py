@@ -1,0 +1,37 @@
+"""Scores of a detector for several objects on renderings that show some of them."""
+
+import numpy as np
+
+from curio_train.evaluation.scores import add_errors, pose_scores
+from curio_train.metrics.calibration import auroc, calibration_error
+from curio_train.metrics.poses import ADD_THRESHOLD
+from curio_train.scene_code import CONFIDENCE, SceneCode, index, poses
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+
+_MOST_POINTS = 2_000  # vertices that ADD is measured at, about
+
+
+def several_objects_scores(world: SeveralObjectsWorld, predicted: SceneCode, true: SceneCode) -> dict[str, float]:
+    """Means of the objects' pose scores where they are shown, and what all confidences say together.
+
+    ``confidence_ece`` takes a confidence as the probability that ADD(-S) is below a tenth of the diameter, and
+    ``present_auroc`` as a sign that an object is shown.
+    """
+    each, confidences, correct = [], [], []
+    there = true[CONFIDENCE][..., 0] > 0
+    for slot, member in enumerate(world.members):
+        shown = there[:, slot]
+        if not shown.any():
+            continue
+        vertices = member.mesh.vertices_m
+        points = vertices[:: max(1, len(vertices) // _MOST_POINTS)]
+        found, wanted = (poses(index(code, shown), slot) for code in (predicted, true))
+        each.append(pose_scores(found, wanted, points, member.kind.info))
+        errors = add_errors(found, wanted, points, member.kind.info)
+        confidences += predicted[CONFIDENCE][shown, slot, 0].tolist()
+        correct += [error < ADD_THRESHOLD for error in errors]
+    scores = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+    scores["confidence_ece"] = calibration_error(confidences, correct)
+    if not there.all():
+        scores["present_auroc"] = auroc(confidences, predicted[CONFIDENCE][..., 0][~there].tolist())
+    return scores
