@@ -208,6 +208,39 @@ def test_following_with_a_shipped_model_keeps_a_still_object() -> None:
     assert [track.predicted for track in tracks] == [False] * 5 + [True] * 2 + [False]
 
 
+@pytest.mark.parametrize("moved_px", [(45, 30), (-40, 45), (0, -50)])
+def test_an_object_that_moved_while_it_was_hidden_is_found_beside_its_last_place(moved_px: tuple[int, int]) -> None:
+    detector = Detector(open_model(ROOT / "models" / "duck"))
+    camera = PinholeCamera(np.array(json.loads((ROOT / "samples" / "camera.json").read_text())["camera_matrix"]))
+    pixels = np.ascontiguousarray(cv2.imread(str(ROOT / "samples" / "01.jpg"))[..., ::-1])
+    moved = np.roll(pixels, moved_px[::-1], axis=(0, 1))
+    num_runs: list[int] = []
+    stream, results = FollowingStream(), messages.DetectResponse().results
+    for frame in (*[pixels] * 3, *[np.zeros_like(pixels)] * 3, *[moved] * 4):
+        num_runs.append(0)
+
+        def count() -> None:
+            num_runs[-1] += 1
+
+        stream.follow(
+            messages.Tracking(),
+            [detector],
+            frame,
+            camera,
+            min_confidence=0.0,
+            reduction=1,
+            results=results,
+            before_run=count,
+        )
+    last = results[-1].detections[0]
+    assert (last.track.track_id, last.track.predicted) == (1, False)
+    slope = np.array(last.translation_m[:2]) / last.translation_m[2]
+    before = results[2].detections[0].translation_m
+    gap_px = 572.4 * (slope - np.array(before[:2]) / before[2])
+    assert gap_px == pytest.approx(moved_px, abs=8)
+    assert 9 in {runs - 1 for runs in num_runs[6:]}, "the crops found it, without a look at the whole frame"
+
+
 @pytest.mark.parametrize(
     "change", [{"side_px": -1}, {"tensors": {}}, {"presence": [1.0]}, {"fill": "wide"}, {"unknown": 1}]
 )

@@ -28,6 +28,9 @@ KEEP_S, MAX_OBJECTS = 1.5, 16
 _FOUND, _FOLLOWED = 0.2, 0.08  # least confidence to begin a track, and to go on with it
 _SEARCH_S = 0.09  # between looks at whole frames while an object is not seen
 _MORE_S, _VERIFY_S = 0.5, 2.0  # the same for further objects, and to make sure of those that are followed
+_AROUND = 0.6  # diameters between the crops in which an object is looked for that is not seen
+_OFFSETS = np.array([(x, y, 0) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+_TAKEN = 0.5  # diameters around an object within which no other one is
 _SURER = 0.2  # by which another place must be more confident than the one that is followed
 
 
@@ -98,7 +101,9 @@ class Follower:
         light = self._read_crops(frame)
         if self._is_look_due(frame, following):
             self._looked_s = time_s
-            light = self._look(frame, following) or light
+            light = self._search_around(frame) or light
+            if self._is_whole_needed(frame, following):
+                light = self._look(frame, following) or light
         kept = [track for track in self._tracks if time_s - track.seen_s <= following.keep_s]
         self._tracks = without_doubles(kept)[: following.num_objects * len(detector.model.spec.objects)]
         return self._answer(frame, light, following, min_confidence, results)
@@ -106,31 +111,38 @@ class Follower:
     def _read_crops(self, frame: StreamFrame) -> Sequence[float]:
         """Look for each object where it is expected; the light there."""
         light: Sequence[float] = ()
-        stage = frame.detector.model.crop_stage
-        if stage is None or frame.scaled_camera is None:
-            return light
-        height, width = frame.pixels.shape[:2]
         for track in self._tracks:
-            position_m = track.filter.translation_m
-            if not stage.sees(frame.scaled_camera, position_m, width, height):
-                continue
-            frame.before_run()
-            focal_px = frame.detector.model.camera.focal_lengths[0]
-            pose = stage.read(frame.pixels, frame.scaled_camera, position_m, focal_px)
-            if pose.confidence >= _FOLLOWED and pose.translation_m[2] > 0:
-                track.update(
-                    Measurement(
-                        track.kind.name,
-                        pose.translation_m,
-                        pose.rotation,
-                        pose.confidence,
-                        pose.position_covariance_m2,
-                        pose.rotation_variance,
-                    ),
-                    frame.time_s,
-                )
+            pose = frame.read(track.filter.translation_m)
+            if pose is not None and pose.confidence >= _FOLLOWED:
+                track.update(Measurement.of_crops(track.kind, pose), frame.time_s)
                 light = pose.light.tolist()
         return light
+
+    def _search_around(self, frame: StreamFrame) -> Sequence[float]:
+        """Look for each object that is not seen around where it was seen last; the light there."""
+        light: Sequence[float] = ()
+        for track in self._tracks:
+            if track.is_seen:
+                continue
+            offsets_m = _AROUND * track.kind.diameter_m
+            read = [frame.read(track.measured.translation_m + offsets_m * offset) for offset in _OFFSETS]
+            found = [pose for pose in read if pose is not None and pose.confidence >= _FOLLOWED]
+            found = [pose for pose in found if not self._is_taken(track, pose.translation_m)]
+            if found:
+                surest = max(found, key=lambda pose: pose.confidence)
+                track.update(Measurement.of_crops(track.kind, surest), frame.time_s)
+                light = surest.light.tolist()
+        return light
+
+    def _is_taken(self, track: Track, position_m: Array) -> bool:
+        """Whether another object that is seen is at that place."""
+        apart_m = _TAKEN * track.kind.diameter_m
+        return any(
+            other.is_seen
+            and other.kind.name == track.kind.name
+            and float(np.linalg.norm(other.measured.translation_m - position_m)) < apart_m
+            for other in self._tracks
+        )
 
     def _is_look_due(self, frame: StreamFrame, following: Following) -> bool:
         if frame.detector.model.crop_stage is None or following.search:
@@ -140,6 +152,10 @@ class Follower:
         if num_seen == 0 or num_seen < len(self._tracks):
             return waited_s >= _SEARCH_S
         return waited_s >= (_MORE_S if num_seen < wanted else _VERIFY_S)
+
+    def _is_whole_needed(self, frame: StreamFrame, following: Following) -> bool:
+        """Whether the whole frame has to be looked at, after the surroundings of what was not seen."""
+        return following.search or not self._tracks or not all(track.is_seen for track in self._tracks)
 
     def _look(self, frame: StreamFrame, following: Following) -> Sequence[float]:
         """Look at the whole frame; the light there."""

@@ -10,6 +10,7 @@ from curio_proto.v1.detector_pb2 import Track as TrackMessage
 
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
+from curio_serve.models.crop_stage import CropPose
 from curio_serve.models.detector import Detector, transformed
 from curio_serve.models.instances import cover, enlarged
 from curio_serve.models.reliability import status_of
@@ -73,6 +74,16 @@ class StreamFrame:
             for detection in result.detections
         ]
         return found, result.light
+
+    def read(self, position_m: Array) -> CropPose | None:
+        """The pose in crops around a position; None: the frame does not show it, or the model has no such stage."""
+        stage, camera = self.detector.model.crop_stage, self.scaled_camera
+        height, width = self.pixels.shape[:2]
+        if stage is None or camera is None or not stage.sees(camera, position_m, width, height):
+            return None
+        self.before_run()
+        pose = stage.read(self.pixels, camera, position_m, self.detector.model.camera.focal_lengths[0])
+        return pose if pose.translation_m[2] > 0 else None
 
     def add_detection(
         self, result: RegionResult, object_: str, translation_m: Array, rotation: Array, confidence: float

@@ -8,6 +8,7 @@ import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectModel
 from scipy.optimize import linear_sum_assignment
 
+from curio_serve.models.crop_stage import CropPose
 from curio_serve.models.symmetries import symmetry_rotations
 from curio_serve.tracking.pose_filter import PoseFilter
 
@@ -45,6 +46,18 @@ class Measurement:
         across, along = (_ACROSS * kind.diameter_m) ** 2, (_IN_DEPTH * distance_m) ** 2
         covariance = np.eye(3) * across + np.outer(ray, ray) * along
         return Measurement(kind.name, translation_m, rotation, confidence, covariance, _ROTATION_RAD**2)
+
+    @staticmethod
+    def of_crops(kind: ObjectModel, pose: CropPose) -> "Measurement":
+        """A pose that was read from crops, with the network's own spread."""
+        return Measurement(
+            kind.name,
+            pose.translation_m,
+            pose.rotation,
+            pose.confidence,
+            pose.position_covariance_m2,
+            pose.rotation_variance,
+        )
 
 
 @dataclass(eq=False)
