@@ -13,26 +13,65 @@ from curio_train.exported_model import ExportedModel
 from curio_train.meshes.shapes import chair
 from curio_train.scene_code import TRANSLATION
 from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
 from safetensors.torch import load_file
 
 VERSIONS = sorted((Path(__file__).parents[2] / "models").glob("*/[0-9]*"))
+SEVERAL = [version for version in VERSIONS if version.parent.name == "lmo"]
+"""Models of several objects, whose templates are in the graph alone."""
+SINGLE = [version for version in VERSIONS if version not in SEVERAL]
 MESH = chair(0.1)  # only rendering would need the object's own
 
 
-def described_world(model: ExportedModel) -> TwoStageWorld:
-    """The world that a model's specification describes, with another mesh."""
+def described_objects(model: ExportedModel) -> list[Object]:
+    """The objects that a model's specification describes, with another mesh."""
     spec = model.spec
-    camera, found = spec.camera, spec.objects[0]
+    camera = spec.camera
     depth = next((field.lower[2], field.upper[2]) for field in spec.fields if field.name == TRANSLATION)
-    kind = ObjectKind(found.name, (0,), found.diameter_m, MESH.box_corners_m, found.mesh_sha256)
     intrinsics = Intrinsics(np.reshape(camera.camera_matrix, (3, 3)), camera.width, camera.height)
     pool = np.zeros((1, camera.height, camera.width, 3), np.uint8)
-    return TwoStageWorld(spec.world, Object(kind, MESH, intrinsics, *depth, lambda _: ClutterBackgrounds(pool)))
+    return [
+        Object(
+            ObjectKind(found.name, (slot,), found.diameter_m, MESH.box_corners_m, found.mesh_sha256),
+            MESH,
+            intrinsics,
+            *depth,
+            lambda _: ClutterBackgrounds(pool),
+        )
+        for slot, found in enumerate(spec.objects)
+    ]
+
+
+def described_world(model: ExportedModel) -> TwoStageWorld:
+    """The world of one object that a model's specification describes."""
+    (one,) = described_objects(model)
+    return TwoStageWorld(model.spec.world, one)
 
 
 @pytest.mark.parametrize("version", VERSIONS, ids=lambda version: version.parent.name)
+def test_the_graph_gives_its_golden_answer(version: Path) -> None:
+    golden = dict(np.load(version / "golden.npz"))
+    found = ExportedModel.open(version / "model.onnx")(torch.from_numpy(golden.pop("image"))[None])
+    assert found.keys() == golden.keys()
+    for name, expected in golden.items():
+        np.testing.assert_allclose(found[name][0].numpy(), expected, atol=5e-3, err_msg=name)
+
+
+@pytest.mark.parametrize("version", SEVERAL, ids=lambda version: version.parent.name)
+def test_weights_fit_the_locator(version: Path) -> None:
+    members = described_objects(ExportedModel.open(version / "model.onnx"))
+    assert len(members) == 8
+    (stage,) = SeveralObjectsWorld("linemod", members).stages
+    built = stage.network(NetworkConfig()).state_dict()
+    weights = {
+        name.removeprefix("locator."): value for name, value in load_file(version / "weights.safetensors").items()
+    }
+    assert {name: value.shape for name, value in weights.items()} == {name: v.shape for name, v in built.items()}
+
+
+@pytest.mark.parametrize("version", SINGLE, ids=lambda version: version.parent.name)
 def test_weights_fit_and_give_the_golden_answer(version: Path) -> None:
     world = described_world(ExportedModel.open(version / "model.onnx"))
     network = world.assemble([stage.network(NetworkConfig()) for stage in world.stages])
