@@ -7,7 +7,7 @@ frames are the data set's labelled ones, read as serving reads them; labels scor
 
 sure                 fraction of answers that are sure, on frames with the object
 position, rotation   fraction of sure answers whose interval holds the true pose; the goal is 0.87 to 0.93 on renderings
-false_answers        fraction of backgrounds without the object for which the answer is sure; the goal is at most 0.05
+false_answers        fraction of frames without the object for which the answer is sure; on renderings at most 0.05
 """
 
 import json
@@ -56,48 +56,60 @@ class Arguments:
 def main() -> None:
     """Measures and prints."""
     arguments = tyro.cli(Arguments)
-    figures: dict[str, dict[str, Figures]] = {}
+    dataset, models = BopDataset(arguments.data), dict[str, dict[str, dict[str, Figures]]]()
     for path in arguments.models:
         detector, subject = Detector(open_model(path)), load_subject(path, arguments.data)
         world, cache = subject.world, arguments.cache.expanduser()
         answers = held_out_answers(world, subject.predict, "test", arguments.num_images, cache)
+        models[path.name] = {}
         for of, on_renderings in zip(detector.model.spec.reliability.objects, answers, strict=True):
-            figures[of.object] = {
+            models[path.name][of.object] = found = {
                 "renderings": _on_renderings(of, on_renderings),
-                "real": on_real_frames(detector, BopDataset(arguments.data), on_renderings.kind, of),
+                "real": on_real_frames(detector, dataset, on_renderings.kind, of),
             }
-            print(of.object, figures[of.object])
-    result = {"num_images": arguments.num_images, "all": _over_all(figures), "objects": figures}
-    print(json.dumps(result) if arguments.json else result["all"])
+            print(path.name, of.object, found, flush=True)
+    result = {"num_images": arguments.num_images, "models": models}
+    for name, several in (("single", False), ("several", True)):
+        figures = [one for found in models.values() if (len(found) > 1) == several for one in found.values()]
+        result |= {name: _over_all(figures)} if figures else {}
+    print(json.dumps(result) if arguments.json else "")
 
 
 def _on_renderings(of: ObjectReliability, answers: Answers) -> Figures:
-    found = coverage(of, answers.confidences, answers.errors)
-    false = float((answers.without >= of.min_confidence).mean())
-    return _rounded(found | {"backgrounds": len(answers.without), "false_answers": false})
+    return _with_false(of, coverage(of, answers.confidences, answers.errors), answers.without)
+
+
+def _with_false(of: ObjectReliability, found: Figures, without: np.ndarray) -> Figures:
+    """Adds how often answers are sure on frames without the object; of no such frames, never."""
+    num_sure = int((without >= of.min_confidence).sum())
+    return _rounded(found | {"num_without": len(without), "false_answers": num_sure / max(1, len(without))})
 
 
 def on_real_frames(detector: Detector, dataset: BopDataset, kind: ObjectKind, of: ObjectReliability) -> Figures:
-    """How often the intervals of the served answers hold on the labelled frames of an object."""
+    """How often the intervals of served answers hold on the frames of an object, and are sure on those without it."""
     targets = {(target.scene_id, target.image_id): target for target in scored_frames(dataset, kind.name).targets}
-    confidences, found, true = list[float](), list[Pose](), list[Pose]()
+    shown = {(one.scene_id, one.image_id) for one in dataset.annotations(SPLIT, kind.name)}
+    confidences, found, true, without = list[float](), list[Pose](), list[Pose](), list[float]()
     for scene_id in sorted({scene for scene, _ in targets}):
         for frame in dataset.frames(SPLIT, scene_id):
             target = targets.get((frame.scene_id, frame.image_id))
-            if target is None:
+            if target is None and (frame.scene_id, frame.image_id) in shown:
                 continue
             (result,) = detector.detect(read_photograph(frame.path), PinholeCamera(frame.matrix))
             one = next(one for one in result.detections if one.object == kind.name)
             assert (one.status == DETECTION_STATUS_SURE) == one.HasField("interval")
+            if target is None:
+                without.append(one.confidence)
+                continue
             confidences.append(one.confidence)
             found.append(Pose(np.reshape(one.rotation, (3, 3)), np.array(one.translation_m)))
             true.append(target.pose)
-    return _rounded(coverage(of, np.array(confidences), pose_errors(found, true, kind)))
+    return _with_false(of, coverage(of, np.array(confidences), pose_errors(found, true, kind)), np.array(without))
 
 
-def _over_all(figures: dict[str, dict[str, Figures]]) -> dict[str, Figures]:
-    """Fractions of the answers of all objects together."""
-    return {where: _pooled([one[where] for one in figures.values()]) for where in ("renderings", "real")}
+def _over_all(figures: Sequence[dict[str, Figures]]) -> dict[str, Figures]:
+    """Fractions of the answers about all objects together."""
+    return {where: _pooled([one[where] for one in figures]) for where in ("renderings", "real")}
 
 
 def _pooled(figures: Sequence[Figures]) -> Figures:
@@ -107,9 +119,9 @@ def _pooled(figures: Sequence[Figures]) -> Figures:
     for name in ("position", "rotation"):
         held = [one[name] * sure for one, sure in zip(figures, num_sure, strict=True) if sure]
         result[name] = sum(held) / sum(num_sure)
-    if "false_answers" in figures[0]:
-        result["false_answers"] = float(np.mean([one["false_answers"] for one in figures]))
-    return _rounded(result)
+    without = sum(one["num_without"] for one in figures)
+    false = sum(one["num_without"] * one["false_answers"] for one in figures)
+    return _rounded(result | {"num_without": without, "false_answers": false / max(1, without)})
 
 
 def _rounded(figures: Figures) -> Figures:

@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,9 @@ from curio_train.export.graph import Exported
 from curio_train.geometry import Pose
 from curio_train.metrics.conformal import conformal_quantile, error_bounds, sure_from
 from curio_train.scene_code import CONFIDENCE, SceneCode
-from curio_train.worlds.single_object.two_stage import TwoStageWorld
-from curio_train.worlds.single_object.world import Object
+from curio_train.worlds.several_objects.scenes import ObjectScenes
+from curio_train.worlds.single_object.two_stage import TwoStageWorld, frame_camera
+from curio_train.worlds.single_object.world import Object, pose_layout, position_field
 from scipy.spatial.transform import Rotation
 
 
@@ -95,6 +97,21 @@ def test_answers_on_renderings(brick_world: TwoStageWorld, tmp_path: Path) -> No
     (answers,) = held_out_answers(brick_world, predict, "validation", 10, tmp_path)
     assert len(answers.confidences) == len(answers.without) == len(answers.errors) == 10
     assert answers.confidences.mean() > answers.without.mean()
+
+
+def test_renderings_of_several_objects_are_also_those_without_some(brick: Object, tmp_path: Path) -> None:
+    members = [replace(brick, kind=replace(brick.kind, name=name, slots=(slot,))) for slot, name in enumerate("ab")]
+    layout = pose_layout(position_field(brick), confidence=True, num_slots=2)
+    world = ObjectScenes("linemod", members, frame_camera(brick.camera), layout)
+
+    def predict(images: torch.Tensor) -> SceneCode:
+        code = world.sample(len(images), (7,))
+        return {**code, CONFIDENCE: torch.tensor([0.2, 0.7]).repeat(len(images), 1)[..., None]}
+
+    answers = held_out_answers(world, predict, "test", 20, tmp_path)
+    assert [one.kind.name for one in answers] == ["a", "b"]
+    assert all(len(one.confidences) + len(one.without) == 20 and len(one.without) for one in answers)
+    assert [*answers[1].confidences, *answers[1].without] == pytest.approx([0.7] * 20)
 
 
 def _reliability(name: str) -> Reliability:
