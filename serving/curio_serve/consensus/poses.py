@@ -11,7 +11,6 @@ Self-training uses it on photographs of a still scene, serving on the cameras of
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
 _MEAN_STEPS = 3  # times that a pose becomes the mean of the predictions near it
@@ -81,10 +80,18 @@ def mean_pose(predictions: Predictions, rows: Array, symmetries: Array) -> tuple
     """Mean rotation [3, 3] and position [3] of some predictions; positions are weighted by their inverse covariance."""
     rotations = predictions.rotation[rows]
     _, symmetry = angles_deg(rotations, rotations[0], symmetries)
-    rotation = Rotation.from_matrix(rotations @ symmetries[symmetry]).mean().as_matrix()
+    rotation = mean_rotation(rotations @ symmetries[symmetry])
     weight = np.linalg.inv(predictions.covariance_m2[rows])
     weighted = np.einsum("nij,nj->i", weight, predictions.translation_m[rows])
     return rotation, np.linalg.solve(weight.sum(axis=0), weighted)
+
+
+def mean_rotation(rotations: Array) -> Array:
+    """The rotation [3, 3] with the least sum of squared differences to rotations [n, 3, 3]."""
+    left, _, right = np.linalg.svd(rotations.mean(axis=0))
+    left[:, 2] *= np.linalg.det(left @ right)
+    result: Array = left @ right
+    return result
 
 
 def mahalanobis(gaps: Array, covariance: Array) -> Array:

@@ -38,3 +38,22 @@ def quaternion_xyzw(rows: Sequence[float]) -> tuple[float, float, float, float]:
         w, x, y, z = yx - xy, xz + zx, zy + yz, z
     scale = math.copysign(1 / math.hypot(w, x, y, z), w)
     return x * scale, y * scale, z * scale, w * scale
+
+
+def from_rotation_vector(vector: Array) -> Array:
+    """Rotations [..., 3, 3] about axes by angles: vectors [..., 3] in radians (Rodrigues' formula)."""
+    x, y, z = np.moveaxis(np.asarray(vector, float), -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
+    angle = np.sqrt(x * x + y * y + z * z)[..., None, None]
+    sine, versine = np.sinc(angle / np.pi), np.sinc(angle / (2 * np.pi)) ** 2 / 2  # divided by angle and its square
+    result: Array = np.eye(3) + sine * cross + versine * (cross @ cross)
+    return result
+
+
+def rotation_vector(rotation: Array) -> Array:
+    """The vector [3] of a rotation [3, 3]: along its axis, as long as its angle, at most pi."""
+    x, y, z, w = quaternion_xyzw(rotation.ravel().tolist())
+    sine = math.hypot(x, y, z)
+    result: Array = np.array([x, y, z]) * (2 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0)
+    return result

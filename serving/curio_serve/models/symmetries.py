@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectModel
-from scipy.spatial.transform import Rotation
+
+from curio_serve.imaging.rotation import from_rotation_vector
 
 Array = np.ndarray
 _SYMMETRY_STEP_RAD = math.radians(5)
@@ -17,6 +18,6 @@ def symmetry_rotations(kind: ObjectModel) -> Array:
     for symmetry in kind.symmetries:
         if len(symmetry.axis) == 3:
             angles = np.arange(0, 2 * math.pi, _SYMMETRY_STEP_RAD)
-            turns = Rotation.from_rotvec(angles[:, None] * np.array(symmetry.axis)).as_matrix()
+            turns = from_rotation_vector(angles[:, None] * np.array(symmetry.axis))
             found = (found[:, None] @ turns[None]).reshape(-1, 3, 3)
     return found

@@ -7,9 +7,8 @@ with constant velocity: a surprise opens it, so that it neither trembles at rest
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from curio_serve.imaging.rotation import quaternion_xyzw
+from curio_serve.imaging.rotation import from_rotation_vector, rotation_vector
 
 Array = np.ndarray
 _ACCELERATION_M_S2, _ANGULAR_ACCELERATION_RAD_S2 = 0.06, 0.4  # standard deviations while nothing surprises
@@ -54,7 +53,7 @@ class PoseFilter:
             self.velocity_m_s *= fading
             self.turn_rad_s *= fading
         self.translation_m += seconds * self.velocity_m_s
-        self.rotation = Rotation.from_rotvec(seconds * self.turn_rad_s).as_matrix() @ self.rotation
+        self.rotation = from_rotation_vector(seconds * self.turn_rad_s) @ self.rotation
         self._linear = _moved(self._linear, seconds, _ACCELERATION_M_S2)
         self._angular = _moved(self._angular, seconds, _ANGULAR_ACCELERATION_RAD_S2)
         self._elapsed_s = seconds
@@ -74,14 +73,12 @@ class PoseFilter:
 
     def update_rotation(self, rotation: Array, variance: float) -> None:
         """Take in a measured rotation cam_from_obj [3, 3] with its variance about each axis, rad²."""
-        # By its quaternion: scipy's from_matrix takes half a millisecond to make sure that it is orthogonal.
-        change = (rotation @ self.rotation.T).ravel().tolist()
-        innovation = Rotation.from_quat(quaternion_xyzw(change)).as_rotvec()
+        innovation = rotation_vector(rotation @ self.rotation.T)
         noise = np.eye(3) * max(variance, _LEAST_RAD**2)
         correction, self._angular = _corrected(
             self._angular, innovation, noise, self._elapsed_s, _ANGULAR_ACCELERATION_RAD_S2
         )
-        self.rotation = Rotation.from_rotvec(correction[:3]).as_matrix() @ self.rotation
+        self.rotation = from_rotation_vector(correction[:3]) @ self.rotation
         self.turn_rad_s += correction[3:]
 
     def replace_rotation(self, rotation: Array, variance: float) -> None:

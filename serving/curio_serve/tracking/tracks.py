@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectModel
-from scipy.optimize import linear_sum_assignment
 
 from curio_serve.models.crop_stage import CropPose
 from curio_serve.models.symmetries import symmetry_rotations
+from curio_serve.tracking.assignment import assigned
 from curio_serve.tracking.pose_filter import PoseFilter
 
 Array = np.ndarray
@@ -150,8 +150,7 @@ def assign(tracks: Sequence[Track], found: Sequence[Measurement], time_s: float,
             gap_m = float(np.linalg.norm(measured.translation_m - track.filter.translation_m))
             if measured.object == track.kind.name and (alone or gap_m < track.reach_m(time_s)):
                 distance[row, column] = gap_m
-    rows, columns = linear_sum_assignment(distance)
-    return {int(r): int(c) for r, c in zip(rows, columns, strict=True) if distance[r, c] < far}
+    return {row: column for row, column in assigned(distance).items() if distance[row, column] < far}
 
 
 def without_doubles(tracks: Sequence[Track]) -> list[Track]:
