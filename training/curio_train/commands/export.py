@@ -63,7 +63,8 @@ def _export(command: ExportCommand) -> int:
         check_repository(command.push)
     is_written = bool(ModelFolder(command.run).versions())
     if is_written and (command.half or command.int8 or command.name is not None):
-        raise UsageError(f"{command.run} is a model and used as it is; --half, --int8 and --name are for run folders")
+        done = "measured" if command.push is None else "pushed"
+        raise UsageError(f"{command.run} is a model and {done} as it is; --half, --int8 and --name are for run folders")
     folder = command.run if is_written else _write(command).parent
     try:
         if command.intervals:
@@ -75,7 +76,9 @@ def _export(command: ExportCommand) -> int:
             raise
         asked = [*(["--intervals"] if command.intervals else []), *(["--push", command.push] if command.push else [])]
         again = shlex.join(["curio-export", str(folder), *asked])
-        raise type(exc)(f"{exc}\n{folder} was written; to go on from it: {again}") from exc
+        raise type(exc)(
+            f"{exc}\n{folder} was written; to {'push' if command.push else 'measure'} it again: {again}"
+        ) from exc
     return 0
 
 
