@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from curio_train.commands.running import answer
+from curio_train.commands.command_line.running import answer
 from paper.captures_table import METHODS, Table, markdown, row
 from paper.results import load_rows, save_results
 from paper.run_queue import QueuedRun, carry_out

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
-from curio_train.commands.running import answer
+from curio_train.commands.command_line.running import answer
 from curio_train.config import PRESETS
 from curio_train.errors import UsageError
 from paper.run_queue import QueuedRun, carry_out

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
-from curio_train.commands.running import answer
+from curio_train.commands.command_line.running import answer
 from curio_train.data.bop import BopDataset
-from curio_train.evaluation.candidates import Candidate, candidates
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.real_frames import evaluate_real_frames
 from curio_train.evaluation.subject import load_subject
+from curio_train.evaluation.unlabelled.candidates import Candidate, candidates
 from curio_train.refinement.render_and_compare import with_refinement
 from paper.linemod_markdown import markdown
 from paper.linemod_sheet import write_sheet

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from curio_train.commands.running import answer
+from curio_train.commands.command_line.running import answer
 from curio_train.config import PRESETS
 from curio_train.errors import UsageError
 from paper.results import ORDER, WORLDS, collect, load_results, merge, save_results

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from curio_train.evaluation.candidates import Candidate, files_sha256
+from curio_train.evaluation.unlabelled.candidates import Candidate, files_sha256
 
 from paper.results import Results, Row, load_rows
 

@@ -83,7 +83,7 @@ def test_the_wheel_holds_packages_and_commands_and_nothing_else(
     tops = {Path(file).parts[0] for file in installed["files"] if not file.startswith("..")}
     packages = {"curio_train", "curio_serve", "curio_proto"}
     assert {top for top in tops if not top.endswith(".dist-info")} == packages
-    assert "curio_train/evaluation/report.html.jinja" in installed["files"]
+    assert "curio_train/evaluation/reporting/report.html.jinja" in installed["files"]
     assert any(file.endswith("licenses/LICENSE") for file in installed["files"])
 
 

@@ -9,6 +9,11 @@ import pytest
 
 MAX_FILE_LINES = 350
 MAX_FUNCTION_LINES = 80
+MAX_FOLDER_FILES = 15
+MAX_FOLDER_LINES = 2600
+CODE = {"training", "serving", "proto", "benchmarks"}
+# The renderer is one thing in many short files.
+FULL_FOLDER = Path("training/curio_train/rendering")
 VAGUE_NAMES = {"utils", "util", "helpers", "helper", "common", "misc"}
 BROAD = {"Exception", "BaseException"}
 # Where a call ends: its caller gets an answer to any fault of ours.
@@ -47,6 +52,20 @@ def is_broad(handler: ast.ExceptHandler) -> bool:
 def test_files_are_short(sources: dict[Path, str]) -> None:
     long = {str(path): n for path, text in sources.items() if (n := len(text.splitlines())) > MAX_FILE_LINES}
     assert not long, f"more than {MAX_FILE_LINES} lines: {long}"
+
+
+def test_folders_are_small(sources: dict[Path, str]) -> None:
+    modules: dict[Path, list[int]] = {}
+    for path, text in sources.items():
+        if path.parts[0] in CODE and path.name != "__init__.py" and path.parent != FULL_FOLDER:
+            modules.setdefault(path.parent, []).append(len(text.splitlines()))
+    assert len(modules) > 30, "these are not all folders"
+    full = {
+        str(folder): (len(lines), sum(lines))
+        for folder, lines in modules.items()
+        if len(lines) > MAX_FOLDER_FILES or sum(lines) > MAX_FOLDER_LINES
+    }
+    assert not full, f"more than {MAX_FOLDER_FILES} modules or {MAX_FOLDER_LINES} lines: {full}"
 
 
 def test_functions_are_short(trees: dict[Path, ast.Module]) -> None:

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from curio_serve.batch.parallel import in_order
+from curio_serve.batch.images.parallel import in_order
 
 
 def test_answers_keep_the_order_whoever_is_first() -> None:

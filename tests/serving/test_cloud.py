@@ -18,8 +18,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from curio_serve.batch.remote_files import Patience, RemoteFiles
-from curio_serve.batch.sources import PassedOver, images
+from curio_serve.batch.images.remote_files import Patience, RemoteFiles
+from curio_serve.batch.images.sources import PassedOver, images
 from curio_serve.errors import ImageError, Unavailable
 
 boto3 = pytest.importorskip("boto3", reason="moto is not installed: extra `dev`")
@@ -52,7 +52,7 @@ def environment(endpoint: str) -> dict[str, str]:
 
 def forget_connections() -> None:
     import s3fs
-    from curio_serve.batch.remote_files import remote_files
+    from curio_serve.batch.images.remote_files import remote_files
 
     s3fs.S3FileSystem.clear_instance_cache()
     remote_files.cache_clear()
@@ -219,8 +219,8 @@ def test_parts_joined_are_the_file_of_a_local_run_after_a_stop_and_a_kill(
     (tmp_path / "some").write_bytes(b"".join(here.read_bytes().splitlines(keepends=True)[:12]))
     program = (
         "import os, signal, sys\n"
-        "from curio_serve.batch.formats import ImageLines, JsonLines\n"
-        "from curio_serve.batch.result_parts import ResultParts\n"
+        "from curio_serve.batch.results.formats import ImageLines, JsonLines\n"
+        "from curio_serve.batch.results.result_parts import ResultParts\n"
         f"with ResultParts({there!r}, JsonLines(), [('flat', 1)], every_s=float(sys.argv[2])) as parts:\n"
         "    parts.unanswered(iter(()))\n"
         "    for line in open(sys.argv[1], 'rb'):\n"

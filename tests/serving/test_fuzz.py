@@ -31,7 +31,7 @@ fuzz = settings(
 _SCENE = cv2.resize(np.random.default_rng(0).integers(0, 255, (6, 8, 3)).astype(np.uint8), (96, 64))
 _IMAGES = [cv2.imencode(suffix, _SCENE)[1].tobytes() for suffix in (".jpg", ".png", ".webp")]
 _IMAGES.append(cv2.imencode(".jpg", _SCENE, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes())
-# Messages as they travel, METHOD-WHAT.bin; benchmarks/fuzz_corpus.py writes them.
+# Messages as they travel, METHOD-WHAT.bin; benchmarks/load/fuzz_corpus.py writes them.
 _CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.bin"))
 _PATHS = {
     "Detect": "/curio.v1.PoseDetector/Detect",

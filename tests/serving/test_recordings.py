@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from curio_serve.batch import recordings
 from curio_serve.batch.arguments import DetectArguments
 from curio_serve.batch.detect_cli import run
-from curio_serve.batch.recordings import info_topic_of
+from curio_serve.batch.images import recordings
+from curio_serve.batch.images.recordings import info_topic_of
 from curio_serve.errors import UsageError
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory

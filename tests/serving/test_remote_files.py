@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from curio_serve.batch.remote_files import Patience, RemoteFiles
+from curio_serve.batch.images.remote_files import Patience, RemoteFiles
 from curio_serve.errors import ImageError, UsageError
 
 pytest.importorskip("aiohttp", reason="aiohttp is not installed: extra `cloud`")

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
-from curio_serve.batch.formats import Bop, Csv, ImageResult, JsonLines, ResultFormat
-from curio_serve.batch.result_file import ResultFile
+from curio_serve.batch.results.formats import Bop, Csv, ImageResult, JsonLines, ResultFormat
+from curio_serve.batch.results.result_file import ResultFile
 from curio_serve.errors import OutputError, UsageError
 
 MODEL = ("ape", 1)
@@ -195,8 +195,8 @@ def test_a_full_disk_leaves_complete_lines_and_says_so(tmp_path: Path, limited_f
 def test_a_pipe_is_written_through() -> None:
     program = (
         "from pathlib import Path\n"
-        "from curio_serve.batch.result_file import ResultFile\n"
-        "from curio_serve.batch.formats import ImageResult, Csv\n"
+        "from curio_serve.batch.results.result_file import ResultFile\n"
+        "from curio_serve.batch.results.formats import ImageResult, Csv\n"
         "form = Csv()\n"
         "with ResultFile(None, form, [('ape', 1)]) as output:\n"
         "    list(output.unanswered(iter([])))\n"

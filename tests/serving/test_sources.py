@@ -10,8 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from curio_serve.batch import sources
-from curio_serve.batch.sources import PassedOver, check_arguments, common_folder, images
+from curio_serve.batch.images import sources
+from curio_serve.batch.images.source_image import SourceImage
+from curio_serve.batch.images.sources import PassedOver, check_arguments, common_folder, images
 from curio_serve.errors import ImageError, UsageError
 
 
@@ -69,7 +70,7 @@ def test_a_list_on_standard_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_missing_file_is_an_error_of_that_image(tmp_path: Path) -> None:
     for name in ("missing.png", "null\0byte.png"):
         with pytest.raises(ImageError, match="cannot be read"):
-            sources.SourceImage(name, str(tmp_path / name)).read()
+            SourceImage(name, str(tmp_path / name)).read()
 
 
 def test_arguments_that_name_nothing_are_refused_before_the_start(tmp_path: Path) -> None:

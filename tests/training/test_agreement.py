@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from curio_train.evaluation.agreement import differing, overlap
-from curio_train.evaluation.closeups import CLOSEUP_PX
-from curio_train.evaluation.photographed import Judgement, judge
-from curio_train.evaluation.report_figures import samples
+from curio_train.evaluation.reporting.report_figures import samples
+from curio_train.evaluation.unlabelled.agreement import differing, overlap
+from curio_train.evaluation.unlabelled.closeups import CLOSEUP_PX
+from curio_train.evaluation.unlabelled.photographed import Judgement, judge
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
 from curio_train.worlds.base import World

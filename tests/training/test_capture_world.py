@@ -25,8 +25,8 @@ from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
 from curio_train.worlds.base import World
+from curio_train.worlds.capture import CapturePhotographs
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object.capture import CapturePhotographs
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from torch import Tensor
 

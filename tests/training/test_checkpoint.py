@@ -18,7 +18,7 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import load_config, refuse_other
 from curio_train.learning.runs.interruption import Interrupted, Interruption, interruptible
 from curio_train.learning.runs.provenance import SESSIONS, record_session, run_sessions
-from curio_train.learning.runs.session import learn
+from curio_train.learning.session import learn
 from curio_train.learning.state import TrainState
 from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions, LinemodOptions

@@ -16,7 +16,7 @@ from curio_train.config import ConvStack, NetworkConfig, Recipe, RunConfig
 from curio_train.errors import CheckpointError
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.interruption import Interruption
-from curio_train.learning.runs.session import learn
+from curio_train.learning.session import learn
 from curio_train.worlds.options import CirclesOptions
 from torch import Tensor
 

@@ -19,7 +19,7 @@ from curio_train.doctor.finding import Finding
 from curio_train.export.onnx import put_spec
 from curio_train.meshes.meshes import load_mesh
 from curio_train.worlds.base import Camera
-from curio_train.worlds.single_object.capture import CapturePhotographs
+from curio_train.worlds.capture import CapturePhotographs
 from PIL import Image
 
 WIDTH, HEIGHT, NUM_PHOTOS = 160, 120, 84

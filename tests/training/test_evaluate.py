@@ -16,14 +16,14 @@ from curio_train.data.bop import ModelInfo
 from curio_train.errors import CurioError, DataError, ExportError, UsageError
 from curio_train.evaluation.evaluate import draw, evaluate, score
 from curio_train.evaluation.real_frames import evaluate_real_frames
+from curio_train.evaluation.reporting.tables import print_evaluation
 from curio_train.evaluation.scores import pose_scores, rotation_errors_deg
 from curio_train.evaluation.subject import Subject
-from curio_train.evaluation.tables import print_evaluation
 from curio_train.geometry import Pose
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds.generated.circles import Circles
+from curio_train.worlds.linemod import build
 from curio_train.worlds.options import LinemodOptions
-from curio_train.worlds.single_object.linemod import build
 from curio_train.worlds.single_object.world import SingleObjectWorld
 from rich.console import Console
 from scipy.spatial.transform import Rotation

@@ -16,7 +16,7 @@ from curio_train.exported_model import ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.initial import begin_with, uses_synthetic_labels
 from curio_train.learning.runs.interruption import Interruption
-from curio_train.learning.runs.session import learn
+from curio_train.learning.session import learn
 from curio_train.learning.state import TrainState
 from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions

@@ -16,8 +16,8 @@ from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
+from curio_train.worlds.linemod import FAR_M, NEAR_M, read_camera_poses
 from curio_train.worlds.options import LinemodOptions
-from curio_train.worlds.single_object.linemod import FAR_M, NEAR_M, read_camera_poses
 from curio_train.worlds.single_object.viewpoints import MAX_LIGHT, MIN_LIGHT
 from curio_train.worlds.single_object.world import EXPOSURE
 

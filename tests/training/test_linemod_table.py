@@ -17,7 +17,7 @@ import pytest
 import trimesh
 from curio_train.data.bop import LINEMOD_CLASSES
 from curio_train.errors import DataError, UsageError
-from curio_train.evaluation.candidates import candidates
+from curio_train.evaluation.unlabelled.candidates import candidates
 from curio_train.worlds.options import LinemodOptions
 from paper.linemod_markdown import markdown
 from paper.linemod_table import load_table

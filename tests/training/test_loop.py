@@ -13,7 +13,7 @@ from curio_train.errors import DataError, TrainingError, UsageError
 from curio_train.learning.loop import Outcome, learning_rate_factor
 from curio_train.learning.parallel import Ranks
 from curio_train.learning.runs.interruption import Interruption
-from curio_train.learning.runs.session import learn
+from curio_train.learning.session import learn
 from curio_train.learning.trainer import Trainer
 from curio_train.worlds.base import Batch, ImageSource
 from curio_train.worlds.generated.circles import Circles

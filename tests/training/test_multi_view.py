@@ -17,8 +17,8 @@ from curio_train.refinement.pseudo_labels import MIN_CONSENSUS, PseudoLabels
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.linemod import LinemodPhotographs
 from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
-from curio_train.worlds.single_object.linemod import LinemodPhotographs
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation

@@ -15,7 +15,7 @@ from curio_train.learning.parallel import Ranks
 from curio_train.learning.prefetch import prefetching
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.interruption import Interruption
-from curio_train.learning.runs.session import learn
+from curio_train.learning.session import learn
 from curio_train.learning.state import TrainState
 from curio_train.learning.trainer import Trainer
 from curio_train.meshes.shapes import box

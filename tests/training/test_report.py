@@ -18,8 +18,8 @@ from curio_train.commands import train as train_command
 from curio_train.config import WorldOptions
 from curio_train.errors import ReportError
 from curio_train.evaluation.evaluate import evaluate
-from curio_train.evaluation.report import REPORT_FILE, report_training
-from curio_train.evaluation.report_figures import reliability
+from curio_train.evaluation.reporting.report import REPORT_FILE, report_training
+from curio_train.evaluation.reporting.report_figures import reliability
 from curio_train.metrics.calibration import reliability_bins
 from curio_train.worlds.options import CirclesOptions, LightOptions
 

@@ -12,7 +12,7 @@ from curio_train.capture.structure import Structure
 from curio_train.commands import train as train_command
 from curio_train.data.bop import BopDataset
 from curio_train.errors import DataError, UsageError
-from curio_train.evaluation.scene_scale import mean_scale, scale_by_objects
+from curio_train.evaluation.unlabelled.scene_scale import mean_scale, scale_by_objects
 
 MODELS = Path(__file__).parents[2] / "models"
 

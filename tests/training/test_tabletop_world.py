@@ -14,7 +14,7 @@ from curio_train.config import METHODS, NetworkConfig, Recipe, RunConfig
 from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, UsageError
 from curio_train.evaluation.evaluate import evaluate
-from curio_train.evaluation.photographed import judge
+from curio_train.evaluation.unlabelled.photographed import judge
 from curio_train.export.graph import export
 from curio_train.geometry import Pose, camera_looking_at
 from curio_train.learning.parallel import ranks

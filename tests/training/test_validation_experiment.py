@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from paper.validation_experiment import (
+from discs.validation_experiment import (
     ValidationSettings,
     discrepancy,
     image_error,

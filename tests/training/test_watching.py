@@ -6,7 +6,7 @@ from typing import get_args
 import pytest
 import torch
 from curio_train.scene_code import COLOR, TRANSLATION
-from paper.watching import BACKGROUND_SRGB, FAR, NEAR, RADIUS, Discs, Loss, Scene, watch
+from discs.watching import BACKGROUND_SRGB, FAR, NEAR, RADIUS, Discs, Loss, Scene, watch
 
 
 @pytest.mark.parametrize(("scene", "z", "radius"), [("5D", 1.5, RADIUS), ("6D", 1.0, 0.18), ("6D", 3.0, 0.06)])

@@ -14,9 +14,9 @@ from typing import Any, TypeAlias
 
 import cv2
 
-from curio_serve.batch.formats import ImageLines
-from curio_serve.batch.remote_files import is_url
-from curio_serve.batch.sources import SourceImage
+from curio_serve.batch.images.remote_files import is_url
+from curio_serve.batch.images.source_image import SourceImage
+from curio_serve.batch.results.formats import ImageLines
 from curio_serve.errors import CurioError, Unavailable, UsageError
 
 Opening: TypeAlias = Callable[[], Callable[[SourceImage], ImageLines]]

@@ -21,12 +21,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from curio_serve.batch.estimators import Estimator, Settings
-    from curio_serve.batch.formats import ImageLines, ResultFormat
-    from curio_serve.batch.recorded_poses import Detection3DArrays, PoseRecording
-    from curio_serve.batch.recordings import Recording
-    from curio_serve.batch.result_file import ResultFile
-    from curio_serve.batch.result_parts import ResultParts
-    from curio_serve.batch.sources import SourceImage
+    from curio_serve.batch.images.recordings import Recording
+    from curio_serve.batch.images.source_image import SourceImage
+    from curio_serve.batch.results.formats import ImageLines, ResultFormat
+    from curio_serve.batch.results.recorded_poses import Detection3DArrays
     from curio_serve.client import PoseClient
 
 
@@ -63,13 +61,15 @@ def run(arguments: DetectArguments) -> int:
     import cv2
 
     from curio_serve.batch.cluster import over_cluster
-    from curio_serve.batch.parallel import in_order
+    from curio_serve.batch.images.parallel import in_order
+    from curio_serve.batch.images.read_ahead import read_ahead
+    from curio_serve.batch.images.remote_files import is_url
+    from curio_serve.batch.images.source_image import Topics
+    from curio_serve.batch.images.sources import STANDARD_INPUT, PassedOver, check_arguments, images
+    from curio_serve.batch.output import open_output, result_format
     from curio_serve.batch.progress import Progress
-    from curio_serve.batch.read_ahead import read_ahead
     from curio_serve.batch.refinement import refining
-    from curio_serve.batch.remote_files import is_url
     from curio_serve.batch.rig_images import run_rig
-    from curio_serve.batch.sources import STANDARD_INPUT, PassedOver, Topics, check_arguments, images
     from curio_serve.batch.tracked import check_tracking, from_the_first
     from curio_serve.models.model_check import ChildCheck
 
@@ -92,9 +92,9 @@ def run(arguments: DetectArguments) -> int:
         _check_camera(arguments, estimator, recordings)
     if arguments.video is not None:
         return _live(arguments, estimators)
-    form = _format(arguments, estimators)
+    form = result_format(arguments, estimators)
     passed_over, topics = PassedOver(), Topics(arguments.topic, arguments.info_topic)
-    with _output(arguments, form, estimators) as output:
+    with open_output(arguments, form, estimators) as output:
         remaining = output.unanswered(images(arguments.images, passed_over, topics))
         if arguments.track:
             remaining = from_the_first(output, remaining)
@@ -163,7 +163,7 @@ def _check_numbers(arguments: DetectArguments) -> None:
 
 def _settings(arguments: DetectArguments) -> "Settings":
     from curio_serve.batch.estimators import Settings
-    from curio_serve.batch.sources import common_folder
+    from curio_serve.batch.images.sources import common_folder
     from curio_serve.imaging.camera_files import read_camera_file
 
     try:
@@ -187,8 +187,8 @@ def _settings(arguments: DetectArguments) -> "Settings":
 
 def _check_overlays(folder: Path, images: tuple[str, ...]) -> None:
     """Refuse drawings that would land on the images, or be taken for images by this run or the next."""
-    from curio_serve.batch.remote_files import is_url
-    from curio_serve.batch.sources import common_folder
+    from curio_serve.batch.images.remote_files import is_url
+    from curio_serve.batch.images.sources import common_folder
 
     target = Path(os.path.abspath(folder))
     for argument in images:
@@ -232,8 +232,10 @@ def _answering(
     arguments: DetectArguments, models: "Sequence[str]", settings: "Settings"
 ) -> "Callable[[SourceImage], ImageLines]":
     """Build the function that answers images in another process."""
+    from curio_serve.batch.output import result_format
+
     estimators = _estimators(arguments, models, settings)
-    return partial(_answer, estimators, _format(arguments, estimators))
+    return partial(_answer, estimators, result_format(arguments, estimators))
 
 
 def _answer(
@@ -264,36 +266,17 @@ def _client(arguments: DetectArguments, address: str) -> "PoseClient":
 
 def _recordings(arguments: DetectArguments) -> "list[Recording]":
     """The recordings among the images, each looked at before any work."""
-    from curio_serve.batch.sources import STANDARD_INPUT, Topics, is_recording
+    from curio_serve.batch.images.source_image import Topics
+    from curio_serve.batch.images.sources import STANDARD_INPUT, is_recording
 
     if not any(map(is_recording, arguments.images)):
         if (arguments.topic or arguments.info_topic) and STANDARD_INPUT not in arguments.images:
             raise UsageError("--topic and --info-topic are for recordings; found no .mcap among the images")
         return []
-    from curio_serve.batch.recordings import Recording  # of an extra
+    from curio_serve.batch.images.recordings import Recording  # of an extra
 
     topics = Topics(arguments.topic, arguments.info_topic)
     return [Recording(path, topics) for path in arguments.images if is_recording(path) and os.path.exists(path)]
-
-
-def _output(
-    arguments: DetectArguments, form: "ResultFormat | Detection3DArrays", estimators: "Sequence[Estimator]"
-) -> "ResultFile | ResultParts | PoseRecording":
-    from curio_serve.batch.formats import ResultFormat
-    from curio_serve.batch.remote_files import is_url
-    from curio_serve.batch.result_file import ResultFile
-    from curio_serve.batch.result_parts import ResultParts
-
-    if isinstance(form, ResultFormat):
-        names = [(estimator.name, estimator.version) for estimator in estimators]
-        if arguments.out is not None and is_url(arguments.out):
-            return ResultParts(arguments.out, form, names, overwrite=arguments.overwrite)
-        path = None if arguments.out is None else Path(arguments.out)
-        return ResultFile(path, form, names, overwrite=arguments.overwrite)
-    from curio_serve.batch.recorded_poses import PoseRecording  # of an extra
-
-    assert arguments.out is not None
-    return PoseRecording(Path(arguments.out), overwrite=arguments.overwrite)
 
 
 def _check_camera(arguments: DetectArguments, estimator: "Estimator", recordings: "list[Recording]") -> None:
@@ -309,31 +292,6 @@ def _check_camera(arguments: DetectArguments, estimator: "Estimator", recordings
             f"model {estimator.name} needs the intrinsics of the camera that took the images; give --camera FILE "
             "(camera JSON, BOP's camera.json or scene_camera.json, or OpenCV YAML)"
         )
-
-
-def _format(arguments: DetectArguments, estimators: "Sequence[Estimator]") -> "ResultFormat | Detection3DArrays":
-    from curio_serve.batch.formats import Bop, Csv, JsonLines, bop_object_ids
-    from curio_serve.batch.sources import is_recording
-
-    if arguments.out is not None and is_recording(arguments.out):
-        are_flat = any(not estimator.spec.camera.camera_matrix for estimator in estimators)
-        if arguments.format != "jsonl" or not all(map(is_recording, arguments.images)) or are_flat:
-            raise UsageError(
-                f"--out {arguments.out} writes vision_msgs/Detection3DArray: for poses in space, images of recordings "
-                "(.mcap) alone, and no --format"
-            )
-        from curio_serve.batch.recorded_poses import Detection3DArrays
-
-        return Detection3DArrays([kind for estimator in estimators for kind in estimator.spec.objects])
-    if arguments.format == "jsonl":
-        return JsonLines()
-    if arguments.format == "csv":
-        return Csv()
-    for estimator in estimators:
-        if not estimator.spec.camera.camera_matrix:
-            raise UsageError(f"--format bop is for poses in space; the model's world {estimator.spec.world!r} is flat")
-    names = dict.fromkeys(kind.name for estimator in estimators for kind in estimator.spec.objects)
-    return Bop(bop_object_ids(list(names), arguments.obj_id))
 
 
 def _how_to_go_on(arguments: DetectArguments) -> str:

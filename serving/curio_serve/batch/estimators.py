@@ -17,8 +17,8 @@ import numpy as np
 from curio_proto.v1.detector_pb2 import Detection, DetectResponse, RegionResult, Tracking
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 
-from curio_serve.batch.formats import ImageResult
-from curio_serve.batch.sources import SourceImage
+from curio_serve.batch.images.source_image import SourceImage
+from curio_serve.batch.results.formats import ImageResult
 from curio_serve.errors import ArgumentError, CameraError, ImageError, InternalError, OutputError
 from curio_serve.imaging import image as images
 from curio_serve.imaging.camera import PinholeCamera

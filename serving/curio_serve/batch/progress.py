@@ -4,7 +4,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Self
 
-from curio_serve.batch.formats import ImageLines
+from curio_serve.batch.results.formats import ImageLines
 
 if TYPE_CHECKING:
     from curio_serve.batch.progress_bar import Bar

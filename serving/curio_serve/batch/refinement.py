@@ -16,7 +16,7 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_serve.batch.arguments import DetectArguments
 from curio_serve.batch.estimators import Estimator, Seen
-from curio_serve.batch.sources import SourceImage
+from curio_serve.batch.images.source_image import SourceImage
 from curio_serve.errors import UsageError
 from curio_serve.imaging.camera import PinholeCamera
 

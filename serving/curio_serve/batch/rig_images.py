@@ -13,12 +13,13 @@ from pathlib import Path
 from curio_proto.v1.detector_pb2 import DetectResponse
 
 from curio_serve.batch.arguments import DetectArguments
-from curio_serve.batch.formats import ImageLines, ImageResult, JsonLines
-from curio_serve.batch.parallel import in_order
+from curio_serve.batch.images.parallel import in_order
+from curio_serve.batch.images.remote_files import is_url
+from curio_serve.batch.images.source_image import SourceImage
+from curio_serve.batch.images.sources import PassedOver, images
 from curio_serve.batch.progress import Progress
-from curio_serve.batch.remote_files import is_url
-from curio_serve.batch.result_file import ResultFile
-from curio_serve.batch.sources import PassedOver, SourceImage, images
+from curio_serve.batch.results.formats import ImageLines, ImageResult, JsonLines
+from curio_serve.batch.results.result_file import ResultFile
 from curio_serve.errors import ArgumentError, CameraError, ImageError, InternalError, UsageError
 from curio_serve.imaging import image as decoding
 from curio_serve.models.detector import Detector

@@ -11,10 +11,10 @@ from curio_serve.errors import UsageError
 from curio_serve.tracking.follower import MAX_OBJECTS
 
 if TYPE_CHECKING:
-    from curio_serve.batch.recorded_poses import PoseRecording
-    from curio_serve.batch.result_file import ResultFile
-    from curio_serve.batch.result_parts import ResultParts
-    from curio_serve.batch.sources import SourceImage
+    from curio_serve.batch.images.source_image import SourceImage
+    from curio_serve.batch.results.recorded_poses import PoseRecording
+    from curio_serve.batch.results.result_file import ResultFile
+    from curio_serve.batch.results.result_parts import ResultParts
 
 
 def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectArguments:

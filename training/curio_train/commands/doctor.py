@@ -9,8 +9,8 @@ from typing import Literal
 
 from rich.console import Console
 
-from curio_train.commands.field_help import parsed
-from curio_train.commands.running import CACHE, answer
+from curio_train.commands.command_line.field_help import parsed
+from curio_train.commands.command_line.running import CACHE, answer
 from curio_train.errors import UsageError
 
 

@@ -10,9 +10,9 @@ from typing import Annotated, Literal
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from curio_train.commands.field_help import parsed
+from curio_train.commands.command_line.field_help import parsed
+from curio_train.commands.command_line.running import CACHE, answer, tell, warn
 from curio_train.commands.linemod_data import fetched_linemod
-from curio_train.commands.running import CACHE, answer, tell, warn
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def evaluate(arguments: Sequence[str] | None = None) -> None:
 
 def _evaluate(command: EvaluateCommand) -> int:
     from curio_train.evaluation.evaluate import evaluate
-    from curio_train.evaluation.tables import print_evaluation
+    from curio_train.evaluation.reporting.tables import print_evaluation
 
     if command.download and command.data is None:
         command = replace(command, data=fetched_linemod(command.cache, tell, ask=False, frames=True))

@@ -10,8 +10,8 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from curio_train.commands.field_help import parsed
-from curio_train.commands.running import CACHE, answer
+from curio_train.commands.command_line.field_help import parsed
+from curio_train.commands.command_line.running import CACHE, answer
 from curio_train.errors import CurioError, UsageError
 
 

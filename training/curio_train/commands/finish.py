@@ -26,7 +26,7 @@ def end(run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None]) 
     Raises:
         ExportError: No model could be made. The run is whole.
     """
-    from curio_train.evaluation.report import REPORT_FILE, report_training
+    from curio_train.evaluation.reporting.report import REPORT_FILE, report_training
 
     verdict = ""
     try:

@@ -98,7 +98,7 @@ def _refuse_unreadable(options: LinemodOptions) -> None:
         return
     from curio_train.data.bop import BopDataset
     from curio_train.data.photographs import Photographs, read_frame
-    from curio_train.worlds.single_object.linemod import read_camera_poses
+    from curio_train.worlds.linemod import read_camera_poses
 
     camera = BopDataset(options.data).camera
     paths = Photographs(options.photos).paths

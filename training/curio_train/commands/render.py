@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from curio_train.commands.field_help import parsed
-from curio_train.commands.running import answer
+from curio_train.commands.command_line.field_help import parsed
+from curio_train.commands.command_line.running import answer
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from curio_serve.version import answer_version
 from tyro.conf import OmitArgPrefixes
 
 from curio_train.capture.options import AssistantCommand, CalibrateCommand
-from curio_train.commands.field_help import join_help_lines, parsed
-from curio_train.commands.project_file import with_project
-from curio_train.commands.running import CACHE, answer, tell, warn
-from curio_train.commands.short_help import FLAG_ALL, print_short_help
+from curio_train.commands.command_line.field_help import join_help_lines, parsed
+from curio_train.commands.command_line.project_file import with_project
+from curio_train.commands.command_line.running import CACHE, answer, tell, warn
+from curio_train.commands.command_line.short_help import FLAG_ALL, print_short_help
 from curio_train.config import NetworkConfig, Preset, Recipe, RunConfig, WorldOptions, preset_recipe
 from curio_train.errors import UsageError, nearest
 from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
@@ -71,7 +71,7 @@ def _calibrate(command: CalibrateCommand) -> int:
     from curio_train.commands.calibrate import run
 
     def by_objects(structure: "Structure", models: Path, data: Path | None) -> "tuple[Structure, str]":
-        from curio_train.evaluation.scene_scale import scale_by_objects
+        from curio_train.evaluation.unlabelled.scene_scale import scale_by_objects
 
         return scale_by_objects(structure, models, data, tell)
 
@@ -169,8 +169,8 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_train.commands.finish import end
     from curio_train.commands.prepare import prepared, with_kept_meshes
     from curio_train.learning.loop import Outcome
-    from curio_train.learning.runs.session import learn
     from curio_train.learning.runs.without_training import draw_templates
+    from curio_train.learning.session import learn
 
     session = command.session
     config = command.config if session.resume else prepared(command.config, session.cache, warn, tell)

@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from curio_train.commands.field_help import parsed
-from curio_train.commands.running import CACHE, answer, tell
+from curio_train.commands.command_line.field_help import parsed
+from curio_train.commands.command_line.running import CACHE, answer, tell
 from curio_train.errors import UsageError
 
 

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from curio_train.errors import DataError, ReportError, UsageError
-from curio_train.evaluation.photographed import judge
 from curio_train.evaluation.real_frames import evaluate_real_frames
-from curio_train.evaluation.report import write_report
+from curio_train.evaluation.reporting.report import write_report
 from curio_train.evaluation.results import keep
 from curio_train.evaluation.scores import add_errors, pose_scores, scene_errors, scene_scores
 from curio_train.evaluation.several_objects import several_objects_scores
 from curio_train.evaluation.subject import Predict, Subject, load_subject
+from curio_train.evaluation.unlabelled.photographed import judge
 from curio_train.export.card import EVALUATION_FILE
 from curio_train.learning.runs.configuration import CONFIG_FILE, world_name
 from curio_train.learning.runs.initial import uses_synthetic_labels

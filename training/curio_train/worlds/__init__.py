@@ -23,8 +23,8 @@ _REGISTRY: dict[str, tuple[type[WorldOptions], str]] = {
     "varied": (_options.VariedOptions, "generated.varied"),
     "multi": (_options.MultiOptions, "generated.multi"),
     "light": (_options.LightOptions, "generated.light"),
-    "linemod": (_options.LinemodOptions, "single_object.linemod"),
-    "capture": (_options.CaptureOptions, "single_object.capture"),
+    "linemod": (_options.LinemodOptions, "linemod"),
+    "capture": (_options.CaptureOptions, "capture"),
 }
 
 WORLDS: dict[str, type[WorldOptions]] = {name: kind for name, (kind, _) in _REGISTRY.items()}

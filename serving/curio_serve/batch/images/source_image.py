@@ -1,0 +1,98 @@
+"""An image as the commands pass it along: from a file, from a video or from a robot's recording."""
+
+import os
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from curio_serve.batch.images.remote_files import files_of, is_url, path_of
+from curio_serve.errors import ImageError
+from curio_serve.files import read_file
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.image import MAX_FILE_BYTES
+
+Pixels: TypeAlias = np.ndarray
+
+
+@dataclass(frozen=True)
+class Topics:
+    """What to read of a recording."""
+
+    image: str | None = None
+    """Topic of the images; None: the only one there is."""
+    info: str | None = None
+    """Topic of their CameraInfo; None: by ROS's naming, beside the images."""
+
+
+@dataclass(frozen=True)
+class RecordedAt:
+    """Where and when a robot's recording has an image."""
+
+    topic: str
+    """Topic of the image."""
+    stamp_ns: int
+    """The camera's own, of the image's header, since the epoch."""
+    log_time_ns: int
+    """When the image was recorded."""
+    frame_id: str
+    """Of the camera's optical frame."""
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """An image that is going to be looked at."""
+
+    name: str
+    """Its path as given; a video's frames are ``clip.mp4#0`` and so on, a recording's ``run.mcap#/topic@SECONDS``."""
+    path: str
+    """The file it comes from."""
+    video_frame: int | None = None
+    """Its number in a video; None for an image file."""
+    pixels: Pixels | None = None
+    """Uint8 RGB [height, width, 3] of a video's frame or a recording's raw image."""
+    data: bytes | None = None
+    """Content of a recording's compressed image."""
+    camera: PinholeCamera | None = None
+    """Its own camera, which a recording knows."""
+    no_camera: str = ""
+    """Why a recording does not."""
+    recorded: RecordedAt | None = None
+    """For an image of a recording."""
+    error: str = ""
+    """Why a video has no frames to give, or a folder no images."""
+    time_s: float | None = None
+    """When a video's frame was taken, since its first, where that is known."""
+
+    def read(self) -> bytes:
+        """The bytes of an image file.
+
+        Raises:
+            ImageError: The file cannot be read, is no regular file or too large, or there is none.
+            Unavailable: The object store that it lies in does not answer.
+        """
+        if self.error:
+            raise ImageError(self.error)
+        if self.data is not None:
+            return self.data
+        if is_url(self.path):
+            return files_of(self.path).read(self.path, MAX_FILE_BYTES)
+        try:
+            return read_file(self.path, MAX_FILE_BYTES)
+        except (OSError, ValueError) as exc:  # ValueError: a null byte in the name
+            reason = exc.strerror if isinstance(exc, OSError) else str(exc)
+            raise ImageError(f"cannot be read: {reason}") from exc
+
+    @property
+    def stream(self) -> str:
+        """The video or recording, or the folder whose images are frames of one camera in order."""
+        return os.path.dirname(self.path) if self.video_frame is None and self.recorded is None else self.path
+
+    @property
+    def relative_name(self) -> str:
+        """The path in which a file of its own, such as a drawing, may be kept apart from all others'."""
+        if self.recorded is not None:
+            return os.path.join(self.path, self.recorded.topic.strip("/"), f"{self.recorded.stamp_ns:019d}.jpg")
+        if is_url(self.path):
+            return path_of(self.path)
+        return self.path if self.video_frame is None else os.path.join(self.path, f"{self.video_frame:06d}.jpg")

@@ -1,0 +1,65 @@
+"""Where the results of a call go, and in which format."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from curio_serve.batch.arguments import DetectArguments
+from curio_serve.batch.estimators import Estimator
+from curio_serve.batch.images.remote_files import is_url
+from curio_serve.batch.images.sources import is_recording
+from curio_serve.batch.results.formats import Bop, Csv, JsonLines, ResultFormat, bop_object_ids
+from curio_serve.batch.results.result_file import ResultFile
+from curio_serve.batch.results.result_parts import ResultParts
+from curio_serve.errors import UsageError
+
+if TYPE_CHECKING:
+    from curio_serve.batch.results.recorded_poses import Detection3DArrays, PoseRecording
+
+
+def result_format(arguments: DetectArguments, estimators: Sequence[Estimator]) -> "ResultFormat | Detection3DArrays":
+    """The format of the results.
+
+    Raises:
+        UsageError: The call or a model does not fit the format.
+    """
+    if arguments.out is not None and is_recording(arguments.out):
+        are_flat = any(not estimator.spec.camera.camera_matrix for estimator in estimators)
+        if arguments.format != "jsonl" or not all(map(is_recording, arguments.images)) or are_flat:
+            raise UsageError(
+                f"--out {arguments.out} writes vision_msgs/Detection3DArray: for poses in space, images of recordings "
+                "(.mcap) alone, and no --format"
+            )
+        from curio_serve.batch.results.recorded_poses import Detection3DArrays
+
+        return Detection3DArrays([kind for estimator in estimators for kind in estimator.spec.objects])
+    if arguments.format == "jsonl":
+        return JsonLines()
+    if arguments.format == "csv":
+        return Csv()
+    for estimator in estimators:
+        if not estimator.spec.camera.camera_matrix:
+            raise UsageError(f"--format bop is for poses in space; the model's world {estimator.spec.world!r} is flat")
+    names = dict.fromkeys(kind.name for estimator in estimators for kind in estimator.spec.objects)
+    return Bop(bop_object_ids(list(names), arguments.obj_id))
+
+
+def open_output(
+    arguments: DetectArguments, form: "ResultFormat | Detection3DArrays", estimators: Sequence[Estimator]
+) -> "ResultFile | ResultParts | PoseRecording":
+    """Open the file or folder that ``--out`` names, or standard output.
+
+    Raises:
+        UsageError: It holds something else, or results of another call.
+        OutputError: It cannot be written.
+    """
+    if isinstance(form, ResultFormat):
+        names = [(estimator.name, estimator.version) for estimator in estimators]
+        if arguments.out is not None and is_url(arguments.out):
+            return ResultParts(arguments.out, form, names, overwrite=arguments.overwrite)
+        path = None if arguments.out is None else Path(arguments.out)
+        return ResultFile(path, form, names, overwrite=arguments.overwrite)
+    from curio_serve.batch.results.recorded_poses import PoseRecording  # of an extra
+
+    assert arguments.out is not None
+    return PoseRecording(Path(arguments.out), overwrite=arguments.overwrite)

@@ -1,0 +1,300 @@
+"""What a detection looks like as JSON Lines, CSV and BOP results, and how such lines are read back after a stop.
+
+Each format knows four things: the line the file opens with, the lines of one image, how those lines name the image, and
+what one line says. Where several models are run, an image has the lines of each, in the order of the models. The file
+itself is :mod:`curio_serve.batch.results.result_file`'s.
+"""
+
+import csv
+import io
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import PurePath
+
+from curio_proto.v1.detector_pb2 import Detection, RegionResult
+
+from curio_serve.batch.images.source_image import RecordedAt
+from curio_serve.batch.results.detection_json import STATUS, detection_json, finite, rows
+from curio_serve.bop import LINEMOD_IDS
+from curio_serve.errors import UsageError
+
+
+@dataclass(frozen=True)
+class ImageResult:
+    """The detections of one image, or its error."""
+
+    image: str
+    """Its path as given."""
+    model: str
+    """Name of the model."""
+    version: int
+    """Of the model."""
+    width: int | None = None
+    """Of the decoded frame in pixels; None where it could not be decoded. Likewise ``height``."""
+    height: int | None = None
+    camera_matrix: Sequence[float] = ()
+    """K that was used, 9 values row-major; empty without one."""
+    results: Sequence[RegionResult] = field(default_factory=tuple)
+    """What the model found; empty where ``error`` is not."""
+    decode_ms: float | None = None
+    """Bytes to pixels."""
+    inference_ms: float | None = None
+    """Pixels to detections."""
+    error: str = ""
+    """Why there is no answer."""
+    is_turned: bool = False
+    """EXIF asks for a rotation that was not applied."""
+    recorded: RecordedAt | None = None
+    """For an image of a robot's recording."""
+    views: Sequence[str] = ()
+    """Images of all cameras of a rig; poses are then in the rig's frame."""
+
+    @property
+    def detections(self) -> list[Detection]:
+        return [detection for result in self.results for detection in result.detections]
+
+    @property
+    def light(self) -> list[float]:
+        """[3] towards the light, camera frame; empty where the world has none."""
+        return next((list(result.light) for result in self.results if result.light), [])
+
+
+@dataclass(frozen=True)
+class ImageLines:
+    """The lines of a result file that belong to one image."""
+
+    image: str
+    """Its path as given."""
+    error: str
+    """Why there is no answer."""
+    data: bytes
+    """The lines, each with its newline."""
+    is_turned: bool = False
+    """EXIF asks for a rotation that was not applied."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of an existing result file."""
+
+    key: str
+    """Names the image, see :meth:`ResultFormat.key`."""
+    opens_image: bool
+    """The first line of its image."""
+    model: tuple[str, int] | None = None
+    """(name, version), where the format says it."""
+    is_error: bool = False
+    """The image had no answer."""
+
+
+class ResultFormat(ABC):
+    """A way to write results down, line by line."""
+
+    opening: bytes
+    """What every file of this format begins with."""
+    header: bytes = b""
+    """The opening that is a line of its own, or nothing."""
+    has_line_for_every_image: bool = True
+    """Also for one without detections."""
+    is_one_line_an_image: bool = False
+    """A complete line is then all that one model has to say about an image."""
+
+    def lines(self, results: Sequence[ImageResult]) -> ImageLines:
+        """Format the lines of an image, those of one model after those of another."""
+        errors = dict.fromkeys(result.error for result in results if result.error)
+        is_turned = any(result.is_turned for result in results)
+        return ImageLines(results[0].image, "; ".join(errors), b"".join(map(self.encode, results)), is_turned)
+
+    @abstractmethod
+    def encode(self, result: ImageResult) -> bytes:
+        """The lines of one model about one image, each with its newline."""
+
+    @abstractmethod
+    def key(self, image: str) -> str:
+        """The name of an image in lines of this format."""
+
+    @abstractmethod
+    def parse(self, line: bytes) -> Line:
+        """Reads a line back.
+
+        Raises:
+            ValueError: The line is not of this format.
+        """
+
+
+class JsonLines(ResultFormat):
+    """One JSON object an image, always with the same keys; ``error`` stands in place of ``detections``.
+
+    What does not apply (the rotation of a flat object, the size of what is no image) is null.
+    """
+
+    opening = b'{"image": '
+    is_one_line_an_image = True
+
+    def encode(self, result: ImageResult) -> bytes:
+        answer: dict[str, object] = {"detections": [detection_json(detection) for detection in result.detections]}
+        record = {
+            "image": result.image,
+            **({"views": list(result.views)} if result.views else {}),
+            "width": result.width,
+            "height": result.height,
+            "camera_matrix": rows(result.camera_matrix, 3) or None,
+            **({"error": result.error} if result.error else answer),
+            "light": result.light or None,
+            "model": {"name": result.model, "version": result.version},
+            "milliseconds": {"decode": _rounded(result.decode_ms), "inference": _rounded(result.inference_ms)},
+        }
+        return json.dumps(record, allow_nan=False).encode() + b"\n"
+
+    def key(self, image: str) -> str:
+        return image
+
+    def parse(self, line: bytes) -> Line:
+        record = json.loads(line)
+        try:
+            model = (record["model"]["name"], record["model"]["version"])
+            return Line(record["image"], opens_image=True, model=model, is_error="error" in record)
+        except (KeyError, TypeError) as exc:
+            raise ValueError("no image or model in it") from exc
+
+
+class Csv(ResultFormat):
+    """One row a detection, and one with empty fields for an image without any."""
+
+    columns = (
+        *("image", "width", "height", "model", "version", "detection", "object", "confidence"),
+        *("x_m", "y_m", "z_m", "r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33"),
+        *("qx", "qy", "qz", "qw", "red", "green", "blue"),
+        *(f"box_{axis}{corner}_px" for corner in range(8) for axis in "uv"),
+        *("light_x", "light_y", "light_z", "decode_ms", "inference_ms", "error"),
+        *("outside_trained_range", "status"),
+    )
+    opening = header = (",".join(columns) + "\n").encode()
+
+    def encode(self, result: ImageResult) -> bytes:
+        text = io.StringIO()
+        rows = csv.writer(text, lineterminator="\n")
+        start = (self.key(result.image), result.width, result.height, result.model, result.version)
+        error = " ".join(result.error.split())
+        end = (*_padded(result.light, 3), _rounded(result.decode_ms), _rounded(result.inference_ms), error)
+        for index, detection in enumerate(result.detections or [None]):
+            rows.writerow((*start, index, *_detection_cells(detection), *end, *_last_cells(detection)))
+        return text.getvalue().encode(errors="surrogateescape")
+
+    def key(self, image: str) -> str:
+        # one line a row, also for a file name that has a line break in it
+        return image.replace("\r", "\\r").replace("\n", "\\n")
+
+    def parse(self, line: bytes) -> Line:
+        try:
+            cells = next(csv.reader([line.decode(errors="surrogateescape")]))
+        except csv.Error as exc:
+            raise ValueError(str(exc)) from exc
+        row = dict(zip(self.columns, cells, strict=True))
+        model = (row["model"], int(row["version"]))
+        return Line(row["image"], opens_image=int(row["detection"]) == 0, model=model, is_error=bool(row["error"]))
+
+
+class Bop(ResultFormat):
+    """The result file of the BOP challenge: one row a detection, millimetres, nothing for an image without any.
+
+    The format names neither the image's path nor the model. Scene and image come from the path, which must be BOP's own
+    ``<scene>/rgb/<image>.png``; the time of a row is that of its whole image, as the challenge asks.
+
+    Args:
+        object_ids: BOP's number of every object that the model can find.
+    """
+
+    opening = header = b"scene_id,im_id,obj_id,score,R,t,time\n"
+    has_line_for_every_image = False
+
+    def __init__(self, object_ids: Mapping[str, int]) -> None:
+        self._object_ids = dict(object_ids)
+
+    def encode(self, result: ImageResult) -> bytes:
+        key = self.key(result.image)
+        seconds = ((result.decode_ms or 0.0) + (result.inference_ms or 0.0)) / 1000
+        rows = []
+        for detection in result.detections:
+            rotation = " ".join(f"{value:.9g}" for value in detection.rotation)
+            translation_mm = " ".join(f"{1000 * value:.9g}" for value in detection.translation_m)
+            score, number = f"{detection.confidence:.7g}", self._object_ids[detection.object]
+            rows.append(f"{key},{number},{score},{rotation},{translation_mm},{seconds:.6f}\n")
+        return "".join(rows).encode()
+
+    def key(self, image: str) -> str:
+        """``scene,image``.
+
+        Raises:
+            UsageError: The path has no such numbers in it.
+        """
+        path = PurePath(image)
+        folders = path.parent.parts
+        if len(folders) < 2 or not (folders[-2].isdecimal() and path.stem.isdecimal()):
+            raise UsageError(
+                f"--format bop: {image!r} does not say its scene and image; expected <scene>/rgb/<image>.png as BOP "
+                "lays them out, with numbers for both. Use --format jsonl or csv for other folders."
+            )
+        return f"{int(folders[-2])},{int(path.stem)}"
+
+    def parse(self, line: bytes) -> Line:
+        scene, image, number, *rest = line.decode("ascii").split(",")
+        if len(rest) != 4:
+            raise ValueError(f"{3 + len(rest)} columns")
+        if int(number) not in self._object_ids.values():
+            raise ValueError(f"object id {number}, which this model does not find")
+        # the format has no mark for the first row of an image: the file's reader sees the key change
+        return Line(f"{int(scene)},{int(image)}", opens_image=False)
+
+
+def bop_object_ids(objects: Sequence[str], given: int | None) -> dict[str, int]:
+    """BOP's number of each object of a model.
+
+    Args:
+        objects: Names in the model's spec.
+        given: What ``--obj-id`` says; None: look the names up among LineMOD's classes.
+
+    Raises:
+        UsageError: A number is missing, or one was given for several objects.
+    """
+    if given is not None:
+        if len(objects) != 1:
+            raise UsageError(f"--obj-id {given} names one object, the model finds {len(objects)}: {', '.join(objects)}")
+        return {objects[0]: given}
+    unknown = [name for name in objects if name not in LINEMOD_IDS]
+    if unknown:
+        raise UsageError(
+            f"--format bop needs the object id of {', '.join(unknown)}: expected a LineMOD class "
+            f"({', '.join(LINEMOD_IDS)}) or --obj-id NUMBER"
+        )
+    return {name: LINEMOD_IDS[name] for name in objects}
+
+
+def _detection_cells(detection: Detection | None) -> Iterator[object]:
+    """The columns of one detection; empty for None."""
+    found = Detection() if detection is None else detection
+    yield found.object
+    yield "" if detection is None else round(found.confidence, 6)
+    yield from _padded(found.translation_m, 3)
+    yield from _padded(found.rotation, 9)
+    yield from _padded(found.quaternion_xyzw, 4)
+    yield from _padded(found.color, 3)
+    yield from _padded([finite(value) for value in found.box_px], 16)
+
+
+def _last_cells(detection: Detection | None) -> tuple[str, str]:
+    """The last columns, as JSON writes them; empty for None."""
+    if detection is None:
+        return "", ""
+    return json.dumps(detection.outside_trained_range), STATUS.get(detection.status, "")
+
+
+def _padded(values: Sequence[float | None], length: int) -> list[float | None]:
+    """The values, or that many empty cells where there are none."""
+    return list(values) or [None] * length
+
+
+def _rounded(milliseconds: float | None) -> float | None:
+    return None if milliseconds is None else round(milliseconds, 3)
