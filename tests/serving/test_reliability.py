@@ -15,6 +15,7 @@ from curio_serve.batch.detect_cli import run
 from curio_serve.client import PoseClient
 from curio_serve.errors import ModelError
 from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.view import PinholeFrame, Region
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
 from curio_serve.tracking.stream import FollowingStream
@@ -144,9 +145,37 @@ def test_json_lines_say_it(measured: Path, spot_image: Spot, tmp_path: Path) -> 
     assert "interval" not in unsure
 
 
+def test_a_calibrated_confidence_is_answered_and_judged(
+    measured: Path, start_server: Callable[..., object], spot_image: Spot
+) -> None:
+    """What a server answers went through the calibration; the network's outputs, which KServe gives, did not."""
+    pixels = _of_confidence(measured, spot_image, 0.1, 0.9)
+    before = _detect(measured, pixels).detections[0].confidence
+    _put(measured, RELIABILITY | {"calibration": [0.5, -1.0]})
+    expected = 1 / (1 + np.exp(-(0.5 * np.log(before / (1 - before)) - 1.0)))
+    server = start_server(measured.parent)
+    with PoseClient(server.address) as client:  # type: ignore[attr-defined]
+        (result,) = client.detect("pinhole", pixels, K).results
+    assert result.detections[0].confidence == pytest.approx(expected, abs=1e-5)
+    is_sure = result.detections[0].status == messages.DETECTION_STATUS_SURE
+    assert is_sure == (expected >= SURE)
+    assert not _detect(measured, pixels, min_confidence=float(expected) + 0.01).detections
+    assert open_model(measured).run(_canonical(measured, pixels))["confidence"][0, 0] == pytest.approx(before, abs=1e-5)
+
+
+def _canonical(folder: Path, pixels: np.ndarray) -> np.ndarray:
+    """The frame as the network's own camera takes it, [1, height, width, 3]."""
+    height, width = pixels.shape[:2]
+    frame = PinholeFrame(pixels, PinholeCamera(K), open_model(folder).camera, 1)
+    return frame.crop(Region(0, 0, width, height)).image[None]
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
+        ({"calibration": [0.0, 1.0]}, "impossible values"),
+        ({"calibration": [1.0]}, "impossible values"),
+        ({"calibration": [1.0, "NaN"]}, "impossible values"),
         ({"level": 1.5}, "impossible values"),
         ({"objects": [OF_SPOT | {"object": "cone"}]}, r"is about \['cone'\], the model finds \['spot'\]"),
         ({"objects": [OF_SPOT | {"bounds": BOUNDS[::-1]}]}, "impossible values"),

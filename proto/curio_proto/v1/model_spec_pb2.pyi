@@ -37,14 +37,22 @@ class ModelSpec(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., name: _Optional[str] = ..., world: _Optional[str] = ..., num_slots: _Optional[int] = ..., fields: _Optional[_Iterable[_Union[Field, _Mapping]]] = ..., objects: _Optional[_Iterable[_Union[ObjectModel, _Mapping]]] = ..., camera: _Optional[_Union[CanonicalCamera, _Mapping]] = ..., parity_max_abs_error: _Optional[float] = ..., recipe: _Optional[str] = ..., commit: _Optional[str] = ..., images_seen: _Optional[int] = ..., training_seconds: _Optional[float] = ..., reliability: _Optional[_Union[Reliability, _Mapping]] = ...) -> None: ...
 
 class Reliability(_message.Message):
-    __slots__ = ("level", "num_images", "objects")
+    __slots__ = ("level", "num_images", "objects", "num_photographs", "calibration", "position_widening", "rotation_widening")
     LEVEL_FIELD_NUMBER: _ClassVar[int]
     NUM_IMAGES_FIELD_NUMBER: _ClassVar[int]
     OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    NUM_PHOTOGRAPHS_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_FIELD_NUMBER: _ClassVar[int]
+    POSITION_WIDENING_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_WIDENING_FIELD_NUMBER: _ClassVar[int]
     level: float
     num_images: int
     objects: _containers.RepeatedCompositeFieldContainer[ObjectReliability]
-    def __init__(self, level: _Optional[float] = ..., num_images: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectReliability, _Mapping]]] = ...) -> None: ...
+    num_photographs: int
+    calibration: _containers.RepeatedScalarFieldContainer[float]
+    position_widening: float
+    rotation_widening: float
+    def __init__(self, level: _Optional[float] = ..., num_images: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectReliability, _Mapping]]] = ..., num_photographs: _Optional[int] = ..., calibration: _Optional[_Iterable[float]] = ..., position_widening: _Optional[float] = ..., rotation_widening: _Optional[float] = ...) -> None: ...
 
 class ObjectReliability(_message.Message):
     __slots__ = ("object", "min_confidence", "bounds")

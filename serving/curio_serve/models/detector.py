@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,9 +18,10 @@ from curio_serve.errors import ArgumentError, CameraError, CameraMissing, ImageE
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
+from curio_serve.models.crop_stage import CropPose
 from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Values
 from curio_serve.models.model import Model, Slot
-from curio_serve.models.reliability import add_interval, region_status, status_of
+from curio_serve.models.reliability import add_interval, calibrated, region_status, status_of
 
 if TYPE_CHECKING:
     from google.protobuf.internal.containers import RepeatedCompositeFieldContainer
@@ -50,6 +52,7 @@ class Detector:
     def __init__(self, model: Model) -> None:
         self.model = model
         self.depths_m = trained_depths_m(model.spec)
+        self._calibration = tuple(model.spec.reliability.calibration)
 
     def detect(
         self,
@@ -138,7 +141,25 @@ class Detector:
             found = self.model.run(batch[0][None] if len(batch) == 1 else np.stack(batch))
             rows = zip(*[value.tolist() for value in found.values()], strict=True)
             outputs += [dict(zip(found, row, strict=True)) for row in rows]
+        for values in outputs:
+            if "confidence" in values:
+                values["confidence"] = [calibrated(self._calibration, value) for value in values["confidence"]]
         return outputs
+
+    def read_crops(self, pixels: Array, camera: PinholeCamera, position_m: Array) -> CropPose:
+        """The pose of the one object of a model with a crop-pose stage, in crops around a position.
+
+        Args:
+            pixels: uint8 RGB [height, width, 3].
+            camera: That took them.
+            position_m: Where the object is expected [3], frame's camera, in front of it.
+
+        Raises:
+            InternalError: The network failed.
+        """
+        assert self.model.crop_stage is not None
+        pose = self.model.crop_stage.read(pixels, camera, position_m, self.model.camera.focal_lengths[0])
+        return replace(pose, confidence=calibrated(self._calibration, pose.confidence))
 
     def reduction(self, camera: PinholeCamera | None, width: int, height: int) -> int:
         """How much smaller a frame may be decoded (1, 2, 4, 8) without going below the model's own resolution.

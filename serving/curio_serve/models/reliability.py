@@ -1,8 +1,8 @@
 """How far a model's answers may be trusted, as measured on renderings and stored beside the model.
 
 ``reliability.json`` holds a ``Reliability`` message: for each object the confidence from which an answer counts as
-sure, and bounds of the pose error by confidence (split conformal prediction). Models without the file answer as they
-did, with neither a status nor intervals.
+sure, and bounds of the pose error by confidence (split conformal prediction). Photographs may have adjusted both, and
+the confidence itself. Models without the file answer as they did, with neither a status nor intervals.
 """
 
 import math
@@ -26,6 +26,7 @@ from google.protobuf import json_format
 from curio_serve.errors import ModelError
 
 RELIABILITY_FILE = "reliability.json"
+_LEAST, _MOST_LOGIT = 1e-9, 60.0  # nearer to 0 and 1 logits say nothing
 
 
 def parse_reliability(text: bytes, objects: Sequence[str], where: str) -> Reliability:
@@ -48,7 +49,7 @@ def parse_reliability(text: bytes, objects: Sequence[str], where: str) -> Reliab
             f"{where} is about {sorted(one.object for one in found.objects)}, the model finds {sorted(objects)}; "
             "write it again with curio-export --intervals"
         )
-    if not 0 < found.level < 1 or not all(map(_is_possible, found.objects)):
+    if not 0 < found.level < 1 or not _is_calibration(found.calibration) or not all(map(_is_possible, found.objects)):
         raise ModelError(f"{where} has impossible values; write it again with curio-export --intervals")
     return found
 
@@ -64,6 +65,26 @@ def _is_possible(one: ObjectReliability) -> bool:
         and starts == sorted(starts)
         and (not starts or starts[0] <= one.min_confidence)
     )
+
+
+def _is_calibration(values: Sequence[float]) -> bool:
+    """Whether these are a weight above 0 and an offset, or none."""
+    return not values or (len(values) == 2 and all(map(math.isfinite, values)) and values[0] > 0)
+
+
+def calibrated(calibration: Sequence[float], confidence: float) -> float:
+    """The confidence that is answered.
+
+    Args:
+        calibration: Weight and offset of the logit, see ``Reliability``; none: it is answered as it is.
+        confidence: That the network gives, in [0, 1].
+    """
+    if not calibration:
+        return confidence
+    weight, offset = calibration
+    inside = min(max(confidence, _LEAST), 1 - _LEAST)
+    logit = weight * math.log(inside / (1 - inside)) + offset
+    return 1 / (1 + math.exp(-min(max(logit, -_MOST_LOGIT), _MOST_LOGIT)))
 
 
 def bounds_of(one: ObjectReliability, confidence: float) -> PoseBounds | None:

@@ -153,9 +153,7 @@ def _read_again(
             if not stage.sees(view.camera, in_cam, *view.size):
                 continue
             before_run()
-            pose = stage.read(
-                view.pixels, view.camera.reduced(view.reduction), in_cam, detector.model.camera.focal_lengths[0]
-            )
+            pose = detector.read_crops(view.pixels, view.camera.reduced(view.reduction), in_cam)
             if pose.confidence >= _READ_AGAIN:
                 floor = np.eye(3) * (_LEAST_SPREAD * kind.diameter_m) ** 2
                 covariance = pose.position_covariance_m2 + floor

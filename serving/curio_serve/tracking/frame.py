@@ -82,7 +82,7 @@ class StreamFrame:
         if stage is None or camera is None or not stage.sees(camera, position_m, width, height):
             return None
         self.before_run()
-        pose = stage.read(self.pixels, camera, position_m, self.detector.model.camera.focal_lengths[0])
+        pose = self.detector.read_crops(self.pixels, camera, position_m)
         return pose if pose.translation_m[2] > 0 else None
 
     def add_detection(

@@ -63,13 +63,12 @@ class CameraPoseFile:
         Raises:
             CameraError: The file has none, or it is not rigid.
         """
-        entry = self._entry(photograph)
-        if "cam_from_world" not in entry:
+        if not self.is_known(photograph):
             raise CameraError(
                 f"{self.flag} {self.file}: has no pose of {photograph.name}, only of {', '.join([*self.entries][:5])}. "
                 "Photographs are named by their path from that file's folder, or by their file name"
             )
-        return _rigid(entry["cam_from_world"], self._where(photograph))
+        return _rigid(self._entry(photograph)["cam_from_world"], self._where(photograph))
 
     def pose_above_plane(self, photograph: Path) -> np.ndarray:
         """The same of a camera that has to be above the plane and look down on it.
@@ -87,6 +86,10 @@ class CameraPoseFile:
             )
         return matrix
 
+    def is_known(self, photograph: Path) -> bool:
+        """Whether the file has a pose of this photograph."""
+        return "cam_from_world" in self._entry(photograph)
+
     def in_metres(self, photograph: Path) -> bool:
         """Whether the file has a pose of this photograph in metres."""
         return self._entry(photograph).get("unit") == "m"
@@ -102,7 +105,7 @@ class CameraPoseFile:
         Raises:
             CameraError: Says how they differ.
         """
-        if "cam_from_world" not in self._entry(photograph):
+        if not self.is_known(photograph):
             return
         one, other = (self.pose_above_plane(path) for path in (photograph, background))
         tilt = float(np.degrees(np.arccos(np.clip(one[:3, 1] @ other[:3, 1], -1, 1))))

@@ -35,6 +35,10 @@ class ExportCommand:
     """Measure on renderings when answers are sure and how far off they are: 90 % intervals. Minutes."""
     data: Path | None = None
     """Data set of a LineMOD model's folder, for --intervals."""
+    photos: Path | None = None
+    """Folder of unlabelled photographs of a still scene, in order: --intervals adjusts to how its answers differ."""
+    views: Path | None = None
+    """File with the camera poses of --photos, as curio-train capture --calibrate --views-out writes it."""
     push: Annotated[str | None, arg(metavar="ORG/NAME")] = None
     """Put the model on a Hugging Face hub, where hf://ORG/NAME names it. A new repository is private."""
     license: str | None = None
@@ -52,6 +56,8 @@ def _export(command: ExportCommand) -> int:
         raise UsageError("--half and --int8 are two ways to store the same weights; give one of them")
     if command.push is None and command.license is not None:
         raise UsageError("--license is for the hub's card: give it together with --push")
+    if (command.photos is None) != (command.views is None) or (command.photos is not None and not command.intervals):
+        raise UsageError("--photos, --views and --intervals go together: photographs adjust what renderings measure")
     if command.push is None and not command.intervals:
         _write(command)
         return 0
@@ -92,22 +98,28 @@ def _push(folder: Path, repository: str, licence: str | None) -> None:
 def _measure(command: ExportCommand, folder: Path) -> None:
     """Measure the latest version of a model on renderings, and write what was found beside it."""
     from curio_train.evaluation.reliability import NUM_IMAGES, fit_reliability, held_out_answers
+    from curio_train.evaluation.self_consistency import adjusted, adjustment, photographed_pairs, read_views
     from curio_train.evaluation.subject import load_subject, model_reader
     from curio_train.export.folder import ModelFolder
     from curio_train.exported_model import ExportedModel, find_model
 
     world = load_subject(command.run, command.data).world
     predict = model_reader(ExportedModel.open(find_model(folder)), world)
-    with Console(stderr=True).status("") as status:
+    with Console(stderr=True).status("reading photographs") as status:
+        views = None if command.photos is None or command.views is None else read_views(command.photos, command.views)
+        pairs = None if views is None else photographed_pairs(world, predict, views)
         cache = command.cache.expanduser()
         answers = held_out_answers(world, predict, "validation", NUM_IMAGES, cache, status.update)
-    found, target = fit_reliability(answers), ModelFolder(folder)
+    on_renderings, target = fit_reliability(answers), ModelFolder(folder)
+    found = on_renderings if views is None else adjusted(on_renderings, answers, pairs or (), len(views.paths))
     path = target.put_reliability(target.versions()[-1], found)
-    for one, of in zip(found.objects, answers, strict=True):
+    for one, of, before in zip(found.objects, answers, on_renderings.objects, strict=True):
         print(
             f"{path}: {one.object} is sure from a confidence of {one.min_confidence:.2g}, as in "
-            f"{(of.confidences >= one.min_confidence).mean():.0%} of {len(of.confidences)} renderings that show it"
+            f"{(of.confidences >= before.min_confidence).mean():.0%} of {len(of.confidences)} renderings that show it"
         )
+    if views is not None:
+        print(adjustment(found))
 
 
 def _write(command: ExportCommand) -> Path:

@@ -9,6 +9,8 @@ from scipy.stats import rankdata
 
 NUM_BINS = 10
 _REGULARISATION = 1e-4
+_PAIR_REGULARISATION = 1e-3  # towards the confidence as it is: pairs say less than truth does
+_LEAST_WEIGHT = 0.1  # surer answers stay surer
 
 
 def calibration_error(confidences: Sequence[float], correct: Sequence[bool]) -> float:
@@ -80,6 +82,33 @@ def fit_calibration(features: ArrayLike, correct: Sequence[bool]) -> list[float]
     bounds = [(0.0, None)] * (len(start) - 1) + [(None, None)]
     weights: list[float] = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x.tolist()
     return weights
+
+
+def fit_pair_calibration(logits: ArrayLike, agree: Sequence[bool]) -> tuple[float, float]:
+    """A calibration of confidence by answers that are compared with each other, without any truth.
+
+    Two answers about one pose agree where both are correct, and hardly ever else: with independent errors this has the
+    product of their probabilities. Weight and offset of the logit are those of the greatest likelihood. What all
+    answers get wrong alike is not seen.
+
+    Args:
+        logits: [pairs, 2], of the two answers' confidences.
+        agree: Whether the two say the same pose.
+
+    Returns:
+        The weight, above 0, and the offset.
+    """
+    found, hits = np.asarray(logits, dtype=np.float64), np.asarray(agree, dtype=np.float64)
+    start = np.array([1.0, 0.0])
+
+    def loss(weights: np.ndarray) -> float:
+        both = -np.logaddexp(0, -(weights[0] * found + weights[1])).sum(axis=1)  # log of the product
+        both = np.minimum(both, -1e-9)
+        likelihood = hits * both + (1 - hits) * np.log(-np.expm1(both))
+        return float(_PAIR_REGULARISATION * np.square(weights - start).sum() - likelihood.mean())
+
+    weight, offset = minimize(loss, start, method="L-BFGS-B", bounds=[(_LEAST_WEIGHT, None), (None, None)]).x.tolist()
+    return weight, offset
 
 
 def auroc(with_object: Sequence[float], without: Sequence[float]) -> float:

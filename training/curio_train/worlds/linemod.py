@@ -77,20 +77,29 @@ class LinemodPhotographs:
         return CameraPoses(matrices)
 
 
-def read_camera_poses(file: Path, paths: Sequence[Path]) -> CameraPoses:
-    """Camera poses of photographs, in metres, from a file of ``--views-out``.
+def read_camera_poses(file: Path, paths: Sequence[Path], *, any_unit: bool = False) -> CameraPoses:
+    """Camera poses of photographs from a file of ``--views-out``.
+
+    Args:
+        file: Its path.
+        paths: The photographs.
+        any_unit: Poses of no known unit will do where none is in metres.
 
     Raises:
-        CameraError: The file cannot be read, has no pose of these photographs in metres, or a pose is not rigid.
+        CameraError: The file cannot be read, has no such pose of these photographs, or a pose is not rigid.
     """
     poses = CameraPoseFile.read(file, "--views")
+    in_metres = not any_unit or any(map(poses.in_metres, paths))
+    is_known = poses.in_metres if in_metres else poses.is_known
     unknown = np.full((4, 4), np.nan)
-    matrices = [poses.cam_from_world(path) if poses.in_metres(path) else unknown for path in paths]
-    cameras = CameraPoses(np.stack(matrices), in_metres=True)
+    matrices = [poses.cam_from_world(path) if is_known(path) else unknown for path in paths]
+    cameras = CameraPoses(np.stack(matrices), in_metres=in_metres)
     if not cameras.known.any():
         raise CameraError(
-            f'--views {file}: has none of {paths[0].name} and {len(paths) - 1} more with "unit": "m"; write it with '
-            "curio-train capture --calibrate --views-out, with --distance-m or --objects"
+            f"--views {file}: has none of {paths[0].name} and {len(paths) - 1} more"
+            + (' with "unit": "m"' if in_metres else "")
+            + "; write it with curio-train capture --calibrate --views-out"
+            + (", with --distance-m or --objects" if in_metres else "")
         )
     return cameras
 
