@@ -4,7 +4,8 @@
 
 jitter_ratio         movement of the filtered position from frame to frame at rest, over that of the raw one
 lag_frames           how far the filtered position is behind the truth at 0.5 m/s, over that of the raw one, in frames
-refound_of_100       sequences in which an object is seen again within 5 frames after 30 of occlusion, of 100
+refound_of_100       sequences in which an object is seen again within 5 frames after 30 of occlusion, of a hundred
+                     in which it was followed when it was hidden; refound_of_all: of all, whether it was or not
 swaps                sequences in which two equal objects that do not touch change their numbers
 one_object_ms        CPU a frame of one followed object, beyond decoding, looks at whole frames included
 eight_objects_ms     the same for each of eight objects, one of each model
@@ -88,6 +89,7 @@ def main() -> None:
         "lag_frames": round(float(np.nanmedian(late)), 3),
         "refound_of_100": round(100 * float(np.mean(np.array(found, float))), 1),
         "occlusions": len(found),
+        "refound_of_all": round(100 * sum(map(bool, found)) / arguments.sequences, 1),
         "swaps": int(np.sum(np.array(followed, float))),
         "pairs": len(followed),
         "sequences": arguments.sequences,

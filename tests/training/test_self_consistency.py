@@ -12,7 +12,13 @@ import torch
 from curio_serve.models.reliability import calibrated
 from curio_train.errors import CameraError, DataError
 from curio_train.evaluation.reliability import Answers, coverage, fit_reliability
-from curio_train.evaluation.self_consistency import Pairs, adjusted, adjustment, photographed_pairs, read_views
+from curio_train.evaluation.unlabelled.self_consistency import (
+    Pairs,
+    adjusted,
+    adjustment,
+    photographed_pairs,
+    read_views,
+)
 from curio_train.geometry import rotation_6d_from_matrix
 from curio_train.metrics.calibration import fit_pair_calibration
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, SceneCode

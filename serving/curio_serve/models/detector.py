@@ -141,10 +141,12 @@ class Detector:
             found = self.model.run(batch[0][None] if len(batch) == 1 else np.stack(batch))
             rows = zip(*[value.tolist() for value in found.values()], strict=True)
             outputs += [dict(zip(found, row, strict=True)) for row in rows]
-        for values in outputs:
-            if "confidence" in values:
-                values["confidence"] = [calibrated(self._calibration, value) for value in values["confidence"]]
-        return outputs
+        return [self._calibrated(values) for values in outputs]
+
+    def _calibrated(self, values: Values) -> Values:
+        if "confidence" not in values:
+            return values
+        return {**values, "confidence": [calibrated(self._calibration, value) for value in values["confidence"]]}
 
     def read_crops(self, pixels: Array, camera: PinholeCamera, position_m: Array) -> CropPose:
         """The pose of the one object of a model with a crop-pose stage, in crops around a position.

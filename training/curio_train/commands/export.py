@@ -98,8 +98,8 @@ def _push(folder: Path, repository: str, licence: str | None) -> None:
 def _measure(command: ExportCommand, folder: Path) -> None:
     """Measure the latest version of a model on renderings, and write what was found beside it."""
     from curio_train.evaluation.reliability import NUM_IMAGES, fit_reliability, held_out_answers
-    from curio_train.evaluation.self_consistency import adjusted, adjustment, photographed_pairs, read_views
     from curio_train.evaluation.subject import load_subject, model_reader
+    from curio_train.evaluation.unlabelled.self_consistency import adjusted, adjustment, photographed_pairs, read_views
     from curio_train.export.folder import ModelFolder
     from curio_train.exported_model import ExportedModel, find_model
 

@@ -34,8 +34,8 @@ from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.refinement.multi_view import estimate_scale
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, SceneCode, poses
 from curio_train.worlds.base import World
+from curio_train.worlds.linemod import read_camera_poses
 from curio_train.worlds.several_objects.scenes import ObjectScenes
-from curio_train.worlds.single_object.linemod import read_camera_poses
 from curio_train.worlds.single_object.world import Object, SingleObjectWorld
 
 _NEIGHBOURS = 4  # photographs before each that it is compared with: objects may be moved in longer times
