@@ -188,7 +188,7 @@ def test_a_reservation_keeps_a_place(gate: threading.Event, make_bench: MakeBenc
         with pytest.raises(Overloaded), bench.queue.reserve(Caller()):
             pass
         working = bench.hold(gate)
-        waiting = bench.hold(gate, place=second)
+        waiting = bench.hold(gate, entry=second)
         with pytest.raises(Overloaded):
             bench.hold(gate).result(30)
         gate.set()
@@ -210,11 +210,11 @@ def test_reservations_end(gate: threading.Event, make_bench: MakeBench, monkeypa
     with bench.queue.reserve(Caller()) as slow, bench.queue.reserve(Caller()) as slower:
         monkeypatch.setattr("curio_serve.api.admission._RESERVATION_S", 0.0)
         with bench.queue.reserve(Caller()) as quick:
-            held = [bench.hold(gate, place=quick)]
+            held = [bench.hold(gate, entry=quick)]
             # Their messages come late; they wait if there is room.
-            held.append(bench.hold(gate, place=slow))
+            held.append(bench.hold(gate, entry=slow))
             with pytest.raises(Overloaded):
-                bench.hold(gate, place=slower).result(30)
+                bench.hold(gate, entry=slower).result(30)
             gate.set()
             assert [future.result(30) for future in held] == ["done", "done"]
 

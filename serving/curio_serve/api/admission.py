@@ -40,8 +40,8 @@ class Call(Protocol):
         """Have a function called when the call ends; False if it has ended already."""
 
 
-class Place:
-    """A call's place in the queue, on which its thread sleeps until it gets a slot or the call ends."""
+class QueueEntry:
+    """A call in the queue; its thread sleeps on it until the call gets a slot or ends."""
 
     def __init__(self) -> None:
         self._wakes: queue.SimpleQueue[None] = queue.SimpleQueue()  # a quarter of an Event's cost
@@ -81,15 +81,15 @@ class WorkQueue:
         self._num_behind = num_behind
         self._lock = threading.Lock()
         self._num_free = num_slots
-        self._waiting: deque[Place] = deque()
-        self._reserved: dict[Place, float] = {}  # since when, oldest first
+        self._waiting: deque[QueueEntry] = deque()
+        self._reserved: dict[QueueEntry, float] = {}  # since when, oldest first
         self._mean_work_s = 0.005
         metrics.waiting.set_function(lambda: len(self._waiting))
         metrics.working.set_function(lambda: num_slots - self._num_free)
 
     @contextmanager
-    def reserve(self, call: Call) -> Iterator[Place]:
-        """Reserve a place for a call before its message is read: refusing it later would waste the reading.
+    def reserve(self, call: Call) -> Iterator[QueueEntry]:
+        """Reserve an entry for a call before its message is read: a later refusal would waste the reading.
 
         A reservation lasts one second, so callers who never send their message do not fill the queue.
 
@@ -97,7 +97,7 @@ class WorkQueue:
             call: Its deadline decides whether its turn would come in time.
 
         Yields:
-            The place, for :meth:`slot`.
+            The entry, for :meth:`slot`.
 
         Raises:
             Overloaded: The queue is full, or the deadline would pass before the call is answered.
@@ -109,20 +109,20 @@ class WorkQueue:
                 num_behind = min(self._num_behind(call.peer()), len(self._reserved))
                 if reason := self._why_not(remaining_s, num_behind):
                     self._refuse(reason)
-            place = Place()
-            self._reserved[place] = time.monotonic()
+            entry = QueueEntry()
+            self._reserved[entry] = time.monotonic()
         try:
-            yield place
+            yield entry
         finally:
-            self._reserved.pop(place, None)
+            self._reserved.pop(entry, None)
 
     @contextmanager
-    def slot(self, call: Call, place: Place | None = None, *, always: bool = False) -> Iterator[float]:
+    def slot(self, call: Call, entry: QueueEntry | None = None, *, always: bool = False) -> Iterator[float]:
         """Hold a slot while this thread works.
 
         Args:
             call: Its deadline bounds the wait, and its end takes it out of the queue.
-            place: The one that was reserved for it, if any.
+            entry: The one that was reserved for the call, if any.
             always: Wait even behind a full queue, for callers that are bounded otherwise.
 
         Yields:
@@ -135,9 +135,9 @@ class WorkQueue:
         """
         remaining_s = call.time_remaining()
         begun = time.monotonic()
-        place = place or Place()
-        if not self._enter(place, always):
-            self._wait(place, call, remaining_s)
+        entry = entry or QueueEntry()
+        if not self._enter(entry, always):
+            self._wait(entry, call, remaining_s)
         granted = time.monotonic()
         has_worked = False
         try:
@@ -148,27 +148,27 @@ class WorkQueue:
         finally:
             self._leave(time.monotonic() - granted if has_worked else None)
 
-    def _enter(self, place: Place, always: bool) -> bool:
-        """Take a free slot (True) or a place in the queue (False)."""
+    def _enter(self, entry: QueueEntry, always: bool) -> bool:
+        """Take a free slot (True) or join the queue (False)."""
         with self._lock:
-            is_reserved = self._reserved.pop(place, None) is not None
+            is_reserved = self._reserved.pop(entry, None) is not None
             if self._num_free:
                 self._num_free -= 1
                 return True
             if len(self._waiting) >= self._max_waiting and not (is_reserved or always):
                 self._refuse(_IS_FULL)
-            self._waiting.append(place)
+            self._waiting.append(entry)
             return False
 
-    def _wait(self, place: Place, call: Call, remaining_s: float | None) -> None:
+    def _wait(self, entry: QueueEntry, call: Call, remaining_s: float | None) -> None:
         """Return with a slot, or raise without one."""
-        if not call.add_callback(place.wake):
-            place.wake()
-        is_woken = place.sleep(remaining_s)
+        if not call.add_callback(entry.wake):
+            entry.wake()
+        is_woken = entry.sleep(remaining_s)
         with self._lock:
-            if place not in self._waiting:
+            if entry not in self._waiting:
                 return  # it was given a slot
-            self._waiting.remove(place)
+            self._waiting.remove(entry)
         if is_woken:
             raise CallCancelled("the client hung up while the call was in the queue; nothing was done")
         raise _deadline_passed(remaining_s or 0.0)
@@ -224,9 +224,9 @@ def check_is_wanted(call: Call) -> None:
     """
     remaining_s = call.time_remaining()
     if remaining_s is not None and remaining_s <= 0:
-        raise DeadlineError("the deadline passed before the work was done; the rest of it was not begun")
+        raise DeadlineError("the deadline passed before the work was done; the rest was not started")
     if not call.is_active():
-        raise CallCancelled("the call was ended before the work was done; the rest of it was not begun")
+        raise CallCancelled("the call was ended before the work was done; the rest was not started")
 
 
 def _deadline_passed(waited_s: float) -> DeadlineError:

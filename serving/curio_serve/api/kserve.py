@@ -59,10 +59,10 @@ class InferenceService(GRPCInferenceServiceServicer):
         self, requests: Iterator[messages.ModelInferRequest], context: Context
     ) -> messages.ModelInferResponse:
         """Answer the one request; a full queue refuses it before it is read."""
-        with self._calls.record("ModelInfer", context) as call, self._work.reserve(context) as place:
+        with self._calls.record("ModelInfer", context) as call, self._work.reserve(context) as entry:
             request = only_message(requests)
             call.request_id = request.id
-            with self._work.slot(context, place):
+            with self._work.slot(context, entry):
                 return self._infer(request)
 
     def _model_ready(self, request: messages.ModelReadyRequest) -> messages.ModelReadyResponse:

@@ -54,11 +54,11 @@ class PoseService(PoseDetectorServicer):
 
     def Detect(self, requests: Iterator[messages.DetectRequest], context: Context) -> messages.DetectResponse:
         """Answer the one request; a full queue refuses it before it is read."""
-        with self._calls.record("Detect", context) as call, self._work.reserve(context) as place:
+        with self._calls.record("Detect", context) as call, self._work.reserve(context) as entry:
             request = only_message(requests)
             call.request_id = request.request_id
             detectors = self._detectors(request)
-            with self._work.slot(context, place) as waited_s:
+            with self._work.slot(context, entry) as waited_s:
                 return self._detect(request, detectors, waited_s, context)
 
     def DetectStream(

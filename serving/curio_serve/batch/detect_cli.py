@@ -115,8 +115,8 @@ def run(arguments: DetectArguments) -> int:
         for line in passed_over.lines():
             print(f"curio-detect: {line}", file=sys.stderr)
         if refiner is not None:
-            told = f"refined {refiner.num_refined} of {refiner.num_detections} poses; the others stay as detected"
-            print(f"curio-detect: {told}", file=sys.stderr)
+            text = f"refined {refiner.num_refined} of {refiner.num_detections} poses; the others stay as detected"
+            print(f"curio-detect: {text}", file=sys.stderr)
         if output.num_images == 0:
             raise UsageError(
                 f"no images in {' '.join(arguments.images)}; looked for .jpg, .jpeg, .png and .webp in folders, "

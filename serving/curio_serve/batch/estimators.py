@@ -162,8 +162,8 @@ class Estimator(ABC):
         self, image: SourceImage, data: bytes, header: Header | None = None, max_reduction: int = 1
     ) -> images.Frame:
         if image.pixels is None:
-            turn = self.settings.apply_exif_rotation
-            return images.decode(data, header=header, max_reduction=max_reduction, apply_exif_rotation=turn)
+            rotate = self.settings.apply_exif_rotation
+            return images.decode(data, header=header, max_reduction=max_reduction, apply_exif_rotation=rotate)
         height, width = image.pixels.shape[:2]
         images.check_size(width, height)
         return images.Frame(image.pixels, width, height)

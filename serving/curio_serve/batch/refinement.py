@@ -1,6 +1,6 @@
-"""``curio-detect --refine``: poses improved by render-and-compare, which the extra ``train`` brings.
+"""``curio-detect --refine`` improves poses by render-and-compare; it needs the extra ``train``.
 
-Serving does without a renderer. It asks for the one function below by name, and only where a call wants it.
+Serving has no renderer of its own. It imports the refiner from training, by name, only if a call asks for it.
 """
 
 import importlib

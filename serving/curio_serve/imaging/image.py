@@ -95,16 +95,16 @@ def decode(
         ImageError: Says what is wrong with it.
     """
     header = header or open_header(data, max_pixels)
-    turns = _turns(header) if apply_exif_rotation else 0
+    quarter_turns = _quarter_turns(header) if apply_exif_rotation else 0
     reduction = _reduction(header, max_reduction)
     pixels = _decode_pixels(data, header, reduction)
-    if turns:
-        pixels = np.ascontiguousarray(np.rot90(pixels, -turns))
-    width, height = (header.height, header.width) if turns % 2 else (header.width, header.height)
-    return Frame(pixels, width, height, reduction, turns)
+    if quarter_turns:
+        pixels = np.ascontiguousarray(np.rot90(pixels, -quarter_turns))
+    width, height = (header.height, header.width) if quarter_turns % 2 else (header.width, header.height)
+    return Frame(pixels, width, height, reduction, quarter_turns)
 
 
-def _turns(header: Header) -> int:
+def _quarter_turns(header: Header) -> int:
     if header.orientation not in _QUARTER_TURNS:
         raise ImageError(
             f"EXIF orientation {header.orientation} mirrors the image, which no camera does; decode it as stored, "

@@ -99,18 +99,22 @@ class Detector:
             frame.crop(region) if region.overlaps(frame.width, frame.height) else None
             for region in regions or [Region(0, 0, frame.width, frame.height)]
         ]
-        readings = iter(self._readings([crop.image for crop in crops if crop is not None], max_instances, before_run))
+        predictions = iter(
+            self._predictions([crop.image for crop in crops if crop is not None], max_instances, before_run)
+        )
         results = DetectResponse().results if results is None else results
         for index, crop in enumerate(crops):
             result = results.add(model=self.model.name, model_version=self.model.version, region=index)
             if crop is None:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
-                _fill(result, crop, self.model.slots, next(readings), limits, self.depths_m)
+                _fill(result, crop, self.model.slots, next(predictions), limits, self.depths_m)
                 _judge(result, self.model.spec.reliability)
         return results
 
-    def _readings(self, images: list[Array], max_instances: int | None, before_run: Callable[[], None]) -> list[Values]:
+    def _predictions(
+        self, images: list[Array], max_instances: int | None, before_run: Callable[[], None]
+    ) -> list[Values]:
         """The network's outputs for each image; of a network that reads one pose, a row an instance."""
         outputs = self._outputs(images, before_run)
         if max_instances in (None, 1) or len(self.model.slots) > 1:

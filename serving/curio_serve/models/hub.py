@@ -82,12 +82,12 @@ def timeout_s() -> float:
     return float(HF_HUB_ETAG_TIMEOUT)
 
 
-def fetch(address: str, tell: Callable[[str], None]) -> Path:
+def fetch(address: str, report: Callable[[str], None]) -> Path:
     """A folder of models from a hub, or from the cache if the hub does not answer.
 
     Args:
         address: ``hf://ORG/NAME`` or ``hf://ORG/NAME@REVISION``; a revision is a branch, a tag or a commit.
-        tell: Called with a line where the cache stands in for the hub.
+        report: Called with a line where the cache stands in for the hub.
 
     Returns:
         The folder in the cache. Each file has the SHA-256 that SHA256SUMS lists.
@@ -100,13 +100,13 @@ def fetch(address: str, tell: Callable[[str], None]) -> Path:
     repository, _, revision = address.removeprefix(SCHEME).partition("@")
     if not is_repository(repository) or (address.endswith("@") and not revision):
         raise UsageError(f"{address}: expected {SCHEME}ORG/NAME or {SCHEME}ORG/NAME@REVISION")
-    folder = _fetched(open_hub(), address, repository, revision or None, tell)
+    folder = _fetched(open_hub(), address, repository, revision or None, report)
     for model in sorted({file.parent.parent for file in folder.glob(f"*/*/{MODEL_FILE}")}):
         check_sums(model)
     return folder
 
 
-def _fetched(hub: "HfApi", address: str, repository: str, revision: str | None, tell: Callable[[str], None]) -> Path:
+def _fetched(hub: "HfApi", address: str, repository: str, revision: str | None, report: Callable[[str], None]) -> Path:
     from huggingface_hub.errors import (
         GatedRepoError,
         HTTPError,
@@ -135,7 +135,7 @@ def _fetched(hub: "HfApi", address: str, repository: str, revision: str | None, 
         folder = hub.snapshot_download(repository, revision=revision, allow_patterns=_FETCHED, local_files_only=True)
     except LocalEntryNotFoundError as exc:
         raise Unavailable(f"{address}: {reason}, and the cache has no whole copy of it; try again later") from exc
-    tell(f"{address}: {reason}; the copy in the cache is used")
+    report(f"{address}: {reason}; the copy in the cache is used")
     return Path(folder)
 
 

@@ -46,12 +46,12 @@ class ChildCheck:
         with child:
             self._child = child
             try:
-                _, said = child.communicate(timeout=TIMEOUT_S)
+                _, output = child.communicate(timeout=TIMEOUT_S)
             except subprocess.TimeoutExpired as exc:
                 raise ModelError(f"{label}: its check took longer than {TIMEOUT_S} s") from exc
             finally:
                 child.kill()  # also after Ctrl-C
-        last = (said.strip().splitlines() or ["without a word"])[-1]
+        last = (output.strip().splitlines() or ["without a word"])[-1]
         if child.returncode == 1:
             raise ModelError(last if str(path) in last else f"{label}: {last}")
         if child.returncode:

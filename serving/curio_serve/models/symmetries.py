@@ -18,6 +18,6 @@ def symmetry_rotations(kind: ObjectModel) -> Array:
     for symmetry in kind.symmetries:
         if len(symmetry.axis) == 3:
             angles = np.arange(0, 2 * math.pi, _SYMMETRY_STEP_RAD)
-            turns = from_rotation_vector(angles[:, None] * np.array(symmetry.axis))
-            found = (found[:, None] @ turns[None]).reshape(-1, 3, 3)
+            rotations = from_rotation_vector(angles[:, None] * np.array(symmetry.axis))
+            found = (found[:, None] @ rotations[None]).reshape(-1, 3, 3)
     return found

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 import grpc
 
-from curio_serve.api.admission import Place
+from curio_serve.api.admission import QueueEntry
 from curio_serve.errors import CallCancelled
 from curio_serve.server import memory
 from curio_serve.telemetry import log
@@ -57,7 +57,7 @@ class _Arrival:
     context: grpc.ServicerContext
     peer: str
     is_stream: bool
-    place: Place = field(default_factory=Place)
+    entry: QueueEntry = field(default_factory=QueueEntry)
     """Where its thread sleeps until there is memory."""
     num_bytes: int = 0
     """Memory that it holds or has reserved."""
@@ -174,9 +174,9 @@ class Reception:
                 return
             self._waiting.append(arrival)
             self._hand_out()
-        if not arrival.context.add_callback(arrival.place.wake):
-            arrival.place.wake()
-        arrival.place.sleep(None)
+        if not arrival.context.add_callback(arrival.entry.wake):
+            arrival.entry.wake()
+        arrival.entry.sleep(None)
         with self._lock:
             if arrival not in self._waiting:
                 return
@@ -192,7 +192,7 @@ class Reception:
             following = min(candidates, key=lambda waiting: self._rank(waiting.peer))
             self._waiting.remove(following)
             self._grant(following)
-            following.place.wake()
+            following.entry.wake()
 
     def _grant(self, arrival: _Arrival) -> None:
         arrival.num_bytes = self._limits.message_bytes

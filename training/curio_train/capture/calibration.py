@@ -144,7 +144,7 @@ def _solve(
 ) -> Calibration:
     points, pixels = zip(*views, strict=True)
     try:
-        error, matrix, distortion, turns, _, deviations, _, _ = cv2.calibrateCameraExtended(
+        error, matrix, distortion, rotation_vectors, _, deviations, _, _ = cv2.calibrateCameraExtended(
             points, pixels, size, np.zeros((3, 3)), np.zeros(5)
         )
     except cv2.error as exc:
@@ -156,9 +156,10 @@ def _solve(
             f"{_LARGEST_ERROR_PX:g}; is the board flat, the zoom fixed, and all taken with one camera?"
         )
     # Where all boards are parallel the estimate itself is wrong, and its deviation too small.
-    if not uncertainty < _LARGEST_UNCERTAINTY or _spread_deg(turns) < _LEAST_SPREAD_DEG:
+    if not uncertainty < _LARGEST_UNCERTAINTY or _spread_deg(rotation_vectors) < _LEAST_SPREAD_DEG:
         raise CameraError(
-            f"{folder}: the views are too alike: boards are tilted by {_spread_deg(turns):.0f} degrees to each other, "
+            f"{folder}: the views are too alike: boards are tilted by "
+            f"{_spread_deg(rotation_vectors):.0f} degrees to each other, "
             f"the focal length is uncertain by {uncertainty:.1%}; tilt the board by 30 degrees to all sides"
         )
     width, height = size
@@ -168,7 +169,7 @@ def _solve(
     return Calibration(camera, float(error), uncertainty, len(views), unused, board)
 
 
-def _spread_deg(turns: Sequence[np.ndarray]) -> float:
+def _spread_deg(rotation_vectors: Sequence[np.ndarray]) -> float:
     """Largest angle between the normals of two boards, given as rotation vectors [3, 1]."""
-    normals = np.stack([cv2.Rodrigues(np.asarray(turn))[0][:, 2] for turn in turns])
+    normals = np.stack([cv2.Rodrigues(np.asarray(vector))[0][:, 2] for vector in rotation_vectors])
     return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))

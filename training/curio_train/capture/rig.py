@@ -166,8 +166,10 @@ def _turned(pairs: list[_Pair], reference: bool, one: Intrinsics, two: Intrinsic
 
 def _rotation(points: np.ndarray, pixels: np.ndarray, camera: Intrinsics) -> np.ndarray:
     """cam_from_board."""
-    is_found, turn, _ = cv2.solvePnP(points, pixels, camera.matrix, np.array(camera.distortion or (0.0,) * 5))
-    return np.asarray(cv2.Rodrigues(turn)[0]) if is_found else np.eye(3)
+    is_found, rotation_vector, _ = cv2.solvePnP(
+        points, pixels, camera.matrix, np.array(camera.distortion or (0.0,) * 5)
+    )
+    return np.asarray(cv2.Rodrigues(rotation_vector)[0]) if is_found else np.eye(3)
 
 
 def _solve(pairs: list[_Pair], one: Intrinsics, two: Intrinsics) -> tuple[np.ndarray, float]:

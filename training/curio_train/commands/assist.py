@@ -77,16 +77,16 @@ class Page:
         self._server.shutdown()
         self._server.server_close()
 
-    def show(self, pixels: np.ndarray, said: str, more: str, number: int) -> None:
+    def show(self, pixels: np.ndarray, text: str, more: str, number: int) -> None:
         """Replace what is shown."""
         scale = min(1.0, _SHOWN_PX / max(pixels.shape[:2]))
         small = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else pixels
         _, encoded = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))
         self._content["frame.jpg"] = ("image/jpeg", encoded.tobytes())
-        self._content["status"] = _status(said, more, number)
+        self._content["status"] = _status(text, more, number)
 
 
-def run(command: AssistantCommand, interruption: Interruption, tell: Callable[[str], None]) -> int:
+def run(command: AssistantCommand, interruption: Interruption, report: Callable[[str], None]) -> int:
     """Take photographs until there are enough; the exit status is 1 where the frames end before.
 
     Raises:
@@ -104,21 +104,21 @@ def run(command: AssistantCommand, interruption: Interruption, tell: Callable[[s
     frames = _frames(command.video)
     assistant, faults = Assistant(command.out, board, command.background), Counter[str]()
     with Page(command.port) as page, interruption.deferred():
-        tell(f"{page.address} shows the frames; {assistant.num_kept} of {enough} photographs are in {command.out}")
+        report(f"{page.address} shows the frames; {assistant.num_kept} of {enough} photographs are in {command.out}")
         if assistant.wants_background:
-            tell(f"first the empty scene, for {command.background}: leave the part away")
+            report(f"first the empty scene, for {command.background}: leave the part away")
         for number, pixels in enumerate(frames, 1):
             if assistant.num_kept >= enough or interruption.signum is not None:
                 break
             before, was_background = assistant.num_kept, assistant.wants_background
             found = assistant.take(pixels)
             if was_background and not found.fault:
-                tell(f"{command.background}: the empty scene; now put the part into it")
+                report(f"{command.background}: the empty scene; now put the part into it")
             faults[found.fault] += 1
             if assistant.num_kept > before:
-                tell(f"{assistant.num_kept} of {enough} kept")
-            said = f"{assistant.num_kept} of {enough} kept; this frame: {found.fault or 'kept'}"
-            page.show(pixels, said, _more(found), number)
+                report(f"{assistant.num_kept} of {enough} kept")
+            text = f"{assistant.num_kept} of {enough} kept; this frame: {found.fault or 'kept'}"
+            page.show(pixels, text, _more(found), number)
     if assistant.num_kept >= enough:
         print(f"{command.out}: {assistant.num_kept} photographs, enough")
         return 0
@@ -161,5 +161,5 @@ def _more(found: Judgement) -> str:
     )
 
 
-def _status(said: str, more: str, number: int) -> tuple[str, bytes]:
-    return "application/json", json.dumps({"said": said, "more": more, "frame": number}).encode()
+def _status(text: str, more: str, number: int) -> tuple[str, bytes]:
+    return "application/json", json.dumps({"said": text, "more": more, "frame": number}).encode()

@@ -11,7 +11,7 @@ from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from curio_train.commands.command_line.field_help import parsed
-from curio_train.commands.command_line.running import CACHE, answer, tell, warn
+from curio_train.commands.command_line.running import CACHE, answer, report, warn
 from curio_train.commands.linemod_data import fetched_linemod
 
 
@@ -50,7 +50,7 @@ def _evaluate(command: EvaluateCommand) -> int:
     from curio_train.evaluation.reporting.tables import print_evaluation
 
     if command.download and command.data is None:
-        command = replace(command, data=fetched_linemod(command.cache, tell, ask=False, frames=True))
+        command = replace(command, data=fetched_linemod(command.cache, report, ask=False, frames=True))
     given = {name: getattr(command, name) for name in ("split", "num_images", "data", "bop_results", "refine", "cache")}
     with Console(stderr=True).status("") as status:
         result = evaluate(command.path, **given, progress=status.update, warn=warn)

@@ -18,7 +18,7 @@ def end(run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None]) 
         run: The run folder.
         config: Its configuration.
         cache: Where worlds keep their image sets.
-        warn: Told where the report could not be made; the run has succeeded all the same.
+        warn: Called with the reason if the report could not be made; the run has succeeded all the same.
 
     Returns:
         How to go on, for the user.

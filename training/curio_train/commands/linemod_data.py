@@ -15,13 +15,13 @@ _MEGABITS_A_SECOND = 10
 _DECLINED = ("n", "no")
 
 
-def with_linemod(options: LinemodOptions, cache: Path, tell: Callable[[str], None]) -> LinemodOptions:
+def with_linemod(options: LinemodOptions, cache: Path, report: Callable[[str], None]) -> LinemodOptions:
     """The options with a folder of data.
 
     Args:
         options: As called.
         cache: Where downloads are kept.
-        tell: Told what is there already, and what is downloaded.
+        report: Called with what is there already, and what is downloaded.
 
     Raises:
         UsageError: LineMOD has no such class, or the user declines the download.
@@ -32,18 +32,18 @@ def with_linemod(options: LinemodOptions, cache: Path, tell: Callable[[str], Non
     names = [] if options.class_name == ALL_CLASSES else options.class_name.split(",")
     for name in names:
         BopDataset.object_id(name)  # before anything is fetched
-        _name_models(name, tell)
+        _name_models(name, report)
     if options.data is not None:
         return options
-    return replace(options, data=fetched_linemod(cache, tell, ask=not options.download), download=False)
+    return replace(options, data=fetched_linemod(cache, report, ask=not options.download), download=False)
 
 
-def fetched_linemod(cache: Path, tell: Callable[[str], None], *, ask: bool, frames: bool = False) -> Path:
+def fetched_linemod(cache: Path, report: Callable[[str], None], *, ask: bool, frames: bool = False) -> Path:
     """The folder of LineMOD; says what is missing there, and downloads it.
 
     Args:
         cache: Where downloads are kept.
-        tell: Told what is downloaded.
+        report: Called with what is downloaded.
         ask: On a terminal, begin only if the user agrees.
         frames: Whether the real frames are needed, too.
 
@@ -55,23 +55,23 @@ def fetched_linemod(cache: Path, tell: Callable[[str], None], *, ask: bool, fram
 
     archives = SCORING_ARCHIVES if frames else TRAINING_ARCHIVES
     if missing := missing_archives(cache, archives):
-        _offer(missing, cache, tell, ask=ask)
+        _offer(missing, cache, report, ask=ask)
     return download_linemod(cache, archives)
 
 
-def _name_models(name: str, tell: Callable[[str], None]) -> None:
+def _name_models(name: str, report: Callable[[str], None]) -> None:
     """A user who only wants to try LineMOD need not train."""
     if any((MODELS / name).glob("*/model.onnx")):
-        tell(f"{MODELS / name} is a trained model of it, to be tried at once: curio-detect {MODELS / name} IMAGES")
+        report(f"{MODELS / name} is a trained model of it, to be tried at once: curio-detect {MODELS / name} IMAGES")
 
 
-def _offer(archives: list[str], cache: Path, tell: Callable[[str], None], *, ask: bool) -> None:
+def _offer(archives: list[str], cache: Path, report: Callable[[str], None], *, ask: bool) -> None:
     """Say what will be downloaded; on a terminal, begin only if the user agrees."""
     from curio_train.data.download import REPOSITORY, download_bytes, linemod_folder
 
     num_bytes = download_bytes(archives)
     minutes = num_bytes * 8 / _MEGABITS_A_SECOND / 1e6 / 60
-    tell(
+    report(
         f"LineMOD's archives {', '.join(archives)} ({REPOSITORY}, CC BY 4.0): {num_bytes / 1e6:.1f} MB, "
         f"about {max(1, round(minutes))} min at {_MEGABITS_A_SECOND} Mbit/s, once, to {linemod_folder(cache)}"
     )

@@ -15,14 +15,14 @@ from curio_train.learning.runs.configuration import CONFIG_FILE
 from curio_train.worlds.options import CaptureOptions, LinemodOptions
 
 
-def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: Callable[[str], None]) -> RunConfig:
+def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report: Callable[[str], None]) -> RunConfig:
     """The configuration of a new run, ready to be trained.
 
     Args:
         config: As called.
         cache: Where downloads are kept.
-        warn: Told of what is doubtful.
-        tell: Told of what was found out.
+        warn: Called with what is doubtful.
+        report: Called with what was found out.
 
     Raises:
         UsageError: Pseudo-labels are asked for, and there are no photographs; LineMOD has no such class; or a
@@ -36,7 +36,7 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
             "which linemod and capture have"
         )
     if isinstance(options, LinemodOptions):
-        options = with_linemod(options, cache, tell)
+        options = with_linemod(options, cache, report)
         config = replace(config, world=options)
         _refuse_unreadable(options)
     if isinstance(options, CaptureOptions):
@@ -44,7 +44,7 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], tell: 
 
         for doubt in refuse_unfit(options, self_training=config.recipe.self_training > 0):
             warn(doubt)
-        return replace(config, world=_with_paint(options, tell), network=_usual_network(config, options))
+        return replace(config, world=_with_paint(options, report), network=_usual_network(config, options))
     return config
 
 
@@ -108,7 +108,7 @@ def _refuse_unreadable(options: LinemodOptions) -> None:
         read_camera_poses(options.views, paths)
 
 
-def _with_paint(options: CaptureOptions, tell: Callable[[str], None]) -> CaptureOptions:
+def _with_paint(options: CaptureOptions, report: Callable[[str], None]) -> CaptureOptions:
     """In free space, find an unpainted part's colour in photographs over a background image, and set it."""
     from curio_train.camera import load_intrinsics
     from curio_train.data.part_color import find_color, is_unpainted
@@ -120,11 +120,11 @@ def _with_paint(options: CaptureOptions, tell: Callable[[str], None]) -> Capture
         return options
     anyway = "it is learned in any colour, which takes longer; --paint '#8a6f4c' says which it has"
     if options.background is None:
-        tell(f"the part's colour is not known without --background, a photograph of the empty scene: {anyway}")
+        report(f"the part's colour is not known without --background, a photograph of the empty scene: {anyway}")
         return options
     found = find_color(options.photos, options.background, load_intrinsics(options.camera))
     if found is None:
-        tell(f"the part's colour was not found where the photographs differ from {options.background}: {anyway}")
+        report(f"the part's colour was not found where the photographs differ from {options.background}: {anyway}")
         return options
-    tell(f"the part's colour, from {found.num_used} of {found.num_compared} photographs: {found.hex}")
+    report(f"the part's colour, from {found.num_used} of {found.num_compared} photographs: {found.hex}")
     return replace(options, paint=found.hex)

@@ -16,7 +16,7 @@ from tyro.conf import OmitArgPrefixes
 from curio_train.capture.options import AssistantCommand, CalibrateCommand
 from curio_train.commands.command_line.field_help import join_help_lines, parsed
 from curio_train.commands.command_line.project_file import with_project
-from curio_train.commands.command_line.running import CACHE, answer, tell, warn
+from curio_train.commands.command_line.running import CACHE, answer, report, warn
 from curio_train.commands.command_line.short_help import FLAG_ALL, print_short_help
 from curio_train.config import NetworkConfig, Preset, Recipe, RunConfig, WorldOptions, preset_recipe
 from curio_train.errors import UsageError, nearest
@@ -73,7 +73,7 @@ def _calibrate(command: CalibrateCommand) -> int:
     def by_objects(structure: "Structure", models: Path, data: Path | None) -> "tuple[Structure, str]":
         from curio_train.evaluation.unlabelled.scene_scale import scale_by_objects
 
-        return scale_by_objects(structure, models, data, tell)
+        return scale_by_objects(structure, models, data, report)
 
     print(run(command, by_objects))
     return 0
@@ -82,7 +82,7 @@ def _calibrate(command: CalibrateCommand) -> int:
 def _assist(command: AssistantCommand, interruption: Interruption) -> int:
     from curio_train.commands.assist import run
 
-    return run(command, interruption, tell)
+    return run(command, interruption, report)
 
 
 def parse(arguments: list[str]) -> TrainCommand:
@@ -173,7 +173,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_train.learning.session import learn
 
     session = command.session
-    config = command.config if session.resume else prepared(command.config, session.cache, warn, tell)
+    config = command.config if session.resume else prepared(command.config, session.cache, warn, report)
     path = (
         session.resume
         or (session.out and direct(session.out))
@@ -184,9 +184,9 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     if config.terms.templates:
         seconds = draw_templates(config, path, session.cache).seconds
         print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
-        tell(end(path, config, session.cache, warn))
+        report(end(path, config, session.cache, warn))
         return 0
-    tell(f"{path}: to watch it learn: curio-view {path}, or tensorboard --logdir {path}")
+    report(f"{path}: to watch it learn: curio-view {path}, or tensorboard --logdir {path}")
     outcome, progress = learn(
         config,
         path,
@@ -202,7 +202,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         if outcome is Outcome.INTERRUPTED:
             print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
         else:
-            tell(end(path, config, session.cache, warn))
+            report(end(path, config, session.cache, warn))
     if outcome is Outcome.INTERRUPTED and interruption.signum is not None:
         return 128 + interruption.signum
     return 0

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from curio_train.commands.command_line.field_help import parsed
-from curio_train.commands.command_line.running import CACHE, answer, tell
+from curio_train.commands.command_line.running import CACHE, answer, report
 from curio_train.errors import UsageError
 
 
@@ -60,7 +60,7 @@ def _view(command: ViewCommand) -> int:
     opening = Opening(command.what, meshes, command.model, command.camera, command.cache.expanduser())
     viewer = Viewer(open_pages(opening), command.out, command.host, command.port, newer_pages(opening))
     try:
-        tell(f"curio-view: http://{command.host}:{command.port}, {_reach(command.host)}; Ctrl-C ends it")
+        report(f"curio-view: http://{command.host}:{command.port}, {_reach(command.host)}; Ctrl-C ends it")
         threading.Event().wait()
     finally:
         viewer.close()

@@ -13,13 +13,13 @@ from torch import Tensor
 LARGEST_OCCLUDER = 0.35  # of the image's side
 _SHADE_CELLS = (2, 5)  # of uneven light's grid, a side: from a gradient over the image to shadows of a third of it
 _DARKEST, _LEAST = float(np.log(1e-4)), 1e-30  # values below are as black as that; the logarithm of black is finite
-_NOISE_PLACES = 2**20
+_NOISE_STARTS = 2**20
 _VALUES_AT_ONCE = 2**17  # half a megabyte: what lies between two operations stays in the cache of a core
 
 
 @dataclass(frozen=True)
 class AugmentationStrength:
-    """Ranges of the augmentation; each picture draws its own amounts from them, uniformly."""
+    """Ranges of the augmentation; each picture draws its own strengths from them, uniformly."""
 
     occluded: float
     """Fraction of the images with something in front."""
@@ -86,8 +86,8 @@ KNOWN_SCENE = AugmentationStrength(
 """One camera before a scene whose picture is there: light drifts and something is put down now and then."""
 
 
-class _Amounts(NamedTuple):
-    """The amounts drawn for each image; the first axis of each is the batch's."""
+class _Drawn(NamedTuple):
+    """The strengths drawn for each image; the first axis of each tensor is the batch."""
 
     light: Tensor  # [batch, 1, height, width], a logarithm
     exponent: Tensor  # [batch, 1, 1, 1]
@@ -96,32 +96,32 @@ class _Amounts(NamedTuple):
     offset: Tensor  # [batch, 1, 1]
     blur: Tensor  # [batch, 1, 1, 1]
     noise: Tensor  # [batch, 1, 1, 1]
-    noise_place: Tensor  # [batch]
+    noise_start: Tensor  # [batch]
 
 
 def augment(
     images: Float[Tensor, "batch 3 height width"], random: np.random.Generator, most: AugmentationStrength
 ) -> Float[Tensor, "batch 3 height width"]:
-    """Pictures as a camera on a cluttered desk might take them; each is augmented by amounts of its own.
+    """Pictures as a camera on a cluttered desk might take them; each is augmented with strengths of its own.
 
     Args:
         images: sRGB in [0, 1].
-        random: Draws every amount.
+        random: Draws every strength.
         most: From which ranges.
 
     Returns:
         Images of the same shape, in [0, 1].
     """
     images = _occlude(images, random, most.occluded)
-    amounts = _draw(images, random, most)
+    drawn = _draw(images, random, most)
     at_once = max(1, _VALUES_AT_ONCE // images[0].numel())
     for first in range(0, len(images), at_once):
         part = slice(first, first + at_once)
-        images[part] = _augmented(images[part], _Amounts._make(values[part] for values in amounts))
+        images[part] = _augmented(images[part], _Drawn._make(values[part] for values in drawn))
     return images
 
 
-def _draw(images: Tensor, random: np.random.Generator, most: AugmentationStrength) -> _Amounts:
+def _draw(images: Tensor, random: np.random.Generator, most: AugmentationStrength) -> _Drawn:
     count, _, height, width = images.shape
 
     def even(low: float, high: float, *shape: int) -> Tensor:
@@ -132,7 +132,7 @@ def _draw(images: Tensor, random: np.random.Generator, most: AugmentationStrengt
     cells = int(random.integers(*_SHADE_CELLS))
     grid = torch.from_numpy(random.normal(size=(count, 1, cells, cells))).to(images) * even(0, most.shade, 1, 1, 1)
     down, across = (_smooth(size, cells).to(images) for size in (height, width))
-    return _Amounts(
+    return _Drawn(
         light=down @ grid @ across.T,
         exponent=even(-most.gamma, most.gamma, 1, 1, 1).exp(),
         mixing=gain * (saturation * torch.eye(3).to(images) + (1 - saturation) / 3),
@@ -140,11 +140,11 @@ def _draw(images: Tensor, random: np.random.Generator, most: AugmentationStrengt
         offset=even(-most.offset, most.offset, 1, 1),
         blur=even(0, most.blur, 1, 1, 1),
         noise=even(-most.noise, most.noise, 1, 1, 1),
-        noise_place=torch.from_numpy(random.integers(_NOISE_PLACES, size=count)).to(images.device),
+        noise_start=torch.from_numpy(random.integers(_NOISE_STARTS, size=count)).to(images.device),
     )
 
 
-def _augmented(images: Tensor, by: _Amounts) -> Tensor:
+def _augmented(images: Tensor, by: _Drawn) -> Tensor:
     # Uneven light and the camera's response to it, in the domain where one is a sum and the other a product.
     lit = images.clamp(min=_LEAST).log_().add_(by.light).clamp_(_DARKEST, 0).mul_(by.exponent).exp_()
     # Saturation, exposure, white balance, contrast: one matrix on the channels.
@@ -152,7 +152,7 @@ def _augmented(images: Tensor, by: _Amounts) -> Tensor:
     bias = (1 - by.contrast) * middle + by.offset
     colored = torch.baddbmm(bias, by.contrast * by.mixing, lit.flatten(2)).view_as(lit)
     blurred = colored.mul(1 - by.blur).addcmul_(_gaussian(colored), by.blur)
-    return blurred.addcmul_(_noise(blurred, by.noise_place), by.noise).clamp_(0, 1)
+    return blurred.addcmul_(_noise(blurred, by.noise_start), by.noise).clamp_(0, 1)
 
 
 @functools.cache
@@ -171,16 +171,16 @@ def _gaussian(images: Tensor) -> Tensor:
     return wide.mul_(1 / 256)
 
 
-def _noise(images: Tensor, places: Tensor) -> Tensor:
-    """Gaussian noise, each image's from another place of a long line: drawing it anew costs ten times as much."""
+def _noise(images: Tensor, starts: Tensor) -> Tensor:
+    """Gaussian noise, for each image another stretch of one long sequence: drawing it anew costs ten times as much."""
     num_values = images[0].numel()
     windows = _noise_line(num_values, images.device).unfold(0, num_values, 1)
-    return windows[places].view_as(images)
+    return windows[starts].view_as(images)
 
 
 @functools.cache
 def _noise_line(num_values: int, device: torch.device) -> Tensor:
-    values = np.random.default_rng(0).standard_normal(_NOISE_PLACES + num_values, dtype=np.float32)
+    values = np.random.default_rng(0).standard_normal(_NOISE_STARTS + num_values, dtype=np.float32)
     return torch.from_numpy(values).to(device)
 
 

@@ -52,9 +52,9 @@ def _outline(random: np.random.Generator) -> np.ndarray:
         count = 24 if kind < 0.8 else int(random.integers(3, 7))
         angles = np.sort(random.uniform(0, 2 * np.pi, count)) if count < 24 else np.arange(24) * np.pi / 12
         corners = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    turn, lean = random.uniform(0, 2 * np.pi), random.uniform(-0.3, 0.3)
+    angle, lean = random.uniform(0, 2 * np.pi), random.uniform(-0.3, 0.3)
     squeeze = np.diag([0.5, 0.5 * random.uniform(0.12, 1.0)])
-    rotation = np.array([(np.cos(turn), -np.sin(turn)), (np.sin(turn), np.cos(turn))])
+    rotation = np.array([(np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle))])
     return np.asarray(corners @ squeeze @ np.array([(1, lean), (0, 1)]) @ rotation)
 
 
@@ -73,9 +73,9 @@ def _pattern(shape: tuple[int, ...], size: float, random: np.random.Generator) -
     if kind == "print":
         return _print(shape, random)
     v, u = np.mgrid[: shape[0], : shape[1]]
-    turn = random.uniform(0, np.pi)
+    angle = random.uniform(0, np.pi)
     pitch = random.uniform(3, max(4, size / 2))
-    waves = [np.sin((u * np.cos(a) + v * np.sin(a)) * 2 * np.pi / pitch) for a in (turn, turn + np.pi / 2)]
+    waves = [np.sin((u * np.cos(a) + v * np.sin(a)) * 2 * np.pi / pitch) for a in (angle, angle + np.pi / 2)]
     field = waves[0] * waves[1] if kind == "tiles" else waves[0]
     return (field > 0).astype(np.float32)
 

@@ -67,8 +67,8 @@ def _trial(call: str) -> tuple[float | None, str]:
     except subprocess.TimeoutExpired:
         return None, f"took longer than {_TRIAL_LIMIT_S} s"
     if done.returncode:
-        said = (done.stderr.strip().splitlines() or ["without a word"])[-1]
-        return None, f"failed with status {done.returncode}: {said}"
+        text = (done.stderr.strip().splitlines() or ["without a word"])[-1]
+        return None, f"failed with status {done.returncode}: {text}"
     return float(done.stdout), ""
 
 

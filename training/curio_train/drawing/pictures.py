@@ -159,16 +159,16 @@ def _carried(scene: Scene, around: SceneContext, turn_deg: float) -> tuple[Scene
     center = np.mean(positions, axis=0) if around.center_m is None and positions else around.center_m
     if turn_deg == 0 or center is None:
         return scene, around
-    turn = Rotation.from_rotvec(-np.radians(turn_deg) * np.array(around.up)).as_matrix()
-    orbit = Pose(turn, center - turn @ center)
+    rotation = Rotation.from_rotvec(-np.radians(turn_deg) * np.array(around.up)).as_matrix()
+    orbit = Pose(rotation, center - rotation @ center)
     objects = tuple(replace(item, pose=orbit @ item.pose) for item in scene.objects)
     ground = around.ground
     if ground is not None:
-        up = turn @ ground.up
+        up = rotation @ ground.up
         # The centre's height over the ground stays; the camera's is that plus its own over the centre.
         ground = replace(ground, up=up, camera_height_m=ground.camera_height_m + float((ground.up - up) @ center))
     assert around.light is not None  # settled before
-    return replace(scene, objects=objects), replace(around, light=turn @ around.light, ground=ground)
+    return replace(scene, objects=objects), replace(around, light=rotation @ around.light, ground=ground)
 
 
 def _rendered(scene: Scene, around: SceneContext, behind: np.ndarray | None, samples: int) -> np.ndarray:

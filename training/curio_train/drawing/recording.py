@@ -62,11 +62,11 @@ def _log_objects(recording: rerun.RecordingStream, scene: Scene, context: SceneC
     low, high = (np.array([bound(box, axis=0) for box in corners]).reshape(-1, 3) for bound in (np.min, np.max))
     poses = [item.pose for item in scene.objects]
     centers = [pose.apply(middle) for pose, middle in zip(poses, (low + high) / 2, strict=True)]
-    turns = [Rotation.from_matrix(pose.rotation).as_quat() for pose in poses]
+    quaternions_xyzw = [Rotation.from_matrix(pose.rotation).as_quat() for pose in poses]
     boxes = rerun.Boxes3D(
         centers=np.reshape(centers, (-1, 3)),
         half_sizes=(high - low) / 2,
-        quaternions=[rerun.Quaternion(xyzw=turn) for turn in turns],
+        quaternions=[rerun.Quaternion(xyzw=xyzw) for xyzw in quaternions_xyzw],
         labels=[f"{item.kind} {item.confidence:.2f}" for item in scene.objects],
     )
     recording.log("camera/boxes", boxes)

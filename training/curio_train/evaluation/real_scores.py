@@ -40,7 +40,7 @@ class Estimate:
     confidence: float
     """1 where the model has none."""
     seconds: float
-    """Spent on the frame, reading included; mean of those read together."""
+    """Seconds spent on the frame, including decoding; the mean over frames of one batch."""
 
 
 Pairs = Sequence[tuple[Estimate, Annotation]]

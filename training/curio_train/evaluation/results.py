@@ -1,4 +1,4 @@
-"""Keeps what was found out about a run as JSON in its folder, where export and reports read it."""
+"""Stores the measurements of a run as JSON in its folder; export and reports read them."""
 
 import json
 from collections.abc import Mapping

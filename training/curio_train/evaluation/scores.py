@@ -107,11 +107,11 @@ def pose_scores(
         points: [num_points, 3] of the model, metres.
         info: Diameter and symmetries.
     """
-    turns = rotation_errors_deg(estimates, truths, info)
+    rotation_deg = rotation_errors_deg(estimates, truths, info)
     offsets = np.array([e.translation_m - t.translation_m for e, t in zip(estimates, truths, strict=True)]) * _MM
     return {
         "add_recall": recall(add_errors(estimates, truths, points, info), ADD_THRESHOLD),
-        "rotation_deg_median": float(np.median(turns)),
+        "rotation_deg_median": float(np.median(rotation_deg)),
         "translation_mm_median": float(np.median(np.linalg.norm(offsets, axis=1))),
         "lateral_mm_median": float(np.median(np.linalg.norm(offsets[:, :2], axis=1))),
         "depth_mm_median": float(np.median(np.abs(offsets[:, 2]))),

@@ -267,8 +267,8 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
 def _jittered_layers(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
     """Within the block every layer's output is jittered by about as much as another order of rounding changes it."""
 
-    def off(_layer: nn.Module, _given: object, said: Tensor) -> Tensor:
-        return said * (1 + _LAYER_JITTER * torch.randn(said.shape, generator=generator))
+    def off(_layer: nn.Module, _given: object, output: Tensor) -> Tensor:
+        return output * (1 + _LAYER_JITTER * torch.randn(output.shape, generator=generator))
 
     layers = [module for module in network.modules() if module is not network and not list(module.children())]
     hooks = [layer.register_forward_hook(off) for layer in layers]

@@ -151,14 +151,14 @@ def _as_our_errors(repository: str) -> Iterator[None]:
     except LocalTokenNotFoundError as exc:
         raise UsageError(f"{failure}: {_LOG_IN}") from exc
     except HfHubHTTPError as exc:
-        status, said = exc.response.status_code, exc.server_message or first_line(exc)
+        status, text = exc.response.status_code, exc.server_message or first_line(exc)
         if status in (401, 403, 404):
-            raise UsageError(f"{failure}: the hub refuses it ({said}); {_LOG_IN}") from exc
+            raise UsageError(f"{failure}: the hub refuses it ({text}); {_LOG_IN}") from exc
         if status in (409, 412):
             raise ExportError(
                 f"{failure}: somebody else has changed it meanwhile; give the same command again"
             ) from exc
-        raise ExportError(f"{failure}: the hub answers {status}: {said}") from exc
+        raise ExportError(f"{failure}: the hub answers {status}: {text}") from exc
     except (HTTPError, ConnectionError, LocalEntryNotFoundError) as exc:
         raise ExportError(f"{failure}: the hub does not answer: {first_line(exc)}; try again later") from exc
     except ValueError as exc:  # the hub does not take the card's metadata

@@ -37,7 +37,7 @@ _FLAT = 1e-6  # of the diameter
 _NUM_NAMED = 12
 _PLAIN_SRGB = 0.7  # of bodies without a colour beside others that have one
 _MM_OF_M = {"step": 1000.0, "iges": 1.0}  # cascadio 0.1 leaves IGES in millimetres and calls them metres
-_SAID = re.compile(r"\x1b\[[0-9;]*m|\*{2,}")  # colours and frames of OpenCASCADE's messages
+_DECORATION = re.compile(r"\x1b\[[0-9;]*m|\*{2,}")  # colours and frames of OpenCASCADE's messages
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +107,8 @@ def _tessellated(path: Path, kind: Kind, content: bytes, body: str | None) -> li
         done = subprocess.run(command, input=content, capture_output=True, timeout=_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired as exc:
         raise MeshError(f"{path}: OpenCASCADE did not mesh it within {_TIMEOUT_S} s; export a simpler part") from exc
-    said = [" ".join(line.split()) for line in _SAID.sub("", done.stderr.decode(errors="replace")).splitlines()]
-    last = next((line for line in reversed(said) if line), "without a word")
+    lines = [" ".join(line.split()) for line in _DECORATION.sub("", done.stderr.decode(errors="replace")).splitlines()]
+    last = next((line for line in reversed(lines) if line), "without a word")
     if done.returncode:
         raise MeshError(f"{path}: OpenCASCADE ended with status {done.returncode} on it ({last}); export it again")
     bodies = _from_glb(done.stdout, kind) if done.stdout else []

@@ -57,8 +57,8 @@ def triangles(outline: np.ndarray) -> np.ndarray:
     """
     remaining, found = list(range(len(outline)))[::-1], []
     while len(remaining) > 2:
-        turns = zip(remaining[-1:] + remaining[:-1], remaining, remaining[1:] + remaining[:1], strict=True)
-        ear = next((turn for turn in turns if _is_ear(outline, turn, remaining)), None)
+        triples = zip(remaining[-1:] + remaining[:-1], remaining, remaining[1:] + remaining[:1], strict=True)
+        ear = next((triple for triple in triples if _is_ear(outline, triple, remaining)), None)
         if ear is None:
             raise ValueError(f"no ear among corners {remaining}; expected a simple polygon, clockwise")
         found.append(ear)
@@ -66,10 +66,10 @@ def triangles(outline: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def _is_ear(outline: np.ndarray, turn: tuple[int, int, int], remaining: list[int]) -> bool:
+def _is_ear(outline: np.ndarray, triple: tuple[int, int, int], remaining: list[int]) -> bool:
     """Whether the corner in the middle is convex and its triangle holds no other corner."""
-    a, b, c = outline[list(turn)]
-    others = outline[[corner for corner in remaining if corner not in turn]]
+    a, b, c = outline[list(triple)]
+    others = outline[[corner for corner in remaining if corner not in triple]]
     inside = (_cross(b - a, others - a) >= 0) & (_cross(c - b, others - b) >= 0) & (_cross(a - c, others - c) >= 0)
     return bool(_cross(b - a, c - b) > 0 and not inside.any())
 

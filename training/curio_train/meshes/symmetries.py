@@ -74,7 +74,7 @@ def find_symmetries(mesh: Mesh) -> Symmetries:
             if len(continuous) == 2:
                 return Symmetries((), tuple((axis, surface.centre) for axis in continuous))
         elif not (continuous and discrete):
-            discrete += [turn for turn in surface.rotations_about(axis) if not _is_known(turn, discrete)]
+            discrete += [rotation for rotation in surface.rotations_about(axis) if not _is_known(rotation, discrete)]
     if continuous:
         discrete = discrete[:1]
     return Symmetries(tuple(surface.clear_ones(discrete)), tuple((axis, surface.centre) for axis in continuous))
@@ -119,7 +119,7 @@ class _Surface:
 
     def _least_miss(self, axis: np.ndarray) -> float:
         """Smallest miss of a turn of prime order about an axis: turns of every other order contain such turns."""
-        distances = [self._tree.query(self._few @ _turn(axis, 2 * np.pi / order).T)[0] for order in (2, 3, 5, 7, 11)]
+        distances = [self._tree.query(self._few @ _about(axis, 2 * np.pi / order).T)[0] for order in (2, 3, 5, 7, 11)]
         return float(min(np.percentile(distance, 95) for distance in distances))
 
     def continuous_axis(self, axis: np.ndarray) -> np.ndarray | None:
@@ -127,8 +127,8 @@ class _Surface:
         fitted = self._fitted(axis, np.radians(_PROBE_ANGLES_DEG[0]))
         if fitted is None:
             return None
-        turns = (_turn(fitted, np.radians(degrees)) for degrees in _PROBE_ANGLES_DEG)
-        return fitted if all(self._carried_onto_itself(turn) for turn in turns) else None
+        rotations = (_about(fitted, np.radians(degrees)) for degrees in _PROBE_ANGLES_DEG)
+        return fitted if all(self._carried_onto_itself(rotation) for rotation in rotations) else None
 
     def rotations_about(self, axis: np.ndarray) -> list[np.ndarray]:
         """All turns [4, 4] (metres) about an axis by 360°/n and its multiples, for the largest n that fits.
@@ -136,20 +136,20 @@ class _Surface:
         A slim shape misses itself by little after any turn about its long axis; so a turn must also miss by clearly
         less than those that are no symmetry.
         """
-        other = max(self._misses(_turn(axis, np.radians(degrees)), self._turned)[0] for degrees in _PROBE_ANGLES_DEG)
+        other = max(self._misses(_about(axis, np.radians(degrees)), self._turned)[0] for degrees in _PROBE_ANGLES_DEG)
         for order in range(LARGEST_ORDER, 1, -1):
             fitted = self._fitted(axis, 2 * np.pi / order)
             if fitted is None:
                 continue
-            if self._carried_onto_itself(_turn(fitted, 2 * np.pi / order), _CLEARLY_LESS * other):
-                return [self.in_metres(_turn(fitted, 2 * np.pi * k / order)) for k in range(1, order)]
+            if self._carried_onto_itself(_about(fitted, 2 * np.pi / order), _CLEARLY_LESS * other):
+                return [self.in_metres(_about(fitted, 2 * np.pi * k / order)) for k in range(1, order)]
         return []
 
-    def clear_ones(self, turns: list[np.ndarray]) -> list[np.ndarray]:
-        """The rotations that miss by about as much as the best: noise affects all symmetries of a surface alike."""
-        misses = np.array([self._misses(turn[:3, :3], self._turned)[0] for turn in turns])
+    def clear_ones(self, rotations: list[np.ndarray]) -> list[np.ndarray]:
+        """The rotations whose residual is near the smallest one: noise affects all symmetries of a surface alike."""
+        misses = np.array([self._misses(rotation[:3, :3], self._turned)[0] for rotation in rotations])
         limit = max(_NOISE, _SHARED_NOISE * misses.min(initial=np.inf))
-        return [turn for turn, miss in zip(turns, misses, strict=True) if miss <= limit]
+        return [rotation for rotation, miss in zip(rotations, misses, strict=True) if miss <= limit]
 
     def _fitted(self, axis: np.ndarray, angle: float) -> np.ndarray | None:
         """The axis near the given one about which that turn fits best (iterated closest points), or None.
@@ -157,27 +157,27 @@ class _Surface:
         The points' mean stays where it is under any symmetry, so the axis passes through it and only its direction is
         sought.
         """
-        turn = _turn(axis, angle)
-        if self._misses(turn, self._few)[0] > _COARSE * TOLERANCE:
+        rotation = _about(axis, angle)
+        if self._misses(rotation, self._few)[0] > _COARSE * TOLERANCE:
             return None
         some = self._turned[::3]
         for _ in range(_FIT_STEPS):
-            nearest, distances = self._nearest(some @ turn.T)
+            nearest, distances = self._nearest(some @ rotation.T)
             close = distances < _COARSE * TOLERANCE
-            turn = Rotation.align_vectors(nearest[close], some[close])[0].as_matrix()
-        vector = Rotation.from_matrix(turn).as_rotvec()
+            rotation = Rotation.align_vectors(nearest[close], some[close])[0].as_matrix()
+        vector = Rotation.from_matrix(rotation).as_rotvec()
         found = float(np.linalg.norm(vector))
         if np.degrees(abs(found - angle)) > _DRIFT_DEG:
             return None
         return vector / found if vector @ axis > 0 else -vector / found
 
-    def _carried_onto_itself(self, turn: np.ndarray, tolerance: float = TOLERANCE) -> bool:
-        typical, largest = self._misses(turn, self._turned)
+    def _carried_onto_itself(self, rotation: np.ndarray, tolerance: float = TOLERANCE) -> bool:
+        typical, largest = self._misses(rotation, self._turned)
         return typical < min(tolerance, TOLERANCE) and largest < LARGEST_MISS
 
-    def _misses(self, turn: np.ndarray, points: np.ndarray) -> tuple[float, float]:
+    def _misses(self, rotation: np.ndarray, points: np.ndarray) -> tuple[float, float]:
         """95th percentile and maximum of how far turned points lie from the surface."""
-        _, distances = self._nearest(points @ turn.T)
+        _, distances = self._nearest(points @ rotation.T)
         return float(np.percentile(distances, 95)), float(distances.max())
 
     def _nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -190,14 +190,14 @@ class _Surface:
         nearest = np.take_along_axis(found, best[..., None], axis=1)[:, 0]
         return nearest, np.take_along_axis(distances, best, axis=1)[:, 0]
 
-    def in_metres(self, turn: np.ndarray) -> np.ndarray:
+    def in_metres(self, rotation: np.ndarray) -> np.ndarray:
         """A turn [3, 3] about the centre, as a motion [4, 4] of the object frame."""
         result = np.eye(4)
-        result[:3, :3], result[:3, 3] = turn, self.centre - turn @ self.centre
+        result[:3, :3], result[:3, 3] = rotation, self.centre - rotation @ self.centre
         return result
 
 
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+def _about(axis: np.ndarray, angle: float) -> np.ndarray:
     matrix: np.ndarray = Rotation.from_rotvec(axis * angle).as_matrix()
     return matrix
 
@@ -216,7 +216,7 @@ def _same_line(a: np.ndarray, b: np.ndarray, within_deg: float) -> bool:
     return bool(abs(a @ b) > np.cos(np.radians(within_deg)))
 
 
-def _is_known(turn: np.ndarray, known: list[np.ndarray]) -> bool:
+def _is_known(rotation: np.ndarray, known: list[np.ndarray]) -> bool:
     return any(
-        np.degrees(Rotation.from_matrix(turn[:3, :3].T @ other[:3, :3]).magnitude()) < _SAME_DEG for other in known
+        np.degrees(Rotation.from_matrix(rotation[:3, :3].T @ other[:3, :3]).magnitude()) < _SAME_DEG for other in known
     )

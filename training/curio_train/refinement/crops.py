@@ -23,7 +23,7 @@ class PoseUpdate:
     """Translation across the view, diameters."""
     log_depth: Float[Tensor, "batch 1"]
     """Logarithm of the factor on the distance."""
-    turn: Float[Tensor, "batch 3"]
+    rotation_vector: Float[Tensor, "batch 3"]
     """Rotation vector, radians."""
     light: Float[Tensor, "batch 3"]
     """Change of the light."""
@@ -49,7 +49,8 @@ class PoseAndLight(NamedTuple):
         scale = update.log_depth.exp()
         across, depth = self.translation_m[:, :2] + update.across * diameter_m, self.translation_m[:, 2:]
         translation_m = torch.cat([across * scale, depth * scale], dim=1)
-        return PoseAndLight(rotation_from_vector(update.turn) @ self.rotation, translation_m, self.light + update.light)
+        rotation = rotation_from_vector(update.rotation_vector) @ self.rotation
+        return PoseAndLight(rotation, translation_m, self.light + update.light)
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,13 +79,13 @@ class DetectionRefiner:
 
 def _code(detections: Sequence[Detection], light: Sequence[float], canonical_from_cam: np.ndarray) -> SceneCode:
     """Scene codes of the detections in the canonical camera, one a row."""
-    turn = torch.from_numpy(np.asarray(canonical_from_cam, np.float64))
+    rotation = torch.from_numpy(np.asarray(canonical_from_cam, np.float64))
     rotations = torch.tensor([list(one.rotation) for one in detections], dtype=torch.float64).reshape(-1, 3, 3)
     positions = torch.tensor([list(one.translation_m) for one in detections], dtype=torch.float64)
-    towards_light = turn @ torch.tensor(list(light) or DEFAULT_LIGHT, dtype=torch.float64)
+    towards_light = rotation @ torch.tensor(list(light) or DEFAULT_LIGHT, dtype=torch.float64)
     code = {
-        ROTATION_6D: rotation_6d_from_matrix(turn @ rotations)[:, None].float(),
-        TRANSLATION: (positions @ turn.T)[:, None].float(),
+        ROTATION_6D: rotation_6d_from_matrix(rotation @ rotations)[:, None].float(),
+        TRANSLATION: (positions @ rotation.T)[:, None].float(),
         LIGHT: towards_light.float().expand(len(detections), 3),
     }
     if all(one.color for one in detections):

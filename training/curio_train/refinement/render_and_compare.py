@@ -58,7 +58,7 @@ class _Round(NamedTuple):
 
 _ROUNDS = (_Round(2, 2), _Round(1, 1), _Round(0, 1), _Round(0, 1))
 _STEPS = 12  # a round
-_LEARNING_RATES = {"across": 0.01, "log_depth": 0.015, "turn": 0.03, "light": 0.05}
+_LEARNING_RATES = {"across": 0.01, "log_depth": 0.015, "rotation_vector": 0.03, "light": 0.05}
 _BETAS = (0.8, 0.95)  # of Adam: there are few steps
 _MIN_GAIN, _MAX_GAIN = 0.4, 2.0
 _MIN_VARIANCE = 0.002  # of colours below which gains are uncertain

@@ -17,7 +17,7 @@ class Ground:
     up: np.ndarray
     """Its unit normal [3], camera frame."""
     camera_height_m: float
-    """How far below the camera it lies."""
+    """Height of the camera above the ground, metres."""
     albedo_srgb: float
     """Grey, in [0, 1]."""
 

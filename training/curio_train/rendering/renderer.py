@@ -169,8 +169,8 @@ class Renderer:
     def _corners(self, rotation: Tensor, translation_m: Tensor) -> np.ndarray:
         """[batch · slots, n, 3], of polytopes around the objects, camera frame."""
         # In numpy: torch would wake its threads for it, and those then spin beside the renderer's.
-        turn, shift = (v.detach().numpy() for v in (rotation, translation_m))
-        corners_m = self._corners_m @ turn.swapaxes(-1, -2) + shift[:, :, None]
+        rotations, positions_m = (v.detach().numpy() for v in (rotation, translation_m))
+        corners_m = self._corners_m @ rotations.swapaxes(-1, -2) + positions_m[:, :, None]
         return np.asarray(corners_m.reshape(-1, *corners_m.shape[2:]))
 
     def _pack(

@@ -51,9 +51,9 @@ def _missing_extra(exc: ModuleNotFoundError) -> str:
 
 def warn(text: str) -> None:
     """Print a warning on stderr."""
-    tell(f"warning: {text}")
+    report(f"warning: {text}")
 
 
-def tell(text: str) -> None:
+def report(text: str) -> None:
     """Print a line on stderr, where progress goes; stdout is for results."""
     print(text, file=sys.stderr)

@@ -29,7 +29,7 @@ _SAME_CAMERA = 0.01  # of the focal length, and of it for the centre
 
 
 def scale_by_objects(
-    structure: Structure, models: Path, data: Path | None, tell: Callable[[str], None]
+    structure: Structure, models: Path, data: Path | None, report: Callable[[str], None]
 ) -> tuple[Structure, str]:
     """Scale a structure to metres by the poses that trained networks predict in the photographs.
 
@@ -37,7 +37,7 @@ def scale_by_objects(
         structure: Of any scale.
         models: Folder with a run or a model for each object, LineMOD's in two stages.
         data: Data folder of exported models.
-        tell: Called with a line after each object, which takes about a minute.
+        report: Called with a line after each object, which takes about a minute.
 
     Returns:
         The same in metres, and a line about how well the objects agree.
@@ -50,7 +50,7 @@ def scale_by_objects(
     scales = {}
     for candidate in candidates(models, "--objects", of_any_method=False):
         scale = _scale_by(candidate.path, data, structure)
-        tell(f"{candidate.name}: {'seen too seldom to tell' if scale is None else f'{scale:.4g} m a unit'}")
+        report(f"{candidate.name}: {'seen too seldom to tell' if scale is None else f'{scale:.4g} m a unit'}")
         if scale is not None:
             scales[candidate.name] = scale
     if not scales:

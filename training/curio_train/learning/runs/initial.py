@@ -99,7 +99,7 @@ def uses_synthetic_labels(config: RunConfig) -> bool:
 
 
 def _learned(network: nn.Module) -> dict[str, Tensor]:
-    """The state of a network but templates, which are drawn anew."""
+    """The state of a network without its templates, which are drawn anew."""
     drawn = ObjectsNetwork.DRAWN if isinstance(network, ObjectsNetwork) else ()
     return {name: value for name, value in network.state_dict().items() if not name.startswith(drawn)}
 

@@ -57,7 +57,7 @@ def allocentric_to_egocentric(
 
 
 def random_positions(field: Field, count: int, random: np.random.Generator) -> Float[Tensor, "count 3"]:
-    """Positions uniform in a perspective field's range: in (x/z, y/z, z)."""
+    """Positions [n, 3], drawn uniformly in (x/z, y/z, z) over a perspective field's range."""
     position = random.uniform(field.lower, field.upper, (count, 3))
     position[:, :2] *= position[:, 2:]
     return torch.from_numpy(position).float()
