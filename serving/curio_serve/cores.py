@@ -12,7 +12,7 @@ _UNLIMITED = ("max", "-1")
 
 
 def num_cores(cgroup: Path = _CGROUP) -> int:
-    """Those of its affinity, or as many as its container's quota amounts to where that is less; at least 1.
+    """Number of cores: those of its affinity or its container's quota, whichever is less; at least 1.
 
     Args:
         cgroup: Where control groups are mounted.
@@ -23,7 +23,7 @@ def num_cores(cgroup: Path = _CGROUP) -> int:
 
 
 def _quota(cgroup: Path) -> float | None:
-    """Cores that the quota amounts to; None without one."""
+    """Number of cores that the quota allows; None without a quota."""
     for names in _QUOTA_FILES:
         try:
             quota, period = " ".join((cgroup / name).read_text() for name in names).split()

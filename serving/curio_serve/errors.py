@@ -28,7 +28,7 @@ class CurioError(Exception):
     """Base of all errors of this package."""
 
     exit_status = 1
-    """Of a command line that ends with this error."""
+    """Exit status of a command that ends with this error."""
 
 
 class UsageError(CurioError):
@@ -86,7 +86,7 @@ class OutputError(CurioError):
 
 
 class ServiceError(CurioError):
-    """The service, not the request."""
+    """The service failed; the request may be fine."""
 
 
 class Overloaded(ServiceError):
@@ -147,8 +147,8 @@ def error_from_status(status: str, reason: str, text: str) -> CurioError:
 
     Args:
         status: Name of the gRPC status.
-        reason: Name of the server's exception, or empty where it told none.
-        text: What the server said.
+        reason: Name of the server's exception; empty if it gave none.
+        text: The server's message.
     """
     for kind, name in STATUS_OF.items():
         if name == status and reason in ("", kind.__name__):

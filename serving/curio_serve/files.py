@@ -1,4 +1,4 @@
-"""Reads files that users name, which may be anything: pipes, devices, sparse files larger than the memory."""
+"""Reads files that users name. They may be anything: pipes, devices, sparse files larger than the memory."""
 
 import errno
 import json
@@ -29,7 +29,7 @@ def read_file(path: str | Path, max_bytes: int) -> bytes:
 
 
 def read_given(path: str | Path) -> bytes:
-    """The content of a small file that a command line names: of a pipe, too, as a shell's ``<(...)`` is one.
+    """The content of a small file that a command line names. Pipes are accepted, such as a shell's ``<(...)``.
 
     Raises:
         OSError: It cannot be read, or is larger than 4 MiB; ``strerror`` says which.
@@ -55,7 +55,7 @@ def read_json(path: str | Path, max_bytes: int) -> Any:
 
 
 def direct(path: Path) -> Path:
-    """The path without ``..``, so that making its folders makes none that it only passes through."""
+    """The path without ``..``, so that creating it creates no folder that it only passes through."""
     return Path(os.path.realpath(path.parent), path.name) if ".." in path.parts else path
 
 

@@ -6,7 +6,7 @@ import socket
 def port_fault(host: str, port: int) -> str | None:
     """Why a port cannot be listened on, and what to do; None if it is free.
 
-    Viser says nothing where its port is taken: it serves the page at another one.
+    Viser does not report a port in use; it serves the page at another one.
     """
     try:
         with socket.create_server((host, port)):

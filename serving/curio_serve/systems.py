@@ -1,4 +1,4 @@
-"""What not every operating system has, each with a way to do without.
+"""Features that not every operating system has, each with a fallback.
 
 Linux, macOS and Windows differ in more than this package needs; whatever serving and detection use beyond what all of
 them have is here, and nowhere else.
@@ -64,7 +64,7 @@ def limit_this_process(memory_bytes: int, cpu_s: int) -> None:
 
 
 def c_function(name: str) -> Any:
-    """A function of the C library that runs this process; None where there is none of this name."""
+    """A function of this process's C library; None if the library has none of this name."""
     try:
         return getattr(ctypes.CDLL(None), name, None)
     except TypeError:  # Windows has no such library

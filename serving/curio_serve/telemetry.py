@@ -80,7 +80,7 @@ class LogWriter(logging.Handler):
 
 
 def _is_ours_to_say(record: logging.LogRecord) -> bool:
-    """False for gRPC's traceback for each header of a client that is no UTF-8."""
+    """Whether to keep a log record; drops gRPC's traceback for each client header that is not UTF-8."""
     return not (record.name.startswith("grpc") and record.exc_info and record.exc_info[0] is UnicodeDecodeError)
 
 

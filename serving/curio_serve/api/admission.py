@@ -37,7 +37,7 @@ class Call(Protocol):
         """The connection that it came over."""
 
     def add_callback(self, callback: Callable[[], None]) -> bool:
-        """Have a function called when the call ends; False if it has ended already."""
+        """Register a function that runs when the call ends; False if it has ended already."""
 
 
 class QueueEntry:
@@ -68,12 +68,12 @@ class WorkQueue:
     def __init__(
         self, num_slots: int, max_waiting: int, metrics: Metrics, num_behind: Callable[[str], int] = lambda _: 0
     ) -> None:
-        """Nobody waits yet.
+        """Create an empty queue.
 
         Args:
             num_slots: Calls that work at the same time.
-            max_waiting: Calls that wait for that.
-            metrics: Show both.
+            max_waiting: Calls that may wait for a slot.
+            metrics: Receive both numbers.
             num_behind: Given a connection, how many calls with a reservation a further call of it would overtake.
         """
         self.num_slots = num_slots
@@ -189,7 +189,7 @@ class WorkQueue:
                 self._num_free += 1
 
     def _why_not(self, remaining_s: float | None, num_behind: int = 0) -> str:
-        """Why a further call cannot be answered in time; empty if it can, as far as is known."""
+        """The reason why one more call could not be answered in time; empty if it can, as far as is known."""
         num_ahead = len(self._reserved) - num_behind + len(self._waiting) - self._num_free
         if num_ahead >= self._max_waiting:
             return _IS_FULL

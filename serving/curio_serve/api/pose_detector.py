@@ -53,7 +53,7 @@ class PoseService(PoseDetectorServicer):
         metrics.streams.set_function(lambda: len(self._streams))
 
     def Detect(self, requests: Iterator[messages.DetectRequest], context: Context) -> messages.DetectResponse:
-        """Answer the one request; a full queue refuses it before it is read."""
+        """Answer the request of a unary call; a full queue refuses it before its message is read."""
         with self._calls.record("Detect", context) as call, self._work.reserve(context) as entry:
             request = only_message(requests)
             call.request_id = request.request_id
@@ -194,7 +194,7 @@ class PoseService(PoseDetectorServicer):
         frame: image.Frame,
         times_s: tuple[float, float, float],
     ) -> None:
-        """Write what is not of the models into an answer, and count it; ``times_s``: begun, decoded, waited."""
+        """Fill in the fields of an answer that no model writes, and count it; ``times_s``: begun, decoded, waited."""
         begun, decoded, waited_s = times_s
         inferred = time.perf_counter()
         # Only now: what writes messages has gone cold by the time that a network has run.
@@ -207,7 +207,7 @@ class PoseService(PoseDetectorServicer):
         self._metrics.inference_s.observe(inferred - decoded)
 
     def _detectors(self, request: messages.DetectRequest) -> list[Detector]:
-        """The models that a request names; refuses what can be refused without work."""
+        """The models that a request names. Requests that can be refused without work are refused here."""
         limits, models, num_regions = self._limits, request.models, len(request.regions)
         if not 1 <= len(models) <= limits.max_models:
             raise ArgumentError(f"models names {len(models)} models; expected 1 to {limits.max_models} (--max-models)")

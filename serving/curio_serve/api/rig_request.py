@@ -1,4 +1,4 @@
-"""Translates requests with the views of several cameras, and refuses those that are none of a rig."""
+"""Translates requests with the views of several cameras, and refuses requests that do not describe a rig."""
 
 from curio_proto.v1.detector_pb2 import DetectRequest
 
@@ -14,7 +14,7 @@ _NOT_WITH_VIEWS = ("encoded", "raw", "camera", "track", "max_instances")
 
 
 def check_views(request: DetectRequest, num_models: int, most_runs: int) -> None:
-    """Refuse what can be refused without work.
+    """Refuse requests that can be refused without work.
 
     Args:
         request: With views.
@@ -38,7 +38,7 @@ def check_views(request: DetectRequest, num_models: int, most_runs: int) -> None
 
 
 def view_camera(request: DetectRequest, number: int) -> PinholeCamera | None:
-    """The camera that a view says.
+    """The camera of a view.
 
     Raises:
         CameraError: It is impossible.
@@ -53,7 +53,7 @@ def rig_view(
     """A decoded view.
 
     Raises:
-        CameraMissing: No camera is known of it.
+        CameraMissing: The view has no camera.
         CameraError: ``cam_from_rig`` is no rigid transform.
     """
     known = camera or detectors[0].model.camera.for_frame(frame.width, frame.height)

@@ -89,7 +89,7 @@ def status_from_error(error: CurioError) -> grpc.Status:
 
 
 def frame_error(error: CurioError) -> FrameError:
-    """The same for one frame of a stream that goes on."""
+    """The status of one frame of a stream, which goes on."""
     code = grpc.StatusCode[status_of(error)].value[0]
     return FrameError(code=code, reason=type(error).__name__, message=_text(error))
 

@@ -1,7 +1,8 @@
-"""Bounds the number of open streams, and lets no idle ones keep others out.
+"""Bounds the number of open streams, so that idle ones do not keep others out.
 
-A connection may have a part of all. Once all are open, a new stream takes the place of an idle one: of the connection
-that has most, the one that has waited longest for its next frame. A connection with as many streams is not touched.
+One connection may have a fraction of all streams. Once all are open, a new stream replaces an idle one: of the
+connection that has most streams, the one that has waited longest for its next frame. A connection that has as many
+streams as the caller's keeps them.
 """
 
 import threading
@@ -33,16 +34,16 @@ class Stream:
         self._idle_since: float | None = time.monotonic()
 
     def works(self) -> None:
-        """Say that it has a frame."""
+        """Mark the stream as working on a frame."""
         self._idle_since = None
 
     def waits(self) -> None:
-        """Say that it waits for a frame."""
+        """Mark the stream as waiting for a frame."""
         self._idle_since = time.monotonic()
 
     @property
     def idle_s(self) -> float:
-        """How long it has waited for a frame."""
+        """Seconds that the stream has waited for a frame."""
         since = self._idle_since
         return 0.0 if since is None else time.monotonic() - since
 
@@ -56,11 +57,11 @@ class Streams:
         self._open: dict[str, list[Stream]] = {}  # of each connection
 
     def __len__(self) -> int:
-        """How many are open."""
+        """Number of open streams."""
         return sum(map(len, list(self._open.values())))
 
     def open(self, call: StreamCall) -> Stream:
-        """Take a place, which is free again when the call ends.
+        """Open a stream, which is closed when the call ends.
 
         Raises:
             Overloaded: Too many streams are open.
@@ -85,7 +86,7 @@ class Streams:
         return stream
 
     def _replaceable(self, num_own: int) -> Stream:
-        """The idle stream whose place a connection with so many streams may have."""
+        """The idle stream that may be closed in favour of a connection with so many streams."""
         found = [
             (len(streams), idle_s, stream)
             for streams in self._open.values()

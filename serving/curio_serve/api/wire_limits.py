@@ -20,7 +20,7 @@ _TEXTS = (FieldDescriptor.TYPE_STRING, FieldDescriptor.TYPE_BYTES)
 def check_counts(kind: Descriptor, data: bytes) -> None:
     """Refuse a message that would unfold to far more memory than its own length.
 
-    What is no message at all passes, for the parser to refuse.
+    Bytes that are no message pass; the parser refuses them.
 
     Raises:
         ArgumentError: It has more than MAX_FIELDS fields and elements, or MAX_NUMBERS packed numbers.
@@ -72,7 +72,7 @@ class _Scan:
 
 @cache
 def _fields(kind: Descriptor) -> dict[int, Descriptor | int]:
-    """The kind of message in each field that holds messages, and the least bytes a number of fields of numbers."""
+    """For fields that hold messages, the kind; for fields that hold numbers, the fewest bytes of one number."""
     return {
         field.number: field.message_type or _WIDTHS.get(field.type, 1)
         for field in kind.fields

@@ -1,4 +1,4 @@
-"""The same over a Ray cluster: actors on every node hold the model, images go out by name, answers come back in order.
+"""Runs ``curio-detect`` on a Ray cluster: actors on every node hold the model, take images by name and answer in order.
 
 The nodes need this package, and the images, the model and the drawings' folder under the same paths as here.
 """
@@ -81,7 +81,7 @@ def over_cluster(
 
 
 def _check_reachable(address: str) -> None:
-    """Ray itself tries for minutes where nobody listens.
+    """Check that somebody listens at the address: Ray itself would try for minutes.
 
     Raises:
         OSError: Nobody does.
@@ -109,5 +109,5 @@ def _answers(ray: Any, open_answering: Opening, portion: list[SourceImage]) -> I
 
 
 def _for_other_nodes(image: SourceImage) -> SourceImage:
-    """The image by a path that does not depend on the working folder, which is another one there."""
+    """The image with an absolute path: other nodes have other working folders."""
     return image if is_url(image.path) else replace(image, path=os.path.abspath(image.path))

@@ -51,7 +51,7 @@ def main() -> NoReturn:
 
 
 def run(arguments: DetectArguments) -> int:
-    """Does the work and returns the exit status: 1 where an image has no answer.
+    """Run the command and return the exit status: 1 if an image has no answer.
 
     Raises:
         UsageError: The call cannot be carried out.
@@ -127,7 +127,7 @@ def run(arguments: DetectArguments) -> int:
 
 
 def _models_first(arguments: DetectArguments) -> tuple[tuple[str, ...], DetectArguments]:
-    """The models of a call, and the call with the images alone after them."""
+    """Split a call into its models, and a call that names only images."""
     from curio_serve.batch.named_models import split_models
 
     models, images = split_models(arguments.model, arguments.images)
@@ -204,7 +204,7 @@ def _check_overlays(folder: Path, images: tuple[str, ...]) -> None:
 
 
 def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "Settings") -> "list[Estimator]":
-    """Each model on this machine or behind a server."""
+    """An estimator for each model, on this machine or behind a server."""
     from curio_serve.batch.estimators import LocalEstimator, RemoteEstimator
     from curio_serve.batch.named_models import SERVED_MODEL
     from curio_serve.models.model_folder import open_model
@@ -265,7 +265,7 @@ def _client(arguments: DetectArguments, address: str) -> "PoseClient":
 
 
 def _recordings(arguments: DetectArguments) -> "list[Recording]":
-    """The recordings among the images, each looked at before any work."""
+    """Open the recordings among the images, so that a bad one is refused before any work."""
     from curio_serve.batch.images.source_image import Topics
     from curio_serve.batch.images.sources import STANDARD_INPUT, is_recording
 

@@ -42,23 +42,23 @@ class Settings:
     """The settings that all images of a run share."""
 
     cameras: CameraFile | None = None
-    """Their intrinsics; None for 2D worlds and models that allow a default."""
+    """Intrinsics of the images; None for 2D worlds and models that allow a default."""
     min_confidence: float = 0.0
-    """Detections below are left out."""
+    """Detections below this confidence are left out."""
     max_detections: int | None = None
-    """Most confident first; None: all."""
+    """Largest number of detections, the most confident ones; None: all."""
     apply_exif_rotation: bool = False
-    """Turn pixels, and K with them."""
+    """Rotate the pixels as EXIF says, and K with them."""
     overlays: Path | None = None
     """Where drawings go; None: nowhere."""
     sources_root: Path = Path("/")
-    """Folder below which the images' paths are told apart."""
+    """Folder that holds all images; drawings repeat the paths below it."""
     track_objects: int | None = None
     """Follow that many objects of each model from image to image; None: every image on its own."""
     frame_rate: float = 30.0
-    """Of images that do not say when they were taken, frames/s."""
+    """Frames per second of images that carry no time."""
     max_instances: int | None = None
-    """Of each kind of object; None: what one run of the network gives."""
+    """Largest number of instances of each kind of object; None: as many as one run of the network gives."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ class Seen:
     width: int
     height: int
     camera: PinholeCamera | None
-    """The one that was used, of the frame as turned."""
+    """Intrinsics that were used, of the frame after its EXIF rotation."""
     results: Sequence[RegionResult]
     decode_ms: float | None
     inference_ms: float
     frame: images.Frame | None = None
-    """Where the frame was decoded here in its full size."""
+    """The decoded frame, if it was decoded here in full size."""
 
 
 class Estimator(ABC):
@@ -110,7 +110,7 @@ class Estimator(ABC):
         return self._look(image, data, self._camera(image))
 
     def result(self, image: SourceImage, data: bytes, seen: Seen) -> ImageResult:
-        """What is written down about an image."""
+        """The result of an image for the result file."""
         is_turned = image.pixels is None and images.open_header(data).orientation > 1
         return ImageResult(
             image.name,
@@ -288,13 +288,13 @@ class LocalEstimator(Estimator):
 
 
 class RemoteEstimator(Estimator):
-    """Asks a server; the model's version is settled once, so that a file of results is of one model.
+    """Asks a server. It asks for the version once, so all results of a file are of one model.
 
     Args:
         client: Connected to the server.
         model: ``name`` (the latest version now) or ``name/version``.
         settings: For all images.
-        timeout_s: For the question which model that is: a wrong address shall not take long to be told.
+        timeout_s: For the first question, about the version: a wrong address is reported soon.
     """
 
     def __init__(self, client: "PoseClient", model: str, settings: Settings, *, timeout_s: float = 5.0) -> None:
@@ -321,7 +321,7 @@ class RemoteEstimator(Estimator):
 
 
 def _turned(camera: PinholeCamera | None, frame: images.Frame) -> PinholeCamera | None:
-    """The camera of a decoded frame, from that of its stored pixels."""
+    """The camera of a decoded frame, given the camera of its stored pixels."""
     if camera is None or not frame.quarter_turns:
         return camera
     stored = (frame.height, frame.width) if frame.quarter_turns % 2 else (frame.width, frame.height)
@@ -330,7 +330,7 @@ def _turned(camera: PinholeCamera | None, frame: images.Frame) -> PinholeCamera 
 
 
 def _drawing_path(folder: Path, image: SourceImage, root: Path) -> Path:
-    """Mirrors the image's path below the folder, so that no two drawings meet."""
+    """The path of a drawing, which repeats the image's path so that no two drawings collide."""
     path = Path(os.path.abspath(image.relative_name))
     target = folder / path.relative_to(root if path.is_relative_to(root) else path.anchor)
     return target if target.suffix.lower() in _DRAWN_SUFFIXES else target.with_name(target.name + ".jpg")

@@ -20,7 +20,7 @@ _RECENT = 30  # frames that the rates are means of
 
 
 class LatestFrame:
-    """Reads a video source in a thread and keeps its newest frame; frames that nobody took in time are dropped."""
+    """Reads a video source in a thread and keeps only its newest frame."""
 
     num_read: int
     """Frames read so far."""

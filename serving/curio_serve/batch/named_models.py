@@ -54,7 +54,7 @@ def _names_models(argument: str) -> bool:
 
 
 def _expanded(argument: str) -> list[str]:
-    """The argument, or the models in it where it is a folder of models or on a hub."""
+    """The argument itself; for a folder of models or a model on a hub, the models in it."""
     if is_on_hub(argument):
         return _models_in(str(fetch(argument, lambda line: print(f"curio-detect: {line}", file=sys.stderr))))
     return [argument] if not os.path.isdir(argument) or is_model(argument) else _models_in(argument) or [argument]
@@ -67,6 +67,6 @@ def _models_in(folder: str) -> list[str]:
 
 
 def _folders(path: str) -> Iterator[os.DirEntry[str]]:
-    """The folders in a folder; none where it cannot be listed, which is told when its images are wanted."""
+    """The folders in a folder; none if it cannot be listed (reading its images then reports that)."""
     with suppress(OSError), os.scandir(path) as entries:
         yield from (entry for entry in entries if entry.is_dir())

@@ -1,4 +1,4 @@
-"""Where the results of a call go, and in which format."""
+"""Chooses the result file of a call, and its format."""
 
 from collections.abc import Sequence
 from pathlib import Path

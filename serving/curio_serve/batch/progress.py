@@ -1,4 +1,4 @@
-"""What ``curio-detect`` tells on standard error: a bar on a terminal, and what it came to at the end."""
+"""Progress of ``curio-detect`` on standard error: a bar on a terminal, and a summary at the end."""
 
 import sys
 import time
@@ -38,7 +38,7 @@ class Progress:
             self._bar.stop()
 
     def count(self, lines: ImageLines) -> None:
-        """One more image."""
+        """Count one more image."""
         self._num_new += 1
         if lines.is_turned:
             self._first_turned = self._first_turned or lines.image

@@ -1,4 +1,4 @@
-"""The bar that ``curio-detect`` shows on a terminal; apart, so that other runs need not wait for rich to load."""
+"""The progress bar of ``curio-detect``; in a module of its own, so that runs without a bar need not load rich."""
 
 from rich.console import Console
 from rich.progress import Progress, ProgressColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
@@ -6,7 +6,7 @@ from rich.text import Text
 
 
 class _Rate(ProgressColumn):
-    """Images a second, of late."""
+    """Recent images per second."""
 
     def render(self, task: Task) -> Text:
         return Text(f"{task.speed or 0.0:.1f} images/s")
@@ -33,9 +33,9 @@ class Bar:
         self._progress.start()
 
     def advance(self, num_errors: int) -> None:
-        """One more image; how many have no answer by now."""
+        """Count one more image, and show how many have no answer so far."""
         self._progress.update(self._task, advance=1, num_errors=num_errors)
 
     def stop(self) -> None:
-        """Leave the last state standing."""
+        """Stop, and leave the last state on the terminal."""
         self._progress.stop()

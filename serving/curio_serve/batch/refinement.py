@@ -27,9 +27,9 @@ class Refiner(Protocol):
     """Improves detections in place; safe to share between threads."""
 
     num_detections: int
-    """How many it has been given."""
+    """Number of detections so far."""
     num_refined: int
-    """How many of them got a pose that looks more like the frame."""
+    """Number of detections whose refined pose matches the frame better."""
 
     def __call__(
         self, pixels: np.ndarray, camera: PinholeCamera, detections: Sequence[Detection], light: Sequence[float]
@@ -49,7 +49,7 @@ def load_refiner(spec: ModelSpec, model: str, mesh: Path | None, unit: str | Non
 
     Args:
         spec: Of the model.
-        model: As it was named: a mesh is looked for where it lies.
+        model: Its path; the mesh may lie beside it.
         mesh: The object's; None: that of the run which the model lies in.
         unit: Of the mesh's coordinates; None: the file's own, or metres.
 

@@ -1,4 +1,4 @@
-"""``curio-detect --rig``: folders of several cameras, an instant at a time."""
+"""``curio-detect --rig``: detects in the images that several cameras took at the same instant."""
 
 import os
 import sys
@@ -38,13 +38,13 @@ class RigImage:
     """The images of all cameras at one instant."""
 
     name: str
-    """That of the first camera's image."""
+    """Name of the first camera's image."""
     images: tuple[SourceImage, ...]
-    """One a camera, in the rig's order."""
+    """One image of each camera, in the rig's order."""
 
 
 class RigEstimator:
-    """Answers instants by one model on this machine; safe to share between threads."""
+    """Detects in the images of an instant with one model on this machine; safe to share between threads."""
 
     def __init__(self, model: Model, cameras: Sequence[RigCamera], min_confidence: float, most: int | None) -> None:
         self._model, self._detector, self._cameras = model, Detector(model), cameras
@@ -97,7 +97,7 @@ def read_rig(arguments: DetectArguments, models: Sequence[str]) -> list[RigCamer
     """The cameras of a call.
 
     Raises:
-        UsageError: The file is no rig's, or the call asks for what is for one camera.
+        UsageError: The file describes no rig, or the call has an option that is for one camera.
     """
     assert arguments.rig is not None
     given = {
@@ -131,7 +131,7 @@ def read_rig(arguments: DetectArguments, models: Sequence[str]) -> list[RigCamer
 
 
 def instants(arguments: Sequence[str], passed_over: PassedOver) -> Iterator[RigImage]:
-    """The images of all cameras, an instant at a time, each camera's in the order of their names.
+    """The images of each instant. Those of each camera are taken in the order of their names.
 
     Raises:
         UsageError: One camera has more images than another.

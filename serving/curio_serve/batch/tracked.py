@@ -1,4 +1,4 @@
-"""What ``curio-detect --track`` asks of its call: frames are followed one after the other, here, from the first on."""
+"""Checks for ``curio-detect --track``, which follows frames in order, in this process, from the first one on."""
 
 import math
 import os
@@ -21,7 +21,7 @@ def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectA
     """The call with one image worked on at a time.
 
     Raises:
-        UsageError: It asks for what following cannot do.
+        UsageError: It has an option that does not go with following.
     """
     if remote := [model for model in models if not os.path.exists(model)]:
         raise UsageError(
@@ -47,10 +47,10 @@ def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectA
 def from_the_first(
     output: "ResultFile | ResultParts | PoseRecording", remaining: "Iterator[SourceImage]"
 ) -> "Iterator[SourceImage]":
-    """The images that are left, which have to be all: who was followed in those before is forgotten.
+    """The unanswered images, which have to be all: tracks of an earlier run are lost.
 
     Raises:
-        UsageError: The result file holds answers to some.
+        UsageError: The result file already has answers.
     """
     first = next(remaining, None)  # the file is read now
     if output.num_images:

@@ -20,16 +20,16 @@ _MAX_DISTANCE = 11.3  # squared Mahalanobis distance: 99 of 100 predictions of o
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Poses of one object in a common frame, one a row."""
+    """Predicted poses of one object in a common frame, one per row."""
 
     view: Array
-    """Number of the view that each is of, [n]."""
+    """Index of the view of each prediction, [n]."""
     rotation: Array
     """[n, 3, 3]."""
     translation_m: Array
     """[n, 3]."""
     covariance_m2: Array
-    """Of each position, [n, 3, 3]."""
+    """Covariance of each position, [n, 3, 3]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,7 +59,7 @@ class Batcher:
         return answer
 
     def _run_waiting(self) -> None:
-        """Run the calls that wait, the own one first; then tell the next one in the queue to run."""
+        """Run all waiting calls, our own first; then wake the next one in the queue to run."""
         with self._lock:
             calls = [self._waiting.popleft()]
             num_images = len(calls[0].images)

@@ -32,7 +32,7 @@ OUTPUTS = (
     *("translation", "rotation_6d", "confidence", "light", "visibility"),
     *("cell_translation", "cell_rotation_6d", "weights"),
 )
-"""Tensors that are read from crops: the pose, its logit and the light in each crop's camera, the logits of seeing the
+"""Tensors that the stage reads from crops: pose, its logit and light in each crop's camera, visibility logits of the
 object [n, 16, 16], and each cell's own pose and weight. Positions are (x, y) in diameters and z in expected depths."""
 _FLOAT32 = 1
 _OVERSAMPLING = 2  # as in training: each pixel of a crop is the mean of four samples

@@ -1,4 +1,4 @@
-"""A version's golden image: what the network said of it where it was exported, to be compared with what it says here.
+"""A version's golden image: the network's outputs where it was exported, to be compared with its outputs here.
 
 ``golden.npz`` holds ``image``, uint8 [height, width, 3], and the outputs for it by name, without a batch.
 """
@@ -34,7 +34,7 @@ class Golden:
     """By name, without a batch; at least one."""
 
     def differences(self, model: Model) -> dict[str, float]:
-        """Largest absolute difference of each stored output from what the model says; nan where either is not finite.
+        """Largest absolute difference between each stored output and the model's; nan if either is not finite.
 
         Raises:
             ModelError: The image cannot pass the graph, or an output is none of the graph's.
@@ -86,7 +86,7 @@ def golden_tolerance(model: Model) -> float:
 
 
 def check_golden(path: Path, model: Model) -> None:
-    """Refuse a model that does not say of the golden image what was exported.
+    """Refuse a model whose outputs for the golden image differ from the stored ones.
 
     Args:
         path: The file; a version without one is not checked.

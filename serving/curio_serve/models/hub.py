@@ -36,12 +36,12 @@ _FETCHED = [
 
 
 def is_on_hub(model: str) -> bool:
-    """Whether a model is named by its place on a hub."""
+    """Whether a name is an address on a hub."""
     return model.startswith(SCHEME)
 
 
 def is_repository(name: str) -> bool:
-    """Whether a repository may be called so: ``ORG/NAME``."""
+    """Whether a text is a valid name of a repository: ``ORG/NAME``."""
     return _REPOSITORY.fullmatch(name) is not None
 
 

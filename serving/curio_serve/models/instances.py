@@ -53,16 +53,16 @@ class InstanceSearch:
     """One image in which instances are found one after the other."""
 
     def __init__(self, model: Model, image: Array) -> None:
-        """Begin without any.
+        """Begin without instances.
 
         Args:
-            model: With K* and one slot; of others one reading is all.
+            model: Has K* and one slot.
             image: uint8 RGB [height, width, 3] as the model sees it.
         """
         self.image = image
-        """With the instances covered that were found."""
+        """The image with the found instances painted over."""
         self.readings: list[Values] = []
-        """One an instance, in the order they were found."""
+        """Outputs of each instance, in the order of search."""
         self._model, self._covered = model, list[Array]()
 
     def take(self, values: Values) -> bool:

@@ -144,7 +144,7 @@ def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAUL
 
 
 def _add_reliability(model: Model, path: Path) -> None:
-    """Add to a model's specification what was measured of it, if the file is there."""
+    """Add the measured reliability to a model's specification, if the file is there."""
     try:
         text = read_file(path, _MAX_RELIABILITY_BYTES)
     except (FileNotFoundError, NotADirectoryError):

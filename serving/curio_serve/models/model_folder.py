@@ -31,7 +31,7 @@ _VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
 
 def is_model_name(name: str) -> bool:
-    """Whether a folder may be called so: letters, digits, ``_``, ``-``, ``.``, at most 64, no leading dot."""
+    """Whether a text is a valid model name: at most 64 letters, digits, ``_``, ``-`` and ``.``, no leading dot."""
     return _NAME.fullmatch(name) is not None
 
 
@@ -50,7 +50,7 @@ def versions(folder: Path) -> list[int]:
 
 
 def _has_model(version: Path) -> bool:
-    """Whether a version's folder has a model; also if that cannot be found out, so that loading it says why."""
+    """Whether a version's folder has a model. True if that cannot be found out: loading it then reports why."""
     try:
         return stat.S_ISREG((version / MODEL_FILE).stat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -79,7 +79,7 @@ def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME)
 
 
 def open_model(path: str | Path, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
-    """Load the MODEL of a command line: a model's folder (latest version), a version's folder or an .onnx file.
+    """Load the MODEL of a command line: a model folder (its latest version), a version folder or an .onnx file.
 
     Args:
         path: What was typed.

@@ -1,4 +1,4 @@
-"""How far a model's answers may be trusted, as measured on renderings and stored beside the model.
+"""Reads a model's reliability, which was measured on renderings and is stored beside the model.
 
 ``reliability.json`` holds a ``Reliability`` message: for each object the confidence from which an answer counts as
 sure, and bounds of the pose error by confidence (split conformal prediction). Photographs may have adjusted both, and
@@ -30,7 +30,7 @@ _LEAST, _MOST_LOGIT = 1e-9, 60.0  # nearer to 0 and 1 logits say nothing
 
 
 def parse_reliability(text: bytes, objects: Sequence[str], where: str) -> Reliability:
-    """What was measured of a model.
+    """The measured reliability of a model.
 
     Args:
         text: Content of the file.
@@ -88,7 +88,7 @@ def calibrated(calibration: Sequence[float], confidence: float) -> float:
 
 
 def bounds_of(one: ObjectReliability, confidence: float) -> PoseBounds | None:
-    """The bounds for an answer of that confidence; None: it is unsure, or there are none."""
+    """The error bounds of an answer with a given confidence; None if it is unsure or nothing was measured."""
     row = bisect_right([bounds.min_confidence for bounds in one.bounds], confidence) - 1
     return one.bounds[row] if row >= 0 and confidence >= one.min_confidence else None
 
@@ -113,7 +113,7 @@ def add_interval(detection: Detection, reliability: Reliability) -> None:
 
 
 def region_status(detections: Iterable[Detection]) -> RegionStatus:
-    """What the detections of a region come to."""
+    """The status of a region, given its detections."""
     found = [detection.status for detection in detections]
     if not found:
         return REGION_STATUS_NO_OBJECT

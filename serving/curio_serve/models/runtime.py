@@ -48,7 +48,7 @@ def available_providers() -> list[str]:
 
 
 def short_name(provider: str) -> str:
-    """What ``--provider`` calls a provider: ``cpu`` for ``CPUExecutionProvider``."""
+    """The short name of a provider for ``--provider``: ``cpu`` for ``CPUExecutionProvider``."""
     return provider.removesuffix(_SUFFIX).lower()
 
 
@@ -78,7 +78,7 @@ def read_providers(text: str) -> tuple[str, ...]:
 
 
 def on_processor(providers: Sequence[str]) -> bool:
-    """Whether all of them compute on the processor, where batches gain nothing."""
+    """Whether all providers compute on the CPU, where batches gain nothing."""
     return _ON_PROCESSOR.issuperset(providers)
 
 

@@ -123,7 +123,7 @@ def _whole(
     kinds: dict[str, ObjectModel],
     before_run: Callable[[], None],
 ) -> list[_Seen]:
-    """The objects in a whole view."""
+    """Detect objects in a whole view."""
     (result,) = detector.detect(view.pixels, view.camera, reduction=view.reduction, before_run=before_run)
     found = []
     for one in result.detections:
@@ -142,7 +142,7 @@ def _read_again(
     kind: ObjectModel,
     before_run: Callable[[], None],
 ) -> list[_Seen]:
-    """Poses read in every view around what the views say; what whole views say where no crop shows the object."""
+    """Read poses from crops in every view around the views' estimate; without any, keep the whole views' poses."""
     stage = detector.model.crop_stage
     assert stage is not None
     expected = [pose.translation_m for _, pose, _ in sorted(_explained(seen, kind), key=lambda one: -one[0])]
@@ -166,7 +166,7 @@ def _read_again(
 
 
 def _explained(seen: list[_Seen], kind: ObjectModel) -> list[tuple[float, Consensus, list[_Seen]]]:
-    """Confidence and pose of what views agree on; without any agreement, of the surest of them."""
+    """Confidence and pose on which the views agree; if none agree, those of the most confident view."""
     if not seen:
         return []
     predictions = Predictions(

@@ -31,7 +31,7 @@ class RigCamera:
     """One camera of a rig."""
 
     name: str
-    """For people."""
+    """Name for messages."""
     camera: PinholeCamera
     """Intrinsics."""
     cam_from_rig: Array
@@ -76,7 +76,7 @@ def _rig_camera(entry: Any, where: str, number: int) -> RigCamera:
 
 
 def check_cam_from_rig(matrix: Array | Sequence[float], where: str) -> Array:
-    """A rigid transform.
+    """Check that a matrix is a rigid transform.
 
     Args:
         matrix: [4, 4], or its 16 values row after row.

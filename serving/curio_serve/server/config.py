@@ -84,7 +84,7 @@ class ServeConfig:
     """Print the settings in effect as TOML and stop."""
 
     def __post_init__(self) -> None:
-        """Refuse values that no server can have.
+        """Refuse impossible values.
 
         Raises:
             UsageError: Names the flag.
@@ -180,7 +180,7 @@ def _typed(variable: str, text: str, default: Any) -> Any:
 
 
 def _arguments(name: str, value: Any, source: str) -> list[str]:
-    """``models`` is the one setting without a flag."""
+    """Arguments for the parser; ``models`` is the only setting without a flag."""
     return [str(value)] if name == "models" else to_arguments(name, value, source)
 
 

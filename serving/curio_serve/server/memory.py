@@ -12,7 +12,7 @@ _LARGE_BYTES, _NUM_ARENAS = 1 << 20, 4
 
 
 def resident_bytes() -> int:
-    """Resident memory of this process; 0 where the system does not tell, and containers have no limit either."""
+    """Resident memory of this process in bytes; 0 if the system does not report it."""
     try:
         return int(_STATM.read_text().split()[1]) * mmap.PAGESIZE
     except OSError:

@@ -13,7 +13,7 @@ _LIMIT_S = 10.0
 
 
 class MetricsPort(ThreadingHTTPServer):
-    """Answers scrapes, each on a thread of its own, from :meth:`start` on."""
+    """Answers scrapes from :meth:`start` on, each in its own thread."""
 
     # On Windows this would let two servers have one port.
     allow_reuse_address = os.name == "posix"
@@ -29,7 +29,7 @@ class MetricsPort(ThreadingHTTPServer):
         super().__init__((host, port), _Scrape)
 
     def start(self) -> None:
-        """Begin to answer."""
+        """Start answering."""
         threading.Thread(target=self.serve_forever, name="curio-metrics", daemon=True).start()
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -43,7 +43,7 @@ class MetricsPort(ThreadingHTTPServer):
             limit.cancel()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Pass over a scrape that was broken off; the base class prints a traceback."""
+        """Ignore a scrape that broke off; the base class would print a traceback."""
 
 
 class _Scrape(BaseHTTPRequestHandler):
@@ -62,7 +62,7 @@ class _Scrape(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, *_: Any) -> None:
-        """Nothing: stderr is for JSON lines."""
+        """Log nothing: stderr is for JSON lines."""
 
 
 def _end(connection: socket.socket) -> None:

@@ -41,7 +41,7 @@ class ReceptionLimits:
     message_bytes: int = 32 << 20
     """The longest message."""
     held_bytes: int = 256 << 20
-    """All messages that arrive or wait; at least one message fits."""
+    """Memory for all messages that arrive or wait; at least one message fits."""
     message_s: float = 10.0
     """Time in which a call's first message has to arrive."""
     idle_s: float = 60.0
@@ -73,7 +73,7 @@ class Reception:
     """Receives the messages of all calls within limits."""
 
     def __init__(self, limits: ReceptionLimits) -> None:
-        """Nothing is watched before :meth:`start`."""
+        """Create a reception; :meth:`start` starts its watching thread."""
         self._limits = limits
         self._lock = threading.Lock()
         self._all_bytes = self._free = max(limits.held_bytes, limits.message_bytes)
@@ -91,7 +91,7 @@ class Reception:
         self._watcher.start()
 
     def stop(self) -> None:
-        """Stop that."""
+        """Stop ending calls."""
         self._stopped.set()
         self._watcher.join()
 
@@ -136,7 +136,7 @@ class Reception:
         return data
 
     def _learn(self, peer: str, length: int) -> None:
-        """Expect messages of such a length from a connection; after a long one, its next short ones count as long."""
+        """Record a connection's message length. After a long message, its next short ones count as long, too."""
         if peer not in self._lengths and len(self._lengths) >= _MOST_KNOWN:
             del self._lengths[next(iter(self._lengths))]
         self._lengths[peer] = max(length, self._lengths.get(peer, 0) // 2)
@@ -145,7 +145,7 @@ class Reception:
         return self._lengths.get(peer, min(_LONG_BYTES, self._limits.message_bytes))
 
     def _rank(self, peer: str) -> tuple[bool, int]:
-        """Sorts the waiting; the least comes first.
+        """Sort key of waiting arrivals; the smallest is served first.
 
         First messages, which may never come, get one half of the memory before the others, and the rest after them.
         """
@@ -161,7 +161,7 @@ class Reception:
         )
 
     def num_behind(self, peer: str) -> int:
-        """How many calls wait for memory that a further call of a connection would overtake."""
+        """Number of calls waiting for memory that a new call of this connection would overtake."""
         with self._lock:
             rank = self._rank(peer)
             return sum(self._rank(waiting.peer) > rank for waiting in self._waiting)
@@ -184,7 +184,7 @@ class Reception:
         raise CallCancelled("the call ended before there was memory for its message (--message-memory-mb)")
 
     def _hand_out(self) -> None:
-        """Give free memory to those who wait and may have it."""
+        """Give free memory to the waiting arrivals that may have it."""
         while self._waiting and self._free >= self._limits.message_bytes:
             candidates = [waiting for waiting in self._waiting if self._may_have(waiting.peer)]
             if not candidates:

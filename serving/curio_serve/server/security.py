@@ -1,4 +1,4 @@
-"""Checks who may call: TLS, client certificates, bearer tokens."""
+"""Authenticates callers: TLS, client certificates, bearer tokens."""
 
 import hmac
 import logging
@@ -27,7 +27,7 @@ class Tokens:
         self._known = known
 
     def refuse(self, metadata: Iterable[tuple[str, str | bytes]]) -> TokenError | None:
-        """Why a call with this metadata may not be made, if so."""
+        """The reason for refusing a call with this metadata; None if it is allowed."""
         if not self._known:
             return None
         shown = dict(metadata).get("authorization", "")

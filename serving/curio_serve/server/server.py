@@ -148,7 +148,7 @@ class PoseServer:
         return f"http://{self.config.host}:{http.server_port}/metrics"
 
     def _announce(self) -> None:
-        """Health of the whole and of each service and model."""
+        """Set the health status of the server and of each service and model."""
         names = [name for name, _ in self._repository]
         for name in ("", _POSE.full_name, _INFERENCE.full_name, *names):
             self._health.set(name, _SERVING)
@@ -238,7 +238,7 @@ def channel_options(config: ServeConfig) -> list[tuple[str, int]]:
 
 
 def _why_not(host: str, port: int) -> str:
-    """Why an address cannot be listened on, or nothing: gRPC keeps the operating system's reason to itself."""
+    """Why an address cannot be listened on, or empty: gRPC does not pass on the operating system's reason."""
     with contextlib.closing(socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)) as probe:
         try:
             probe.bind((host, port))

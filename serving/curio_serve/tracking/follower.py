@@ -39,14 +39,14 @@ class Following:
     """How objects are followed."""
 
     keep_s: float = KEEP_S
-    """How long an object that is not seen is answered as predicted."""
+    """Seconds for which an object that is not seen is answered with its predicted pose."""
     num_objects: int = 1
-    """Most that are followed at a time."""
+    """Largest number of objects followed at a time."""
     search: bool = False
-    """Look at this whole frame, whatever is followed."""
+    """Run the whole model on this frame in any case."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be.
+        """Refuse impossible values.
 
         Raises:
             ArgumentError: A value is out of range.
@@ -109,7 +109,7 @@ class Follower:
         return self._answer(frame, light, following, min_confidence, results)
 
     def _read_crops(self, frame: StreamFrame) -> Sequence[float]:
-        """Look for each object where it is expected; the light there."""
+        """Read each object from crops at its expected position; return the light."""
         light: Sequence[float] = ()
         for track in self._tracks:
             pose = frame.read(track.filter.translation_m)
@@ -119,7 +119,7 @@ class Follower:
         return light
 
     def _search_around(self, frame: StreamFrame) -> Sequence[float]:
-        """Look for each object that is not seen around where it was seen last; the light there."""
+        """Search each object that is not seen around its last position; return the light."""
         light: Sequence[float] = ()
         for track in self._tracks:
             if track.is_seen:
@@ -135,7 +135,7 @@ class Follower:
         return light
 
     def _is_taken(self, track: Track, position_m: Array) -> bool:
-        """Whether another object that is seen is at that place."""
+        """Whether another object that is seen is at this position."""
         apart_m = _TAKEN * track.kind.diameter_m
         return any(
             other.is_seen
@@ -154,11 +154,11 @@ class Follower:
         return waited_s >= (_MORE_S if num_seen < wanted else _VERIFY_S)
 
     def _is_whole_needed(self, frame: StreamFrame, following: Following) -> bool:
-        """Whether the whole frame has to be looked at, after the surroundings of what was not seen."""
+        """Whether to run the whole model, after the search around objects that are not seen."""
         return following.search or not self._tracks or not all(track.is_seen for track in self._tracks)
 
     def _look(self, frame: StreamFrame, following: Following) -> Sequence[float]:
-        """Look at the whole frame; the light there."""
+        """Run the whole model on the frame; return the light."""
         has_crops = frame.detector.model.crop_stage is not None
         hidden = [track for track in self._tracks if track.is_seen] if has_crops and following.num_objects > 1 else []
         found, light = frame.look(hidden)
@@ -176,7 +176,7 @@ class Follower:
         return light
 
     def _verified(self, found: list[Measurement]) -> list[Measurement]:
-        """Drop a track where another place is surer to be the one object; what is left are objects not yet seen."""
+        """Drop a track if a detection elsewhere is more confident; return the detections of objects not seen yet."""
         left = []
         for measured in found:
             seen = next((t for t in self._tracks if t.is_seen and t.kind.name == measured.object), None)

@@ -1,4 +1,4 @@
-"""One frame of a stream as following needs it: whole, with objects hidden, and as an answer."""
+"""One frame of a stream: runs the model on it, whole or with objects covered, and fills its answer."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,16 +21,16 @@ Array = np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class StreamFrame:
-    """A frame, its camera and the model that looks at it."""
+    """A frame, its camera and the model to run on it."""
 
     detector: Detector
     """Of the model."""
     pixels: Array
     """uint8 RGB [height / reduction, width / reduction, 3]."""
     camera: PinholeCamera | None
-    """Of the full-size frame."""
+    """Intrinsics of the full-size frame."""
     reduction: int
-    """How much smaller the pixels are."""
+    """Factor by which the pixels are smaller than the frame."""
     time_s: float
     """When it was taken."""
     before_run: Callable[[], None]
@@ -38,7 +38,7 @@ class StreamFrame:
 
     @cached_property
     def known_camera(self) -> PinholeCamera | None:
-        """The camera, or the model's own where a frame may come without."""
+        """The camera, or the model's default camera for a frame without one."""
         height, width = self.pixels.shape[:2]
         default = self.detector.model.camera.for_frame(width * self.reduction, height * self.reduction)
         return self.camera or default

@@ -42,11 +42,11 @@ class PoseFilter:
         return float(np.sqrt(np.diag(self._angular)[:3].mean()))
 
     def predict(self, seconds: float, *, seen: bool = True) -> None:
-        """Move on in time.
+        """Predict the state at a later time.
 
         Args:
             seconds: Not negative.
-            seen: Whether the object was seen last; the velocity of one that was not dies away.
+            seen: Whether the object was seen in the last frame; if not, its velocity decays.
         """
         if not seen:
             fading = float(np.exp(-seconds / _DAMPING_S))
@@ -59,7 +59,7 @@ class PoseFilter:
         self._elapsed_s = seconds
 
     def update(self, translation_m: Array, covariance_m2: Array) -> None:
-        """Take in a measured position.
+        """Update with a measured position.
 
         Args:
             translation_m: [3], camera frame.
@@ -72,7 +72,7 @@ class PoseFilter:
         self.velocity_m_s += correction[3:]
 
     def update_rotation(self, rotation: Array, variance: float) -> None:
-        """Take in a measured rotation cam_from_obj [3, 3] with its variance about each axis, rad²."""
+        """Update with a measured rotation cam_from_obj [3, 3] and its variance about each axis, rad²."""
         innovation = rotation_vector(rotation @ self.rotation.T)
         noise = np.eye(3) * max(variance, _LEAST_RAD**2)
         correction, self._angular = _corrected(
@@ -82,7 +82,7 @@ class PoseFilter:
         self.turn_rad_s += correction[3:]
 
     def replace_rotation(self, rotation: Array, variance: float) -> None:
-        """Begin anew with another rotation; position and velocity stay."""
+        """Restart with another rotation; position and velocity stay."""
         self.rotation, self.turn_rad_s = np.array(rotation, float), np.zeros(3)
         self._angular = _first(np.eye(3) * max(variance, _LEAST_RAD**2), _FIRST_TURN_RAD_S)
 
@@ -100,7 +100,7 @@ def _floored(covariance_m2: Array) -> Array:
 
 
 def _process(seconds: float, acceleration: float) -> Array:
-    """Covariance that a random acceleration adds in a time: piecewise constant from frame to frame."""
+    """Process noise covariance of a random acceleration that is constant from frame to frame."""
     gain = np.array([seconds**2 / 2, seconds])
     result: Array = np.kron(np.outer(gain, gain), np.eye(3)) * acceleration**2
     return result

@@ -1,4 +1,4 @@
-"""What one stream remembers from frame to frame; it ends with the stream."""
+"""The state that one stream keeps from frame to frame; it ends with the stream."""
 
 import math
 from collections.abc import Callable
@@ -30,7 +30,7 @@ class FollowingStream:
         self._camera: PinholeCamera | None = None
 
     def check(self, request: Tracking) -> tuple[Following, float]:
-        """How a frame is to be followed, and when it was taken.
+        """The options of following for a frame, and the time when it was taken.
 
         Raises:
             ArgumentError: Its time is no number or not after the frame before, or another value is out of range.
@@ -66,7 +66,7 @@ class FollowingStream:
             detectors: Of the models.
             pixels: uint8 RGB [height / reduction, width / reduction, 3].
             camera: Intrinsics of the full-size frame.
-            min_confidence: What the frame shows below it is not answered.
+            min_confidence: Detections below it are not answered.
             reduction: How much smaller than the frame the pixels were decoded.
             results: The field of a response.
             before_run: Called before each run of a network.

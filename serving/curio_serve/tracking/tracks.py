@@ -1,4 +1,4 @@
-"""What is known of the objects that one stream shows of one model: which is which, where each is, when it was seen."""
+"""Tracks of one model's objects in one stream: their numbers, their poses, and when each was seen."""
 
 import math
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ class Measurement:
 
     @staticmethod
     def of_whole_frame(kind: ObjectModel, translation_m: Array, rotation: Array, confidence: float) -> "Measurement":
-        """A pose of a network that says nothing of its spread: positions are worse in depth than across."""
+        """A pose from the whole model, which gives no spread: a larger variance in depth than across is assumed."""
         distance_m = float(np.linalg.norm(translation_m))
         ray = translation_m / max(distance_m, 1e-9)
         across, along = (_ACROSS * kind.diameter_m) ** 2, (_IN_DEPTH * distance_m) ** 2
@@ -65,11 +65,11 @@ class Track:
     """One object that is followed."""
 
     number: int
-    """The same as long as it is followed; never given twice in a stream."""
+    """Constant as long as the object is followed; never given twice in a stream."""
     kind: ObjectModel
     """Of the object."""
     filter: PoseFilter
-    """Its pose."""
+    """Filter of its pose."""
     first_s: float
     """When it was found."""
     seen_s: float
@@ -77,7 +77,7 @@ class Track:
     measured: Measurement
     """When it was last seen."""
     is_seen: bool = True
-    """In the present frame."""
+    """Whether it is seen in the current frame."""
     _symmetries: Array = field(default_factory=lambda: np.eye(3)[None])
     _num_flips: int = 0
 
@@ -88,12 +88,12 @@ class Track:
         return Track(number, kind, pose, time_s, time_s, measured, _symmetries=symmetry_rotations(kind))
 
     def predict(self, seconds: float) -> None:
-        """Move on to the next frame, in which it counts as not seen until :meth:`update`."""
+        """Predict the next frame, in which it counts as not seen until :meth:`update`."""
         self.filter.predict(seconds, seen=self.is_seen)
         self.is_seen = False
 
     def update(self, measured: Measurement, time_s: float) -> None:
-        """Take in what a frame shows of it."""
+        """Update with a measurement in the current frame."""
         unseen_s = time_s - self.seen_s
         self.is_seen, self.seen_s, self.measured = True, time_s, measured
         if self._is_elsewhere(measured) and unseen_s > 0:
@@ -113,7 +113,7 @@ class Track:
             self._num_flips += 1
 
     def reach_m(self, time_s: float) -> float:
-        """How far from its expected position it may be found."""
+        """Largest distance from its expected position at which a measurement is assigned to it."""
         spread_m = 3 * float(self.filter.position_std_m.max())
         return _NEAR * self.kind.diameter_m + spread_m + _DRIFT_M_S * (time_s - self.seen_s)
 
@@ -130,7 +130,7 @@ class Track:
 
 
 def assign(tracks: Sequence[Track], found: Sequence[Measurement], time_s: float, *, alone: bool) -> dict[int, int]:
-    """Which measurement belongs to which track, at the least sum of distances.
+    """Assign measurements to tracks with the least sum of distances.
 
     Args:
         tracks: Predicted to this frame.
@@ -154,7 +154,7 @@ def assign(tracks: Sequence[Track], found: Sequence[Measurement], time_s: float,
 
 
 def without_doubles(tracks: Sequence[Track]) -> list[Track]:
-    """The tracks of different objects: of two that are at one place, the one seen, then the older one, stays."""
+    """Drop duplicates: of two tracks at one position, keep the one that is seen, or else the older one."""
     kept: list[Track] = []
     for track in sorted(tracks, key=lambda t: (not t.is_seen, t.number)):
         apart = _SAME * track.kind.diameter_m

@@ -1,4 +1,4 @@
-"""Images behind URLs are fetched a few at a time, before their turn, because a store answers slowly but to many."""
+"""Fetches images behind URLs a few at a time and ahead: a store is slow to answer, but answers many at once."""
 
 from collections.abc import Generator, Iterable
 from dataclasses import replace

@@ -35,7 +35,7 @@ class Recording:
     info_topic: str
     """Topic of their CameraInfo."""
     has_info: bool
-    """Whether the recording has that one."""
+    """Whether the recording has that topic."""
 
     def __init__(self, path: str, topics: Topics) -> None:
         """Read what the recording holds, and no message yet.
@@ -61,7 +61,7 @@ class Recording:
         self._others = _images_first(types)
 
     def refuse_without_info(self) -> None:
-        """For models that need K.
+        """Refuse a recording without K, for models that need it.
 
         Raises:
             UsageError: There is no CameraInfo.
@@ -73,7 +73,7 @@ class Recording:
             )
 
     def images(self) -> Iterator[SourceImage]:
-        """Every image, in the order of recording; damage further on is one last image with that error."""
+        """Every image, in the order of recording. After damage, the last one carries the error."""
         infos: OrderedDict[int, PinholeCamera | str] = OrderedDict()
         waiting: deque[SourceImage] = deque()
         number = 0
@@ -98,7 +98,7 @@ class Recording:
     def _ready(
         self, waiting: deque[SourceImage], infos: OrderedDict[int, PinholeCamera | str], most: int
     ) -> Iterator[SourceImage]:
-        """The images from the first on that have their CameraInfo, and those that have waited for too many others."""
+        """The oldest images that have their CameraInfo, or that have waited for it too long."""
         while waiting:
             at = waiting[0].recorded
             assert at is not None
@@ -190,7 +190,7 @@ def _damaged(exc: Exception, where: str) -> str:
 
 
 def _modern(name: str) -> str:
-    """The name of a type with its folder, which old recordings leave out."""
+    """The name of a message type with its package's folder ``msg``, which old recordings leave out."""
     package, _, kind = name.rpartition("/")
     return name if package.endswith("/msg") else f"{package}/msg/{kind}"
 
@@ -204,7 +204,7 @@ def _only_image_topic(path: str, types: dict[str, str]) -> str:
 
 
 def _images_first(types: dict[str, str]) -> str:
-    """Topics with their types, for a person to choose from."""
+    """A list of topics and their types for an error message, topics of images first."""
     ordered = sorted(types, key=lambda topic: (types[topic] not in _IMAGE_TYPES, topic))
     return ", ".join(f"{topic} ({types[topic]})" for topic in ordered) or "no topic of ROS 2 messages"
 

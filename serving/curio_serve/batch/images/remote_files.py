@@ -29,18 +29,18 @@ _BUSY = (408, 429)  # of HTTP's 4xx, what another attempt may change
 
 @dataclass(frozen=True)
 class Patience:
-    """How long a store is waited for."""
+    """How long to wait for a store."""
 
     timeout_s: float = 60.0
-    """Of one attempt."""
+    """Seconds for one attempt."""
     num_attempts: int = 5
-    """Of a request, the first included."""
+    """Number of attempts of a request, including the first."""
     first_wait_s: float = 0.5
-    """Before the second attempt; twice as long before each further one, and up to half as much again by chance."""
+    """Seconds before the second attempt. Each further wait is twice as long, plus a random part of up to a half."""
 
 
 def is_url(path: str) -> bool:
-    """Whether an argument is a URL and no path."""
+    """Whether an argument is a URL rather than a path."""
     return _URL.match(path) is not None
 
 
@@ -50,7 +50,7 @@ def is_store(url: str) -> bool:
 
 
 def path_of(url: str) -> str:
-    """A relative path for a URL, in which a file of its own, such as a drawing, may be kept apart from all others'."""
+    """A relative path made of a URL, unique to it, for files such as drawings."""
     return posixpath.normpath(re.split(r"[?#]", url)[0].replace("://", "/")).lstrip("./")
 
 
@@ -205,7 +205,7 @@ def remote_files(scheme: str) -> RemoteFiles:
 
 
 def files_of(url: str) -> RemoteFiles:
-    """The files among which a URL is one.
+    """The files of a URL's scheme.
 
     Raises:
         UsageError: As :class:`RemoteFiles`.
@@ -214,7 +214,7 @@ def files_of(url: str) -> RemoteFiles:
 
 
 def _foreign_errors(scheme: str) -> tuple[type[Exception], ...]:
-    """What the libraries raise beside OSError.
+    """The exceptions, other than OSError, that the libraries raise.
 
     Raises:
         ImportError: They are not installed.

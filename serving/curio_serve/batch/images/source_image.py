@@ -27,21 +27,21 @@ class Topics:
 
 @dataclass(frozen=True)
 class RecordedAt:
-    """Where and when a robot's recording has an image."""
+    """The topic and the times of an image in a robot's recording."""
 
     topic: str
     """Topic of the image."""
     stamp_ns: int
-    """The camera's own, of the image's header, since the epoch."""
+    """Time stamp in the image's header, set by the camera; since the epoch."""
     log_time_ns: int
     """When the image was recorded."""
     frame_id: str
-    """Of the camera's optical frame."""
+    """Name of the camera's optical frame."""
 
 
 @dataclass(frozen=True)
 class SourceImage:
-    """An image that is going to be looked at."""
+    """An image to detect in."""
 
     name: str
     """Its path as given; a video's frames are ``clip.mp4#0`` and so on, a recording's ``run.mcap#/topic@SECONDS``."""
@@ -54,11 +54,11 @@ class SourceImage:
     data: bytes | None = None
     """Content of a recording's compressed image."""
     camera: PinholeCamera | None = None
-    """Its own camera, which a recording knows."""
+    """The image's own camera, if it comes from a recording that has it."""
     no_camera: str = ""
-    """Why a recording does not."""
+    """Why the recording has no camera for it."""
     recorded: RecordedAt | None = None
-    """For an image of a recording."""
+    """Topic and times, if the image comes from a recording."""
     error: str = ""
     """Why a video has no frames to give, or a folder no images."""
     time_s: float | None = None
@@ -90,7 +90,7 @@ class SourceImage:
 
     @property
     def relative_name(self) -> str:
-        """The path in which a file of its own, such as a drawing, may be kept apart from all others'."""
+        """A relative path that is unique to the image, for files such as drawings."""
         if self.recorded is not None:
             return os.path.join(self.path, self.recorded.topic.strip("/"), f"{self.recorded.stamp_ns:019d}.jpg")
         if is_url(self.path):

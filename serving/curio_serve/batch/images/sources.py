@@ -1,4 +1,4 @@
-"""From what a command line names (files, folders, globs, videos, recordings, a list) to images, one at a time.
+"""Lists the images that a command line names by files, folders, globs, videos, recordings or a list, one at a time.
 
 The order is the order of the arguments, and inside a folder that of the names. Nothing here grows with the number of
 images: a folder of a million is listed in batches, and a video is read as it is used.
@@ -39,7 +39,7 @@ def is_recording(path: str) -> bool:
 
 
 class PassedOver:
-    """Counts what folders hold beside images, for a line at the end of a run."""
+    """Counts the other files in folders of images, for a summary at the end of a run."""
 
     def __init__(self) -> None:
         self._num_files, self._has_heic = 0, False
@@ -57,7 +57,7 @@ class PassedOver:
         self._empty.append(path)
 
     def lines(self) -> Iterator[str]:
-        """The lines that tell a person what was passed over."""
+        """The summary, in lines."""
         yield from (f"{path} holds no image" for path in self._empty)
         if self._num_files:
             more = ", …" if self._num_files > len(self._first) else ""
@@ -68,7 +68,7 @@ class PassedOver:
 
 
 def check_arguments(arguments: Sequence[str]) -> None:
-    """Refuse a call that names what does not exist, before any work.
+    """Refuse a call that names something that does not exist, before any work.
 
     Raises:
         UsageError: Says which argument.
@@ -100,7 +100,7 @@ def images(
 
     Args:
         arguments: As on the command line.
-        passed_over: Counts what is no image.
+        passed_over: Counts the other files.
         topics: What to read of recordings.
     """
     for argument in arguments:

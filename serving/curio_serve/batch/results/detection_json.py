@@ -12,7 +12,7 @@ from curio_proto.v1.detector_pb2 import (
 )
 
 STATUS = {DETECTION_STATUS_SURE: "sure", DETECTION_STATUS_UNSURE: "unsure"}
-"""Names of a detection's status; a model that was not measured says none."""
+"""Names of a detection's status; a model whose reliability was not measured gives none."""
 
 
 def detection_json(detection: Detection) -> dict[str, object]:
@@ -60,10 +60,10 @@ def _track_json(track: Track) -> dict[str, object]:
 
 
 def rows(values: Sequence[float], width: int) -> list[list[float]]:
-    """The values in rows of that many."""
+    """The values, cut into rows of a given length."""
     return [list(values[start : start + width]) for start in range(0, len(values), width)]
 
 
 def finite(value: float) -> float | None:
-    """JSON has no NaN: a corner behind the camera is null."""
+    """Replace NaN by None: JSON has no NaN, so a corner behind the camera is null."""
     return value if math.isfinite(value) else None

@@ -35,13 +35,13 @@ class ImageResult:
     """Of the decoded frame in pixels; None where it could not be decoded. Likewise ``height``."""
     height: int | None = None
     camera_matrix: Sequence[float] = ()
-    """K that was used, 9 values row-major; empty without one."""
+    """The K that was used, 9 values row-major; empty if none was."""
     results: Sequence[RegionResult] = field(default_factory=tuple)
-    """What the model found; empty where ``error`` is not."""
+    """The model's detections; empty if there is an error."""
     decode_ms: float | None = None
-    """Bytes to pixels."""
+    """Milliseconds from bytes to pixels."""
     inference_ms: float | None = None
-    """Pixels to detections."""
+    """Milliseconds from pixels to detections."""
     error: str = ""
     """Why there is no answer."""
     is_turned: bool = False
@@ -82,24 +82,24 @@ class Line:
     key: str
     """Names the image, see :meth:`ResultFormat.key`."""
     opens_image: bool
-    """The first line of its image."""
+    """Whether it is the first line of its image."""
     model: tuple[str, int] | None = None
-    """(name, version), where the format says it."""
+    """(name, version), if the format has them."""
     is_error: bool = False
-    """The image had no answer."""
+    """Whether the image had no answer."""
 
 
 class ResultFormat(ABC):
-    """A way to write results down, line by line."""
+    """A text format for results."""
 
     opening: bytes
-    """What every file of this format begins with."""
+    """The text that every file of this format begins with."""
     header: bytes = b""
-    """The opening that is a line of its own, or nothing."""
+    """The opening, if it is a whole line; else empty."""
     has_line_for_every_image: bool = True
-    """Also for one without detections."""
+    """Whether images without detections have a line, too."""
     is_one_line_an_image: bool = False
-    """A complete line is then all that one model has to say about an image."""
+    """Whether each image has exactly one line of each model."""
 
     def lines(self, results: Sequence[ImageResult]) -> ImageLines:
         """Format the lines of an image, those of one model after those of another."""
@@ -117,7 +117,7 @@ class ResultFormat(ABC):
 
     @abstractmethod
     def parse(self, line: bytes) -> Line:
-        """Reads a line back.
+        """Parse a line of an existing file.
 
         Raises:
             ValueError: The line is not of this format.

@@ -17,7 +17,7 @@ from curio_serve.errors import OutputError, UsageError
 from curio_serve.files import direct
 
 TOPIC = "detections"
-"""Beside the topic of the images: /camera/detections of /camera/image_raw."""
+"""Topic of the detections, beside that of the images: /camera/detections for /camera/image_raw."""
 _TYPE = "vision_msgs/msg/Detection3DArray"
 _NEXT = "=" * 80 + "\nMSG: "
 # The definitions of vision_msgs 4 (ROS 2 Humble and later) and of what they are made of, without their comments.
@@ -42,7 +42,7 @@ SCHEMA = _NEXT.join(
 
 
 class Detection3DArrays:
-    """Forms the message of an image; JSON, until it is written.
+    """Builds the message of each image, as JSON until it is written.
 
     Args:
         objects: Of the models' specs; their boxes become the bounding boxes.
@@ -82,7 +82,7 @@ class Detection3DArrays:
 
 
 class PoseRecording:
-    """Writes such messages to an MCAP file; unlike lines, a recording is not gone on with after a stop.
+    """Writes such messages to an MCAP file. Unlike a text file, a recording cannot be continued after a stop.
 
     Args:
         path: The file.
@@ -118,7 +118,7 @@ class PoseRecording:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """End the recording; it is whole after a stop, too."""
+        """Close the recording, which is readable even after an early stop."""
         with self._file:
             try:
                 self._writer.finish()

@@ -20,7 +20,7 @@ from curio_serve.systems import APPEND_FLAGS, lock
 
 
 class Named(Protocol):
-    """Anything with the name under which its result is written."""
+    """An image with the name that its result carries."""
 
     @property
     def name(self) -> str: ...
@@ -34,7 +34,7 @@ class ResultFile:
 
     Args:
         path: The file; None: standard output.
-        form: What its lines look like.
+        form: Format of its lines.
         models: Names and versions of those whose results it holds, in the order of an image's lines.
         overwrite: Drop what is in it.
 
@@ -71,7 +71,7 @@ class ResultFile:
         return "standard output" if self._path is None else str(self._path)
 
     def unanswered(self, images: Iterator[NamedT]) -> Iterator[NamedT]:
-        """The images that the file does not answer yet; the file is then ready for the first of them.
+        """The images that the file does not answer yet. The file is then ready to be appended to.
 
         Args:
             images: All of them, in order; those already answered are taken from it.
@@ -187,9 +187,9 @@ class _Image:
     start: int
     """Offset of the first line."""
     models: list[tuple[str, int]] = field(default_factory=list)
-    """Those that its lines are of, where the format says it."""
+    """The models of its lines, if the format names them."""
     is_error: bool = False
-    """A model had no answer."""
+    """Whether a model had no answer."""
 
     def add(self, line: Line) -> None:
         if line.model is not None and line.model not in self.models:
@@ -202,7 +202,7 @@ def _label(models: Sequence[tuple[str, int]]) -> str:
 
 
 def _open_locked(path: Path) -> int:
-    """A descriptor for reading and appending that no other process of ours has open."""
+    """Open a file for reading and appending, and lock it against our other processes."""
     try:
         path = direct(path)
         path.parent.mkdir(parents=True, exist_ok=True)

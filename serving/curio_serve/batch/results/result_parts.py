@@ -25,11 +25,11 @@ _PART = re.compile(r"part-(\d{5,})\.[a-z]+")
 
 
 class ResultParts:
-    """Writes results as a :class:`ResultFile` in a temporary folder does, and what is new in it as parts.
+    """Writes results to a :class:`ResultFile` in a temporary folder, and uploads what is new in it as parts.
 
     Args:
         url: Of the folder of parts, in an object store.
-        form: What the lines look like.
+        form: Format of the lines.
         models: As of :class:`ResultFile`.
         overwrite: Remove the parts that are there.
         every_s: Seconds from one part to the next.
@@ -98,7 +98,7 @@ class ResultParts:
         return remaining
 
     def write(self, lines: ImageLines) -> None:
-        """Appends one image; now and then what came since the last part becomes the next one.
+        """Append one image. From time to time all images since the last part become the next part.
 
         Raises:
             OutputError: The store refuses, or the disk of the temporary folder is full.
