@@ -87,7 +87,7 @@ def evaluate(
     if num_images is not None and num_images < 1:
         raise UsageError(f"--num-images is {num_images}, expected at least 1")
     if bop_results is not None and data is None:
-        raise UsageError("--bop-results holds detections in real frames: give --data DIR")
+        raise UsageError("--bop-results needs the real frames: give --data DIR")
     subject = load_subject(path, data)
     if data is not None and not isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld):
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
