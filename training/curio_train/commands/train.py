@@ -186,7 +186,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
         tell(end(path, config, session.cache, warn))
         return 0
-    tell(f"{path}: to watch it learn: curio-view {path}, or tensorboard --logdir {path}")
+    tell(f"{path}: preparing images and renderer, which takes a minute or so where it was not done before")
     outcome, progress = learn(
         config,
         path,
