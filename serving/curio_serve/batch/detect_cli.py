@@ -11,11 +11,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-import tyro
-
 from curio_serve.batch.arguments import DetectArguments
+from curio_serve.command_line import parsed
 from curio_serve.errors import CameraError, CurioError, UsageError
-from curio_serve.version import answer_version
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,8 +28,7 @@ if TYPE_CHECKING:
 
 def main() -> NoReturn:
     """Entry point of the command."""
-    answer_version("curio-detect", sys.argv[1:])
-    arguments: DetectArguments = tyro.cli(DetectArguments, prog="curio-detect")
+    arguments = parsed(DetectArguments, None, "curio-detect")
     # Both by name: a process started in the background inherits an ignored SIGINT, and Python then leaves it so.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _terminate)
