@@ -73,6 +73,11 @@ def test_a_camera_of_another_size_is_named() -> None:
         PinholeCamera(K, size=(640, 480)).check_frame(1280, 720)
 
 
+def test_a_frame_that_is_turned_by_a_quarter_is_named_as_such() -> None:
+    with pytest.raises(CameraError, match=r"480x640; one of the two is turned by a quarter.*EXIF.*as stored"):
+        PinholeCamera(K, size=(640, 480)).check_frame(480, 640)
+
+
 def test_scaling_keeps_the_frames_edges() -> None:
     corner = scaling(2, 3) @ [-0.5, -0.5, 1]
     np.testing.assert_allclose(corner, [-0.5, -0.5, 1])

@@ -102,7 +102,7 @@ def test_a_folder_of_a_bucket_is_answered_in_order_with_its_errors(
     out, drawn = tmp_path / "poses.jsonl", tmp_path / "drawn"
     done = detect(models_dir / "flat", "s3://pictures/day/", "--out", out, "--overlays", drawn)
     assert done.returncode == 1, done.stderr
-    assert "1 images have no answer" in done.stderr
+    assert "1 image has no answer" in done.stderr
     assert "passed over: 1 file is no image: s3://pictures/day/notes.txt" in done.stderr
     lines = without_times(out.read_bytes())
     names = sorted(f"s3://pictures/{entry.key}" for entry in bucket.objects.filter(Prefix="day/"))

@@ -54,7 +54,7 @@ def test_a_cluster_writes_the_same_lines_and_goes_on_after_a_stop(
     there.write_bytes(b"".join(lines[:50]) + lines[50][:40])  # as a stop would leave it
     done = detect(models_dir / "flat", frames, "--out", there, "--ray", "local")
     assert done.returncode == 1, done.stderr
-    assert "1 images have no answer" in done.stderr
+    assert "1 image has no answer" in done.stderr
     assert without_times(there) == without_times(here)
     assert done.stdout == ""
 

@@ -127,7 +127,7 @@ def test_an_exif_rotation_that_is_not_applied_is_told(
     Image.new("RGB", (320, 240)).save(tmp_path / "upright.jpg")
     detect(models_dir / "flat", tmp_path, out=tmp_path / "out")
     told = capsys.readouterr().err
-    assert f"1 images have an EXIF rotation that was not applied (first: {tmp_path}/turned.jpg)" in told
+    assert f"1 image has an EXIF rotation that was not applied (first: {tmp_path}/turned.jpg)" in told
     detect(models_dir / "flat", tmp_path, out=tmp_path / "out", overwrite=True, exif_rotation=True)
     assert "EXIF" not in capsys.readouterr().err
 

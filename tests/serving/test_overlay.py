@@ -9,6 +9,7 @@ from curio_proto.v1.detector_pb2 import Detection, RegionResult
 from curio_proto.v1.model_spec_pb2 import ModelSpec, ObjectModel
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.overlay import draw
+from curio_serve.imaging.silhouette import Surface, silhouette
 from scipy.spatial.transform import Rotation
 
 CAMERA = PinholeCamera(np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), (), (640, 480))
@@ -109,3 +110,28 @@ def test_a_slot_that_is_empty_to_two_digits_is_not_drawn() -> None:
     assert not draw(frame, [found], spec(), CAMERA).any()
     found.detections[0].confidence = 0.006
     assert draw(frame, [found], spec(), CAMERA).any()
+
+
+def _wedge() -> Surface:
+    """Half a cube: its box looks the same after half a turn about z, the wedge does not."""
+    caps, sides = [[0, 2, 4], [1, 3, 5]], [[0, 1, 4], [1, 5, 4], [0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]]
+    return Surface(BOX_M[:6], np.array(caps + sides))
+
+
+def test_a_contour_shows_half_a_turn_which_a_box_hides() -> None:
+    frame = np.full((480, 640, 3), 128, np.uint8)
+    half = np.diag([-1.0, -1.0, 1.0])
+    poses = [pose(np.eye(3), (0, 0, 0.6)), pose(half, (0, 0, 0.6))]
+    kind = spec()
+    kind.objects[0].diameter_m = 0  # no axes
+    boxes = [draw(frame, [one], kind, CAMERA) for one in poses]
+    outlines = [draw(frame, [one], kind, CAMERA, {"cube": _wedge()}) for one in poses]
+    differing = [(one != other).any(axis=2).sum() for one, other in (boxes, outlines)]
+    assert differing[0] < 200 < 500 < differing[1]
+
+
+def test_a_silhouette_covers_what_the_camera_sees_of_the_mesh() -> None:
+    covered = silhouette(_wedge(), np.eye(3), np.array([0, 0, 0.6]), CAMERA, 640, 480)
+    side_px = 500 * 0.1 / 0.55  # of its near face, a triangle of half a square
+    assert covered.sum() == pytest.approx(side_px**2 / 2, rel=0.05)
+    assert not silhouette(_wedge(), np.eye(3), np.array([0, 0, -1.0]), CAMERA, 640, 480).any()

@@ -188,8 +188,17 @@ def test_what_is_no_image_is_counted_and_named(tmp_path: Path) -> None:
     empty, counted, heic = passed_over.lines()
     assert empty == f"{tmp_path / 'empty'} holds no image"
     assert counted.startswith("passed over: 6 files are no images: ")
-    assert counted.count(", ") == 3  # three names and an ellipsis
+    assert counted.count(", ") == 5
+    assert {"._a.jpg", "b.HEIC", "notes.txt", "more.txt", "readme.md"} < set(counted.replace(",", "").split())
     assert heic.startswith("HEIC pictures have to be converted")
+
+
+def test_of_many_files_that_are_no_images_the_first_are_named() -> None:
+    passed_over = PassedOver()
+    for number in range(1_030):
+        passed_over.file(f"{number}.txt")
+    (line,) = passed_over.lines()
+    assert line.endswith("18.txt, 19.txt and 1,010 more")
 
 
 def test_a_model_after_images_is_no_folder_of_images(tmp_path: Path) -> None:

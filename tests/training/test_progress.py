@@ -18,3 +18,4 @@ def test_eighty_columns_show_a_bar_and_the_time_left(tmp_path: Path) -> None:
     reporter.close()
     assert "\u2501\u2501\u2501" in screen.getvalue()
     assert " 50 %  0:10 left  1,280 images, 128/s  localisation loss 7.25" in screen.getvalue()
+    assert f"to watch it learn: curio-view {tmp_path}, or tensorboard --logdir {tmp_path}\n" in screen.getvalue()

@@ -171,14 +171,44 @@ def test_a_model_apart_from_its_run_needs_a_mesh(place: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("flags", "told"),
     [
-        ({"mesh": Path("part.ply")}, "--mesh and --mesh-unit are for --refine"),
+        ({"mesh": Path("part.ply")}, "--mesh is for --refine and --overlays"),
+        ({"mesh_unit": "mm"}, "--mesh-unit is for --mesh"),
+        ({"overlays": Path("drawn"), "mesh": Path("missing.ply")}, "missing.ply: the mesh cannot be read"),
         ({"refine": True, "ray": "local"}, "leave out --ray"),
         ({"refine": True, "mesh": Path("missing.ply")}, "missing.ply: the mesh cannot be read"),
     ],
 )
-def test_calls_that_cannot_be_refined_are_refused(place: Path, flags: dict[str, Any], told: str) -> None:
+def test_calls_that_cannot_be_carried_out_are_refused(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: dict[str, Any], told: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError, match=told):
         detect(place, **flags)
+
+
+def test_drawings_show_the_contour_of_a_mesh_that_is_known(place: Path, tmp_path: Path) -> None:
+    """That of the run, or the named one; else the box."""
+
+    def drawn(**flags: Any) -> np.ndarray:
+        folder = tmp_path / f"{len(list(tmp_path.iterdir()))}"
+        detect(place, overlays=folder, **flags)
+        (picture,) = folder.rglob("frame.png")
+        return cv2.imread(str(picture)).astype(int)
+
+    apart = tmp_path / "chair.onnx"
+    apart.write_bytes((place / "models" / "chair.onnx").read_bytes())
+    of_run, box = drawn(), drawn(model=apart)
+    assert (drawn(model=apart, mesh=place / "part.ply") == of_run).all()
+    assert (box != of_run).any(axis=2).sum() > 1000
+
+
+def test_drawings_do_without_the_extra_unless_a_mesh_is_named(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refinement, "_MODULE", "curio_train_is_not_here")
+    detect(place, overlays=tmp_path / "drawn")
+    with pytest.raises(UsageError, match=r"--mesh needs the extra train.*pip install 'curio-pose\[train\]'"):
+        detect(place, overlays=tmp_path / "drawn", mesh=place / "part.ply")
 
 
 def test_a_missing_extra_is_named(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,8 +51,8 @@ class DetectArguments:
     obj_id: int | None = None
     """Object id in BOP's results. None: that of the LineMOD class the object is named after."""
     overlays: Path | None = None
-    """Folder for pictures with boxes and axes drawn in, laid out like the images. An exported model holds no mesh,
-    and a box looks the same after half a turn: curio-render --mesh --over-photograph draws the mesh."""
+    """Folder for pictures with contours and axes drawn in, laid out like the images; with boxes where no mesh is known
+    (--mesh)."""
     min_confidence: float = 0.0
     """Leave out detections below, 0 to 1. Those below the model's own threshold say that they are unsure."""
     max_detections: int | None = None
@@ -68,7 +68,7 @@ class DetectArguments:
     refine: tyro.conf.FlagCreatePairsOff[bool] = False
     """Improve each pose by render-and-compare with the object's mesh: seconds a pose, and the extra train."""
     mesh: Path | None = None
-    """Mesh for --refine. None: that of the run in whose folder the model lies."""
+    """Mesh of the model's object, for --refine and --overlays. None: that of the run in whose folder the model lies."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
     """Unit of --mesh; the file's own, or metres, unless given. BOP's meshes are in mm."""
     exif_rotation: bool = False

@@ -11,11 +11,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-import tyro
-
 from curio_serve.batch.arguments import DetectArguments
+from curio_serve.command_line import parsed
 from curio_serve.errors import CameraError, CurioError, UsageError
-from curio_serve.version import answer_version
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,8 +28,7 @@ if TYPE_CHECKING:
 
 def main() -> NoReturn:
     """Entry point of the command."""
-    answer_version("curio-detect", sys.argv[1:])
-    arguments: DetectArguments = tyro.cli(DetectArguments, prog="curio-detect")
+    arguments = parsed(DetectArguments, None, "curio-detect")
     # Both by name: a process started in the background inherits an ignored SIGINT, and Python then leaves it so.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _terminate)
@@ -68,7 +65,7 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.images.sources import STANDARD_INPUT, PassedOver, check_arguments, images
     from curio_serve.batch.output import open_output, result_format
     from curio_serve.batch.progress import Progress
-    from curio_serve.batch.refinement import refining
+    from curio_serve.batch.refinement import outlining, refining
     from curio_serve.batch.rig_images import run_rig
     from curio_serve.batch.tracked import check_tracking, from_the_first
     from curio_serve.models.model_check import ChildCheck
@@ -88,6 +85,7 @@ def run(arguments: DetectArguments) -> int:
             ChildCheck()(Path(model))
     estimators, recordings = _estimators(arguments, models, settings), _recordings(arguments)
     refiner = refining(arguments, models[0], estimators)
+    outlining(arguments, models, estimators)
     for estimator in estimators:
         _check_camera(arguments, estimator, recordings)
     if arguments.video is not None:
@@ -104,7 +102,8 @@ def run(arguments: DetectArguments) -> int:
             results = in_order(partial(_answer, estimators, form), content, arguments.jobs)
         else:  # other nodes have another working folder
             there = [os.path.abspath(model) if os.path.exists(model) else model for model in models]
-            results = over_cluster(arguments.ray, partial(_answering, arguments, there, settings), remaining)
+            placed = replace(arguments, mesh=arguments.mesh and arguments.mesh.absolute())
+            results = over_cluster(arguments.ray, partial(_answering, placed, there, settings), remaining)
         with (
             closing(results),
             Progress(output.num_images, output.num_errors, is_shown=arguments.out is not None) as progress,
@@ -233,8 +232,10 @@ def _answering(
 ) -> "Callable[[SourceImage], ImageLines]":
     """Build the function that answers images in another process."""
     from curio_serve.batch.output import result_format
+    from curio_serve.batch.refinement import outlining
 
     estimators = _estimators(arguments, models, settings)
+    outlining(arguments, models, estimators)
     return partial(_answer, estimators, result_format(arguments, estimators))
 
 

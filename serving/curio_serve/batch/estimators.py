@@ -7,7 +7,7 @@ server is gone, the disk is full) is raised.
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +25,7 @@ from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.camera_files import CameraFile
 from curio_serve.imaging.image_header import Header
 from curio_serve.imaging.overlay import draw
+from curio_serve.imaging.silhouette import Surface
 from curio_serve.models.detector import Detector
 from curio_serve.models.model import Model, canonical_camera
 from curio_serve.tracking.stream import FollowingStream
@@ -89,6 +90,8 @@ class Estimator(ABC):
     def __init__(self, name: str, version: int, spec: ModelSpec, settings: Settings) -> None:
         self.name, self.version, self.spec = name, version, spec
         self.settings = settings
+        self.surfaces: Mapping[str, Surface] = {}
+        """Of objects by name, where they are known: drawings show their contours."""
         self.canonical = canonical_camera(spec, name)
 
     def __call__(self, image: SourceImage) -> ImageResult:
@@ -143,7 +146,7 @@ class Estimator(ABC):
         image = SourceImage("frame", "frame", 0, pixels, time_s=time.monotonic())
         seen = self._look(image, b"", self._camera(image))
         found = [detection for result in seen.results for detection in result.detections]
-        return draw(pixels, seen.results, self.spec, seen.camera), found
+        return draw(pixels, seen.results, self.spec, seen.camera, self.surfaces), found
 
     @abstractmethod
     def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> Seen:
@@ -179,7 +182,7 @@ class Estimator(ABC):
         """
         if pixels is None:
             pixels = (seen.frame or self._frame(image, data)).pixels
-        return draw(pixels, seen.results, self.spec, seen.camera)
+        return draw(pixels, seen.results, self.spec, seen.camera, self.surfaces)
 
 
 def answers(estimators: Sequence[Estimator], image: SourceImage) -> list[ImageResult]:

@@ -54,17 +54,19 @@ class Progress:
         """Sums up, with the first problems of this run."""
         seconds = time.perf_counter() - self._start_s
         before = f" after {self._num_before} of earlier runs" if self._num_before else ""
-        _say(f"{self._num_new} images{before} in {seconds:.1f} s ({self._num_new / seconds:.1f} images/s) to {label}")
+        _say(
+            f"{_counted(self._num_new)}{before} in {seconds:.1f} s ({self._num_new / seconds:.1f} images/s) to {label}"
+        )
         if self._num_turned:
+            have = "has" if self._num_turned == 1 else "have"
             _say(
-                f"{self._num_turned} images have an EXIF rotation that was not applied (first: {self._first_turned}); "
-                "viewers turn them, K is taken to be of the stored pixels. With --exif-rotation they are turned, and K "
-                "with them"
+                f"{_counted(self._num_turned)} {have} an EXIF rotation that was not applied (first: "
+                f"{self._first_turned}); viewers turn pictures by it, K is taken to be of the stored pixels. With "
+                "--exif-rotation pixels are turned, and K with them"
             )
         if self._num_errors:
-            _say(
-                f"{self._num_errors} images have no answer:" if self._problems else f"{self._num_errors} have no answer"
-            )
+            have = "has" if self._num_errors == 1 else "have"
+            _say(f"{_counted(self._num_errors)} {have} no answer{':' if self._problems else ''}")
         for problem in self._problems:
             print(f"  {problem}", file=sys.stderr)
         if len(self._problems) < self._num_errors and self._problems:
@@ -75,6 +77,10 @@ def _bar(num_images: int, num_errors: int) -> "Bar":
     from curio_serve.batch.progress_bar import Bar
 
     return Bar(num_images, num_errors)
+
+
+def _counted(num_images: int) -> str:
+    return f"{num_images} image{'' if num_images == 1 else 's'}"
 
 
 def _say(text: str) -> None:

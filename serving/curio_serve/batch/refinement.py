@@ -1,9 +1,11 @@
-"""``curio-detect --refine`` improves poses by render-and-compare; it needs the extra ``train``.
+"""What ``curio-detect`` does with an object's mesh, which the extra ``train`` reads.
 
-Serving has no renderer of its own. It imports the refiner from training, by name, only if a call asks for it.
+``--refine`` improves poses by render-and-compare; ``--overlays`` draws the mesh's contour in place of a box. Serving
+does without renderer and mesh files. It asks for the functions below by name, and only where a call wants them.
 """
 
 import importlib
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +22,7 @@ from curio_serve.batch.images.source_image import SourceImage
 from curio_serve.errors import UsageError
 from curio_serve.imaging.camera import PinholeCamera
 
-_MODULE, _FUNCTION = "curio_train.commands.refine", "refiner"
+_MODULE, _REFINER, _SURFACE = "curio_train.commands.refine", "refiner", "surface"
 
 
 class Refiner(Protocol):
@@ -57,7 +59,7 @@ def load_refiner(spec: ModelSpec, model: str, mesh: Path | None, unit: str | Non
         UsageError: The extra is not installed, there is no mesh, or it is none of the model's object.
     """
     try:
-        make = getattr(importlib.import_module(_MODULE), _FUNCTION)
+        make = getattr(importlib.import_module(_MODULE), _REFINER)
         made: Refiner = make(spec, model, mesh, unit)
     except ImportError as exc:
         raise UsageError(f"--refine needs the extra train ({exc}): pip install 'curio-pose[train]'") from exc
@@ -87,12 +89,9 @@ def refining(arguments: DetectArguments, model: str, estimators: list[Estimator]
     """Let the one estimator refine its answers, where the call wants that.
 
     Raises:
-        UsageError: The call names a mesh without ``--refine``, several models, a cluster, a video or tracks; or as of
-            :func:`load_refiner`.
+        UsageError: The call names several models, a cluster, a video or tracks; or as of :func:`load_refiner`.
     """
     if not arguments.refine:
-        if arguments.mesh is not None or arguments.mesh_unit is not None:
-            raise UsageError("--mesh and --mesh-unit are for --refine; add it, or leave them out")
         return None
     if arguments.ray is not None or arguments.video is not None or arguments.track:
         raise UsageError("--refine takes seconds a pose, in this process alone: leave out --ray, --video and --track")
@@ -101,3 +100,31 @@ def refining(arguments: DetectArguments, model: str, estimators: list[Estimator]
     refiner = load_refiner(estimators[0].spec, model, arguments.mesh, arguments.mesh_unit)
     estimators[0] = RefiningEstimator(estimators[0], refiner)
     return refiner
+
+
+def outlining(arguments: DetectArguments, models: Sequence[str], estimators: Sequence[Estimator]) -> None:
+    """Let estimators draw contours where the call wants drawings and the mesh is known.
+
+    Raises:
+        UsageError: The call names a mesh for nothing or for several models, it cannot be read, or the extra is missing.
+    """
+    if arguments.mesh is None and arguments.mesh_unit is not None:
+        raise UsageError("--mesh-unit is for --mesh; name the mesh, too")
+    if arguments.mesh is not None and arguments.overlays is None and not arguments.refine:
+        raise UsageError("--mesh is for --refine and --overlays; add one of them, or leave it out")
+    if arguments.overlays is None:
+        return
+    if arguments.mesh is not None and len(estimators) != 1:
+        raise UsageError(f"--mesh is the mesh of one model, found {len(estimators)} models; name one, or leave it out")
+    for model, estimator in zip(models, estimators, strict=True):
+        if arguments.mesh is None and not os.path.exists(model):
+            continue
+        try:
+            read = getattr(importlib.import_module(_MODULE), _SURFACE)
+        except ImportError as exc:
+            if arguments.mesh is None:
+                return  # boxes do without
+            raise UsageError(f"--mesh needs the extra train ({exc}): pip install 'curio-pose[train]'") from exc
+        found = read(estimator.spec, model, arguments.mesh, arguments.mesh_unit)
+        if found is not None:
+            estimator.surfaces = {estimator.spec.objects[0].name: found}

@@ -73,9 +73,14 @@ class PinholeCamera:
                 distortion.
         """
         if self.size is not None and self.size != (width, height):
+            advice = "calibrate at the size you use, or scale K with the image"
+            if self.size == (height, width):
+                advice = (
+                    "one of the two is turned by a quarter. Viewers turn a picture as its EXIF entry says, K has to be "
+                    "of the pixels as stored: store the pictures turned, or turn K"
+                )
             raise CameraError(
-                f"K belongs to frames of {self.size[0]}x{self.size[1]}, this one has {width}x{height}; "
-                "calibrate at the size you use, or scale K with the image"
+                f"K belongs to frames of {self.size[0]}x{self.size[1]}, this one has {width}x{height}; {advice}"
             )
         (fx, _, cx), (_, fy, cy), _ = self._rows
         if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):

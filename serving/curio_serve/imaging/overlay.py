@@ -1,11 +1,12 @@
-"""Draws poses over the frame they were found in: the projected box, the object's axes, its name and confidence.
+"""Draws poses over the frame they were found in: the mesh's contour or its box, the object's axes, name and confidence.
 
 A picture must be readable over snow and over soot: every stroke is drawn twice, first wider and dark, then in its
 colour. Edges of the box that its own sides hide are thin and dim, so that one sees which corner is near.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec, ObjectModel
 from numpy.typing import NDArray
 
 from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.silhouette import Surface, silhouette
 
 Pixels = NDArray[np.uint8]
 Rgb = tuple[int, int, int]
@@ -35,7 +37,11 @@ _FARTHEST_PX = 1e6  # a corner just before the camera's plane projects to anywhe
 
 
 def draw(
-    pixels: Pixels, results: Iterable[RegionResult], spec: ModelSpec, camera: PinholeCamera | None = None
+    pixels: Pixels,
+    results: Iterable[RegionResult],
+    spec: ModelSpec,
+    camera: PinholeCamera | None = None,
+    surfaces: Mapping[str, Surface] = MappingProxyType({}),
 ) -> Pixels:
     """A copy of the frame with every detection drawn on it, but those whose confidence is 0 to two digits.
 
@@ -47,6 +53,7 @@ def draw(
         results: What was found in these pixels.
         spec: The model that found it: the objects' boxes.
         camera: The frame's own camera; None for 2D worlds, whose objects are drawn as circles.
+        surfaces: Of objects by their names, whose contours are drawn in place of their boxes.
 
     Returns:
         [height, width, 3] RGB.
@@ -64,6 +71,8 @@ def draw(
         corners_px = np.array(detection.box_px, float).reshape(-1, 2)
         if camera is None:
             _draw_disc(canvas, corners_px, color, stroke_px)
+        elif detection.object in surfaces:
+            _draw_contour(canvas, surfaces[detection.object], detection, kind, camera, color, stroke_px)
         else:
             _draw_solid(canvas, corners_px, detection, kind, camera, color, stroke_px)
         _draw_label(canvas, corners_px, f"{detection.object}{'?' * is_unsure} {detection.confidence:.2f}", color)
@@ -86,6 +95,30 @@ def _draw_disc(canvas: Pixels, corners_px: NDArray[np.float64], color: Rgb, stro
         _draw_segment(canvas, center - step, center + step, color, stroke_px)
 
 
+def _draw_contour(
+    canvas: Pixels,
+    surface: Surface,
+    detection: Detection,
+    kind: ObjectModel,
+    camera: PinholeCamera,
+    color: Rgb,
+    stroke_px: int,
+) -> None:
+    """The outline of the mesh, holes included, which half a turn changes where a box stays the same; and the axes."""
+    rotation, translation_m = _pose(detection)
+    height, width = canvas.shape[:2]
+    covered = silhouette(surface, rotation, translation_m, camera, width, height)
+    contours, _ = cv2.findContours(covered, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(canvas, contours, -1, _HALO, stroke_px + 2, cv2.LINE_AA)
+    cv2.drawContours(canvas, contours, -1, color, stroke_px, cv2.LINE_AA)
+    _draw_axes(canvas, rotation, translation_m, 0.6 * kind.diameter_m, camera, stroke_px)
+
+
+def _pose(detection: Detection) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation [3, 3] and translation [3] in metres, from the object's frame to the camera's."""
+    return np.array(detection.rotation, float).reshape(3, 3), np.array(detection.translation_m, float)
+
+
 def _draw_solid(
     canvas: Pixels,
     corners_px: NDArray[np.float64],
@@ -97,8 +130,7 @@ def _draw_solid(
 ) -> None:
     """Hidden edges, then the axes inside the box, then the edges in front of both."""
     corners_m = np.array(kind.box_corners_m, float).reshape(-1, 3)
-    rotation = np.array(detection.rotation, float).reshape(3, 3)
-    translation_m = np.array(detection.translation_m, float)
+    rotation, translation_m = _pose(detection)
     edges = _box_edges(corners_m, -rotation.T @ translation_m) if len(corners_m) == len(corners_px) else []
     dim: Rgb = (color[0] // 2, color[1] // 2, color[2] // 2)
     for start, end, is_visible in edges:

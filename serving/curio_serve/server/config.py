@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from curio_serve.command_line import parsed
 from curio_serve.errors import UsageError
 from curio_serve.settings import environment_settings, read_toml, to_arguments
 
@@ -141,8 +142,7 @@ def read_config(arguments: list[str], environment: Mapping[str, str]) -> ServeCo
 
 def _parse(arguments: list[str], default: ServeConfig, source: str = "") -> ServeConfig:
     prog = f"curio-serve {source}".strip()
-    config: ServeConfig = tyro.cli(ServeConfig, args=arguments, default=default, prog=prog)
-    return config
+    return parsed(ServeConfig, arguments, prog, default=default)
 
 
 def _flag(name: str) -> str:

@@ -10,12 +10,10 @@ from curio_serve.errors import CurioError
 from curio_serve.server.config import ServeConfig, read_config, to_toml
 from curio_serve.systems import STOP_SIGNALS
 from curio_serve.telemetry import log, start_logging
-from curio_serve.version import answer_version
 
 
 def main() -> None:
     """Serve the models of a folder until SIGTERM, SIGHUP or Ctrl-C."""
-    answer_version("curio-serve", sys.argv[1:])
     try:
         config = read_config(sys.argv[1:], os.environ)
         if config.dump_config:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from curio_serve.command_line import parsed
 from rich.console import Console
 
-from curio_train.commands.command_line.field_help import parsed
 from curio_train.commands.command_line.running import CACHE, answer
 from curio_train.errors import UsageError
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+from curio_serve.command_line import parsed
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from curio_train.commands.command_line.field_help import parsed
 from curio_train.commands.command_line.running import CACHE, answer, report, warn
 from curio_train.commands.linemod_data import fetched_linemod
 

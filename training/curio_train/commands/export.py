@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from curio_serve.command_line import parsed
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from curio_train.commands.command_line.field_help import parsed
 from curio_train.commands.command_line.running import CACHE, answer
 from curio_train.errors import CurioError, UsageError
 

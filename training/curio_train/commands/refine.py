@@ -1,4 +1,4 @@
-"""What ``curio-detect --refine`` asks this package for; its errors are serving's, because serving's command tells them.
+"""What ``curio-detect`` asks this package for with a mesh; its errors are serving's, as serving's command tells them.
 
 The command itself is serving's, which installs without this package's dependencies.
 """
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve import errors as serving
+from curio_serve.imaging.silhouette import Surface
 
 from curio_train.errors import CurioError, MeshError, UsageError
 
@@ -45,6 +46,43 @@ def refiner(spec: ModelSpec, model: str, mesh: Path | None, unit: "Unit | None")
         raise serving.UsageError(f"--refine: {exc}") from exc
     except CurioError as exc:
         raise serving.ModelError(f"--refine: {exc}") from exc
+
+
+def surface(spec: ModelSpec, model: str, mesh: Path | None, unit: "Unit | None") -> Surface | None:
+    """The mesh of a model's object, for contours in drawings.
+
+    Args:
+        spec: Of the model.
+        model: As it was named.
+        mesh: Of its object; None: that of the run in whose folder the model lies.
+        unit: Of the mesh's coordinates; None: the file's own, or metres.
+
+    Returns:
+        Its triangles; None where no mesh is named and the model lies in no run's folder, or the run's mesh is gone.
+
+    Raises:
+        curio_serve.errors.UsageError: The named mesh cannot be read, is none of the model's object, or the model has
+            several kinds of objects or flat ones.
+    """
+    if len(spec.objects) != 1 or not spec.camera.camera_matrix:
+        if mesh is not None:
+            raise serving.UsageError(
+                f"--mesh is for models of one kind of object in space; {spec.name or model} finds "
+                f"{len(spec.objects)} kinds in world {spec.world!r}"
+            )
+        return None
+    if mesh is None and _of_run(Path(model)) is None:
+        return None
+    from curio_train.meshes.of_model import refuse_other_mesh
+
+    try:
+        label, found = _mesh(spec, model, mesh, unit)
+        refuse_other_mesh(found, spec.objects[0], label)
+    except (MeshError, UsageError) as exc:
+        if mesh is None:
+            return None
+        raise serving.UsageError(f"--overlays: {exc}") from exc
+    return Surface(found.vertices_m, found.faces)
 
 
 def _mesh(spec: ModelSpec, model: str, mesh: Path | None, unit: "Unit | None") -> tuple[str, "Mesh"]:

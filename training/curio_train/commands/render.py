@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from curio_serve.command_line import parsed
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from curio_train.commands.command_line.field_help import parsed
 from curio_train.commands.command_line.running import answer
 
 

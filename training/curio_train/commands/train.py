@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NoReturn, get_type_hints
 
 import tyro
+from curio_serve.command_line import HELP_ALL, join_help_lines, parsed
 from curio_serve.version import answer_version
 from tyro.conf import OmitArgPrefixes
 
 from curio_train.capture.options import AssistantCommand, CalibrateCommand
-from curio_train.commands.command_line.field_help import join_help_lines, parsed
 from curio_train.commands.command_line.project_file import with_project
 from curio_train.commands.command_line.running import CACHE, answer, report, warn
-from curio_train.commands.command_line.short_help import FLAG_ALL, print_short_help
+from curio_train.commands.command_line.short_help import print_short_help
 from curio_train.config import NetworkConfig, Preset, Recipe, RunConfig, WorldOptions, preset_recipe
 from curio_train.errors import UsageError, nearest
 from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
@@ -100,15 +100,9 @@ def parse(arguments: list[str]) -> TrainCommand:
     default, stored = _defaults(world, typed)
     prog, about = f"curio-train {world}", (kind.__doc__ or "").partition("\n\n")[0]
     join_help_lines([RunConfig, Recipe, NetworkConfig, *WORLDS.values()])
-    if stored is None and {"-h", "--help"} & set(typed) and FLAG_ALL not in typed:
+    if stored is None and {"-h", "--help"} & set(typed) and HELP_ALL not in typed:
         print_short_help(prog, about, default.world, default, Session())
-    command = tyro.cli(
-        TrainCommand,
-        args=["--help" if word == FLAG_ALL else word for word in typed],
-        default=TrainCommand(default),
-        prog=prog,
-        description=about,
-    )
+    command = parsed(TrainCommand, typed, prog, default=TrainCommand(default), description=about)
     if stored is not None and command.session.resume is not None:
         refuse_other(stored, command.config, command.session.resume)
     return command
@@ -144,7 +138,7 @@ def _refuse_world(arguments: list[str]) -> NoReturn:
             {name: TrainCommand(RunConfig(_unset(kind))) for name, kind in WORLDS.items()},
             {name: (kind.__doc__ or "").partition("\n\n")[0] for name, kind in WORLDS.items()},
         ),
-        args=["--help" if word == FLAG_ALL else word for word in arguments],
+        args=["--help" if word == HELP_ALL else word for word in arguments],
         prog="curio-train",
         description=f"Learn to read poses from images without labels. Worlds: {', '.join(WORLDS)}.",
     )
@@ -186,7 +180,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
         report(end(path, config, session.cache, warn))
         return 0
-    report(f"{path}: to watch it learn: curio-view {path}, or tensorboard --logdir {path}")
+    report(f"{path}: preparing images and renderer, which takes a minute or so where it was not done before")
     outcome, progress = learn(
         config,
         path,

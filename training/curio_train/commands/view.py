@@ -9,9 +9,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
+from curio_serve.command_line import parsed
 from tyro.conf import Positional, arg
 
-from curio_train.commands.command_line.field_help import parsed
 from curio_train.commands.command_line.running import CACHE, answer, report
 from curio_train.errors import UsageError
 

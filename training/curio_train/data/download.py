@@ -22,6 +22,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from huggingface_hub import get_hf_file_metadata, hf_hub_url
+from huggingface_hub.constants import ENDPOINT
 from huggingface_hub.errors import GatedRepoError, HTTPError
 from huggingface_hub.file_download import HfFileMetadata, http_get
 from huggingface_hub.utils import WeakFileLock, build_hf_headers, disable_progress_bars
@@ -36,6 +37,7 @@ SCORING_ARCHIVES = (*TRAINING_ARCHIVES, "lm_test_all.zip")
 """These, and all real frames, which are for scoring alone."""
 
 _STATE = ".download"
+_AGAIN = "what has arrived is kept: give the same command again"
 _OFFLINE = "or download it elsewhere and name its folder: --data DIR"
 
 
@@ -56,7 +58,8 @@ def download_bytes(archives: Sequence[str]) -> int:
     Raises:
         DataError: The hub cannot be reached, or states none.
     """
-    with _as_data_errors(f"cannot ask for the size of {REPOSITORY}"):
+    hub = os.environ.get("HF_ENDPOINT") or ENDPOINT
+    with _as_data_errors(f"cannot ask {hub} for the size of {REPOSITORY}", "try again with a network"):
         return sum(_stated_size(name, _metadata(name)) for name in archives)
 
 
@@ -83,9 +86,8 @@ def download_linemod(cache: Path, archives: Sequence[str] = TRAINING_ARCHIVES) -
 
 
 @contextmanager
-def _as_data_errors(failure: str) -> Iterator[None]:
+def _as_data_errors(failure: str, again: str = _AGAIN) -> Iterator[None]:
     """Turns every failure of a download into a DataError that says what to do."""
-    again = "what has arrived is kept: give the same command again"
     try:
         yield
     except GatedRepoError as exc:

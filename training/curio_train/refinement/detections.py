@@ -12,14 +12,12 @@ from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import CanonicalCamera, PinholeCrop, PinholeFrame
 from curio_serve.models.detector import transformed
 
-from curio_train.errors import MeshError
 from curio_train.geometry import rotation_6d_from_matrix
-from curio_train.meshes.meshes import METRES, Mesh
+from curio_train.meshes.meshes import Mesh
+from curio_train.meshes.of_model import refuse_other_mesh
 from curio_train.refinement.render_and_compare import DEFAULT_LIGHT, RenderAndCompare
 from curio_train.scene_code import COLOR, LIGHT, ROTATION_6D, TRANSLATION, SceneCode, poses
 from curio_train.worlds.base import Camera
-
-_TOLERANCE = 0.01  # of the diameter, between the mesh's box and the model's
 
 
 class DetectionRefiner:
@@ -38,7 +36,7 @@ class DetectionRefiner:
         """
         (kind,) = spec.objects
         self._corners = np.reshape(kind.box_corners_m, (-1, 3)).tolist()
-        _check_box(mesh, np.array(self._corners), kind.diameter_m, label)
+        refuse_other_mesh(mesh, kind, label)
         camera = spec.camera
         matrix = np.reshape(camera.camera_matrix, (3, 3))
         self._canonical = CanonicalCamera(camera.width, camera.height, matrix)
@@ -91,24 +89,3 @@ def _code(detections: Sequence[Detection], light: Sequence[float], canonical_fro
     if all(one.color for one in detections):
         code[COLOR] = torch.tensor([list(one.color) for one in detections])[:, None]
     return code
-
-
-def _check_box(mesh: Mesh, corners_m: np.ndarray, diameter_m: float, label: str) -> None:
-    """Refuse a mesh that is not the one that the model learned."""
-    ratio = mesh.diameter_m / diameter_m
-    if abs(ratio - 1) > _TOLERANCE:
-        units = ", ".join(METRES)
-        raise MeshError(
-            f"{label}: its diameter is {mesh.diameter_m:.4g} m, the model's object has {diameter_m:.4g} m; give the "
-            f"mesh that the model was trained with, or its unit with --mesh-unit ({units})"
-        )
-    if np.abs(mesh.box_corners_m - corners_m).max() > _TOLERANCE * diameter_m:
-        raise MeshError(
-            f"{label}: its box is from {_point(mesh.box_corners_m.min(0))} to {_point(mesh.box_corners_m.max(0))}, "
-            f"the model's from {_point(corners_m.min(0))} to {_point(corners_m.max(0))}; give the mesh that the model "
-            "was trained with, in the same frame"
-        )
-
-
-def _point(values: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ") m"

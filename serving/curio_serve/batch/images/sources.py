@@ -25,7 +25,7 @@ RECORDING_SUFFIX = ".mcap"
 LIST_SUFFIX = ".txt"  # of a URL: names of images
 STANDARD_INPUT = "-"
 
-_NAMED = 3  # files passed over that are named; the others are counted
+_NAMED = 20  # files passed over that are named; the others are counted
 _HEIC = (".heic", ".heif")
 _NAMES_A_PASS = 1 << 16
 _BOP_SCENE_FILES = ("scene_camera.json", "scene_gt.json")
@@ -60,7 +60,8 @@ class PassedOver:
         """The summary, in lines."""
         yield from (f"{path} holds no image" for path in self._empty)
         if self._num_files:
-            more = ", …" if self._num_files > len(self._first) else ""
+            unnamed = self._num_files - len(self._first)
+            more = f" and {unnamed:,} more" if unnamed else ""
             verb = "file is no image" if self._num_files == 1 else "files are no images"
             yield f"passed over: {self._num_files} {verb}: {', '.join(self._first)}{more}"
             if self._has_heic:

@@ -3,10 +3,9 @@
 import dataclasses
 from typing import Any, get_type_hints
 
-import tyro
+from curio_serve.command_line import HELP_ALL, parsed
 from docstring_parser import parse_from_object
 
-FLAG_ALL = "--help-all"
 _RARE = frozenset(
     ("recipe", "network", "labels", "preset", "stop_below", "cache", "checkpoint_minutes", "counts", "up", "lying")
 ) | {"held_out", "second", "second_background", "blur_px"}
@@ -28,13 +27,13 @@ def print_short_help(prog: str, about: str, *parts: Any) -> None:
     lines = []
     for part in parts:
         hints = get_type_hints(type(part), include_extras=True)
-        parsed = parse_from_object(type(part)).params
-        texts = {text.arg_name: " ".join((text.description or "").split()) for text in parsed}
+        described = parse_from_object(type(part)).params
+        texts = {text.arg_name: " ".join((text.description or "").split()) for text in described}
         for field in dataclasses.fields(part):
             if field.name not in _RARE and field.name != "world":
                 fields.append((field.name, hints[field.name], dataclasses.field(default=getattr(part, field.name))))
                 lines.append(f"    {field.name}: {texts[field.name]}")
     shown = dataclasses.make_dataclass("Shown", fields)
     shown.__doc__ = "\n".join([about, "", "Attributes:", *lines])
-    description = f"{about}\n\nThese are the flags of everyday use; {FLAG_ALL} shows all, hyperparameters among them."
-    tyro.cli(shown, args=["--help"], prog=prog, description=description)
+    description = f"{about}\n\nThese are the flags of everyday use; {HELP_ALL} shows all, hyperparameters among them."
+    parsed(shown, ["--help"], prog, description=description)

@@ -52,6 +52,8 @@ class Reporter:
         self._counts: Counter[str] = Counter()
         self._since = (progress.step, progress.images, progress.seconds)
         self._logged_at = progress.seconds
+        watched = f"{run}: to watch it learn: curio-view {run}, or tensorboard --logdir {run}"
+        console.print(watched, soft_wrap=True, markup=False)
         self._bar: Progress | None = None
         self._task = TaskID(0)
         if console.is_terminal:
