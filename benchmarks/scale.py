@@ -242,6 +242,7 @@ def write(options: Options, figures: dict[str, Any]) -> None:
 
 
 def main(options: Options) -> None:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the processes below end, too
     port = free_port()
     os.environ |= {
         "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
