@@ -147,6 +147,8 @@ def timed(model: Path, options: Options, num_workers: int, folder: Path) -> dict
             if num_rows >= options.num_timed / 2 and (not samples or num_rows > samples[-1][0]):
                 samples.append((num_rows, time.monotonic(), cpu_s(tree(cluster, run.pid))))
             time.sleep(0.05)
+    if len(samples) < 3:
+        sys.exit(f"{out.name}: the answers came in {len(samples)} blocks; --num-timed has to be larger")
     # The last sample may have been taken while the command ended, and then lacks its CPU time.
     rows, wall_s, used_s = np.subtract(samples[-2], samples[0])
     return {"images_per_second": round(rows / wall_s, 2), "cpu_ms_an_image": round(1000 * used_s / rows, 2)}
