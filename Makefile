@@ -4,7 +4,8 @@ PYTHON ?= python3
 # Any pip requirement, also with options: TORCH="torch==2.13.0 --index-url …" for a build without CUDA.
 TORCH ?= torch==2.13.0
 
-# Interpreters that make dist installs the wheel for; those that are not there are left out.
+# Interpreters that make dist installs the wheel for; those that are not there are left out. Of pyenv, name the versions:
+# PYENV_VERSION=3.11.7:3.12.1:3.13.0 make dist
 PYTHONS ?= python3.11 python3.12 python3.13
 
 BIN := .venv/bin

@@ -1,11 +1,14 @@
-"""Many images from an object store over a Ray cluster: images a second by workers, and memory over time.
+"""Many images from an object store over a Ray cluster: speed by workers, and memory over time.
 
+    pip install 'curio-pose[ray]'
     python benchmarks/scale.py [--json] [--num-files 1000] [--repeats 100] [--minutes 70] [--out FILE]
 
 An S3 server (moto) and the cluster run on this machine, on loopback. The shipped frames of samples/, brightened each in
-its own way, are the files; a list names all of them again and again. Workers are first timed on --num-timed images.
-Then curio-detect --ray answers the whole list, and one worker is killed on the way. Every ten seconds the figures so
-far are written. After --minutes the run is stopped, and the figures are those of the images that it answered.
+its own way, are the files; a list names all of them again and again. curio-detect --ray answers the whole list with two
+workers and a small model, the paper's network with random weights (``load.network``), and one worker is killed on the
+way. Every ten seconds the figures so far are written. After --minutes the run is stopped, and the figures are those of
+the images that it answered. Then that model and models/ape are timed on --num-timed images, each with one worker and
+with two.
 """
 
 import json
@@ -21,6 +24,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +33,10 @@ import cv2
 import numpy as np
 import tyro
 from curio_train.learning.runs.provenance import commit, machine
+from load.generator import WIDTH, K
+from load.network import write_model
 
-_SAMPLES, _MODEL = Path("samples"), Path("models/ape")
+_SAMPLES, _APE = Path("samples"), Path("models/ape")
 _NUM_SETTLED = 5000  # images after which memory is taken as the measure
 _SAMPLE_S = 10.0
 _START_S = 60.0
@@ -47,8 +53,8 @@ class Options:
     """Files in the store."""
     repeats: int = 100
     """How often the list names each."""
-    num_timed: int = 1000
-    """Images for the figures of one worker and of two."""
+    num_timed: int = 2000
+    """Images for each figure of a model with one worker or two."""
     minutes: float = 70.0
     """For the whole list; the run is then stopped."""
     out: Path = Path("docs/results/scale.json")
@@ -110,13 +116,13 @@ def fill(options: Options) -> None:
 
 
 @contextmanager
-def detecting(source: str, out: Path, num_workers: int) -> Iterator[tuple["subprocess.Popen[bytes]", int]]:
+def detecting(model: Path, source: str, out: Path, num_workers: int) -> Iterator[tuple["subprocess.Popen[bytes]", int]]:
     """``curio-detect --ray`` with so many workers, and the process that holds its cluster."""
     port = free_port()
     ray: list[str | Path] = [Path(sys.executable).with_name("ray"), "start", "--head", "--block", f"--port={port}"]
     ray += ["--node-ip-address=127.0.0.1", f"--num-cpus={num_workers}", "--include-dashboard=false"]
     program = "from curio_serve.batch.detect_cli import main; main()"
-    detect: list[str | Path] = [sys.executable, "-c", program, _MODEL, source, "--camera", _SAMPLES / "camera.json"]
+    detect: list[str | Path] = [sys.executable, "-c", program, model, source, "--camera", _SAMPLES / "camera.json"]
     detect += ["--ray", f"127.0.0.1:{port}", "--out", out]
     with process(*ray, port=port) as cluster, process(*detect) as run:
         yield run, cluster.pid
@@ -127,16 +133,25 @@ def count(out: Path) -> int:
     return out.read_bytes().count(b"\n") if out.exists() else 0
 
 
-def images_per_second(num_workers: int, folder: Path) -> float:
-    """From the first block of answers to the last, so that the start of the workers does not count."""
-    out = folder / f"timed-{num_workers}.jsonl"
-    with detecting("s3://scale/timed.txt", out, num_workers) as (run, _):
-        counts: dict[int, float] = {}
+def timed(model: Path, options: Options, num_workers: int, folder: Path) -> dict[str, float]:
+    """From the middle of the images to the last, so that the start of the workers does not count.
+
+    Returns:
+        Images a second, and CPU time an image in milliseconds, of workers, cluster and command together.
+    """
+    out = folder / f"timed-{model.name}-{num_workers}.jsonl"
+    samples: list[tuple[int, float, float]] = []  # rows, then seconds of the clock and of CPU
+    with detecting(model, "s3://scale/timed.txt", out, num_workers) as (run, cluster):
         while run.poll() is None:
-            counts.setdefault(count(out), time.monotonic())
+            num_rows = count(out)
+            if num_rows >= options.num_timed / 2 and (not samples or num_rows > samples[-1][0]):
+                samples.append((num_rows, time.monotonic(), cpu_s(tree(cluster, run.pid))))
             time.sleep(0.05)
-    (first, started), *_, (last, ended) = [item for item in counts.items() if item[0]]
-    return (last - first) / (ended - started)
+    if len(samples) < 3:
+        sys.exit(f"{out.name}: the answers came in {len(samples)} blocks; --num-timed has to be larger")
+    # The last sample may have been taken while the command ended, and then lacks its CPU time.
+    rows, wall_s, used_s = np.subtract(samples[-2], samples[0])
+    return {"images_per_second": round(rows / wall_s, 2), "cpu_ms_an_image": round(1000 * used_s / rows, 2)}
 
 
 def tree(*roots: int) -> list[int]:
@@ -161,6 +176,15 @@ def resident_mib(processes: list[int]) -> float:
     return round(pages * os.sysconf("SC_PAGE_SIZE") / _MEBIBYTE, 1)
 
 
+def cpu_s(processes: list[int]) -> float:
+    """CPU time of processes since their start."""
+    ticks = 0
+    for number in processes:
+        with suppress(OSError):
+            ticks += sum(map(int, Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[11:13]))
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
 def kill_worker(processes: list[int]) -> bool:
     """Kill one of the actors that hold the model."""
     for number in processes:
@@ -171,16 +195,16 @@ def kill_worker(processes: list[int]) -> bool:
     return False
 
 
-def whole_list(options: Options, folder: Path, figures: dict[str, Any]) -> None:
+def whole_list(options: Options, model: Path, folder: Path, figures: dict[str, Any]) -> None:
     """Answers the list, with a worker killed once memory has settled; adds to the figures and writes them."""
     out = folder / "all.jsonl"
     memory: list[dict[str, float]] = []
     started, end = time.monotonic(), time.monotonic() + 60 * options.minutes
     is_killed = False
-    with detecting("s3://scale/all.txt", out, 2) as (run, cluster):
+    with detecting(model, "s3://scale/all.txt", out, 2) as (run, cluster):
         while run.poll() is None and time.monotonic() < end:
             time.sleep(_SAMPLE_S)
-            if not (num_rows := count(out)):
+            if run.poll() is not None or not (num_rows := count(out)):
                 continue
             processes = tree(cluster, run.pid)
             sample = {"seconds": round(time.monotonic() - started, 1), "rows": num_rows}
@@ -220,6 +244,7 @@ def write(options: Options, figures: dict[str, Any]) -> None:
 
 
 def main(options: Options) -> None:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the processes below end, too
     port = free_port()
     os.environ |= {
         "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
@@ -230,20 +255,22 @@ def main(options: Options) -> None:
         "RAY_AUTH_MODE": "token",  # the cluster answers to this run alone
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
     }
-    figures: dict[str, Any] = {"machine": machine(), "commit": commit(), "model": str(_MODEL)}
+    figures: dict[str, Any] = {"machine": machine(), "commit": commit()}
     figures["load_average_before"] = round(os.getloadavg()[0], 1)
-    moto = Path(sys.executable).with_name("moto_server")
-    with tempfile.TemporaryDirectory() as name, process(moto, "-H", "127.0.0.1", "-p", str(port), port=port):
+    store = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    with tempfile.TemporaryDirectory() as name, process(*store, port=port):
         fill(options)
-        figures["images_per_second"] = {}
-        for num_workers in (1, 2):
-            figures["images_per_second"][str(num_workers)] = round(images_per_second(num_workers, Path(name)), 2)
+        small = Path(name) / "paper"
+        write_model(small, K, WIDTH)
+        whole_list(options, small, Path(name), figures)
+        for model, num_workers in product((small, _APE), (1, 2)):
+            figures[f"{model.name}_with_{num_workers}"] = timed(model, options, num_workers, Path(name))
             write(options, figures)
-        whole_list(options, Path(name), figures)
     if options.json:
         print(json.dumps(figures))
         return
-    print(f"images a second by workers: {figures['images_per_second']}")
+    for key in (f"{name}_with_{num_workers}" for name in ("paper", "ape") for num_workers in (1, 2)):
+        print(f"{key:13} {figures[key]}")
     print(f"rows {figures['rows']} of {figures['rows_of_the_list']}, {figures['rows_wrong']} of them wrong")
 
 

@@ -127,7 +127,7 @@ def test_a_list_of_urls_names_images_and_a_missing_one_is_a_line_of_its_own(
 def test_a_bucket_that_refuses_or_is_missing_is_said(models_dir: Path, bucket: Any, endpoint: str) -> None:
     done = detect(models_dir / "flat", "s3://nowhere/day/")
     assert done.returncode == 2
-    assert "s3://nowhere/day/: cannot be listed: No such file" in done.stderr
+    assert "s3://nowhere/day/: cannot be listed: The specified bucket does not exist" in done.stderr
     set_free_calls(endpoint, 0)
     try:
         done = detect(models_dir / "flat", "s3://pictures/day/")
