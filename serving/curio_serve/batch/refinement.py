@@ -44,21 +44,21 @@ class Refiner(Protocol):
         """
 
 
-def load_refiner(spec: ModelSpec, model: str, mesh: Path | None, unit: str | None) -> Refiner:
-    """Render-and-compare for the object of a model.
+def load_refiner(spec: ModelSpec, model: str, meshes: Sequence[Path], unit: str | None) -> Refiner:
+    """Render-and-compare for the objects of a model.
 
     Args:
         spec: Of the model.
-        model: As it was named: a mesh is looked for where it lies.
-        mesh: The object's; None: that of the run which the model lies in.
-        unit: Of the mesh's coordinates; None: the file's own, or metres.
+        model: As it was named: meshes are looked for where it lies.
+        meshes: The objects' files, or folders of them; none: those of the run which the model lies in.
+        unit: Of the meshes' coordinates; None: the files' own, or metres.
 
     Raises:
-        UsageError: The extra is not installed, there is no mesh, or it is none of the model's object.
+        UsageError: The extra is not installed, an object has no mesh, or it is another object's.
     """
     try:
         make = getattr(importlib.import_module(_MODULE), _FUNCTION)
-        made: Refiner = make(spec, model, mesh, unit)
+        made: Refiner = make(spec, model, meshes, unit)
     except ImportError as exc:
         raise UsageError(f"--refine needs the extra train ({exc}): pip install 'curio-pose[train]'") from exc
     return made
@@ -91,13 +91,13 @@ def refining(arguments: DetectArguments, model: str, estimators: list[Estimator]
             :func:`load_refiner`.
     """
     if not arguments.refine:
-        if arguments.mesh is not None or arguments.mesh_unit is not None:
+        if arguments.mesh or arguments.mesh_unit is not None:
             raise UsageError("--mesh and --mesh-unit are for --refine; add it, or leave them out")
         return None
     if arguments.ray is not None or arguments.video is not None or arguments.track:
         raise UsageError("--refine takes seconds a pose, in this process alone: leave out --ray, --video and --track")
     if len(estimators) != 1:
-        raise UsageError(f"--refine needs the mesh of one model, found {len(estimators)} models; name one")
+        raise UsageError(f"--refine needs the meshes of one model, found {len(estimators)} models; name one")
     refiner = load_refiner(estimators[0].spec, model, arguments.mesh, arguments.mesh_unit)
     estimators[0] = RefiningEstimator(estimators[0], refiner)
     return refiner
