@@ -18,7 +18,7 @@ from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.real_frames import evaluate_real_frames
 from curio_train.evaluation.subject import load_subject
 from curio_train.evaluation.unlabelled.candidates import Candidate, candidates
-from curio_train.refinement.render_and_compare import with_refinement
+from curio_train.refinement.predictions import with_refinement
 from paper.linemod_markdown import markdown
 from paper.linemod_sheet import write_sheet
 from paper.linemod_table import REFINED, is_current, load_table, make_row
@@ -75,7 +75,7 @@ def score(settings: Settings, candidate: Candidate) -> dict[str, Row]:
     served = load_subject(candidate.path, settings.data)
     scored = [(candidate.method, served, result)]
     if settings.refine:
-        refiner = replace(served, predict=with_refinement(served.predict, served.world))
+        refiner = replace(served, predict=with_refinement(served.predict, served.world, served.config.method))
         scored.append((candidate.method + REFINED, refiner, result | result["refined"]))
     rows = {}
     for method, subject, found in scored:

@@ -25,7 +25,7 @@ from curio_train.evaluation.subject import load_subject
 from curio_train.geometry import Pose
 from curio_train.learning.runs.provenance import machine
 from curio_train.metrics.poses import ADD_THRESHOLD
-from curio_train.refinement.detections import DetectionRefiner
+from curio_train.refinement.detections import DetectionRefiner, NamedMesh
 from curio_train.scene_code import poses
 
 
@@ -50,7 +50,7 @@ def main() -> None:
     settings = tyro.cli(Settings)
     world = load_subject(settings.model, settings.data).world
     detector, kind = Detector(open_model(settings.model)), world.objects[0]
-    refine = DetectionRefiner(world.object.mesh, detector.model.spec, str(settings.data))
+    refine = DetectionRefiner(detector.model.spec, {kind.name: NamedMesh(str(settings.data), world.object.mesh)})
     frames = draw(world, "test", settings.num_frames, settings.cache)
     camera, truths = PinholeCamera(world.camera.matrix), poses(frames.code)
     found, spent = {"detected": [], "refined": []}, {"detected": [], "refined": []}

@@ -1,5 +1,6 @@
 """``curio-detect --refine``: poses come nearer to the truth, and a wrong mesh is refused with a reason."""
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,21 +11,25 @@ import numpy as np
 import onnx
 import pytest
 import torch
+import tyro
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, Field, ModelSpec, ObjectModel
 from curio_serve.batch import refinement
 from curio_serve.batch.arguments import DetectArguments
 from curio_serve.batch.detect_cli import run
 from curio_serve.errors import UsageError
+from curio_serve.models.spec import read_spec
 from curio_train.camera import Intrinsics
 from curio_train.config import RunConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.learning.runs.configuration import to_json
+from curio_train.meshes.inset import inset
 from curio_train.meshes.meshes import Mesh, to_ply
 from curio_train.meshes.shapes import chair
-from curio_train.scene_code import ROTATION_6D, TRANSLATION
+from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
 from google.protobuf import json_format
@@ -36,13 +41,17 @@ MESH = chair(0.12)
 OFF_DEG, OFF_DEPTH = 8.0, 1.04
 
 
-def constant_model(path: Path, rotation: np.ndarray, translation_m: np.ndarray) -> None:
-    """A model that finds its chair in the same pose in every image."""
-    rotation_6d = rotation[:, :2].T.reshape(1, 1, 6)
+Found = Mapping[str, tuple[Mesh, np.ndarray, np.ndarray]]
+"""Mesh, rotation [3, 3] and position [3] of each object that a model finds."""
+
+
+def constant_model(path: Path, world: str, found: Found) -> None:
+    """A model that finds its objects in the same poses in every image."""
+    rotation = np.stack([rotation for _, rotation, _ in found.values()])[None]
     values = {
-        "translation_m": translation_m.reshape(1, 1, 3),
-        "rotation_6d": rotation_6d,
-        "rotation": rotation[None, None],
+        "translation_m": np.stack([translation_m for _, _, translation_m in found.values()])[None],
+        "rotation_6d": rotation[..., :2].swapaxes(2, 3).reshape(1, -1, 6),
+        "rotation": rotation,
     }
     zero = [numpy_helper.from_array(np.float32(0), "zero"), numpy_helper.from_array(np.array([1, 2, 3]), "axes")]
     nodes = [
@@ -59,17 +68,25 @@ def constant_model(path: Path, rotation: np.ndarray, translation_m: np.ndarray) 
     image = helper.make_tensor_value_info("image", TensorProto.UINT8, ["b", 480, 640, 3])
     graph = helper.make_graph(nodes, "constant", [image], outputs, zero)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    part = ObjectModel(name="chair", diameter_m=MESH.diameter_m, box_corners_m=MESH.box_corners_m.ravel(), slots=[0])
     spec = ModelSpec(
         schema_version=1,
-        name="chair",
-        world="capture",
-        num_slots=1,
+        name=path.stem,
+        world=world,
+        num_slots=len(found),
         fields=[
             Field(name=name, size=size, per_object=True, unit=unit, frame="camera")
             for name, size, unit in (("translation_m", 3, "m"), ("rotation_6d", 6, "1"))
         ],
-        objects=[part],
+        objects=[
+            ObjectModel(
+                name=name,
+                diameter_m=mesh.diameter_m,
+                box_corners_m=mesh.box_corners_m.ravel(),
+                mesh_sha256=hashlib.sha256(to_ply(mesh)).hexdigest(),
+                slots=[slot],
+            )
+            for slot, (name, (mesh, _, _)) in enumerate(found.items())
+        ],
         camera=CanonicalCamera(width=640, height=480, camera_matrix=K.ravel()),
     )
     entry = model.metadata_props.add(key="curio.model_spec")
@@ -100,7 +117,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rotation, translation = truth(code)
     np.savez(folder / "truth.npz", rotation=rotation, translation=translation)
     turn = Rotation.from_rotvec(np.radians(OFF_DEG) * np.array([0.6, 0.0, 0.8])).as_matrix()
-    constant_model(folder / "models" / "chair.onnx", turn @ rotation, translation * OFF_DEPTH)
+    constant_model(
+        folder / "models" / "chair.onnx", "capture", {"chair": (MESH, turn @ rotation, translation * OFF_DEPTH)}
+    )
     (folder / "part.ply").write_bytes(to_ply(MESH))
     options = CaptureOptions((folder / "part.ply",), folder / "camera.json", folder)
     (folder / "config.json").write_text(json.dumps(to_json(RunConfig(options))))
@@ -111,24 +130,32 @@ def truth(code: Mapping[str, torch.Tensor]) -> tuple[np.ndarray, np.ndarray]:
     return matrix_from_rotation_6d(code[ROTATION_6D][0, 0]).numpy(), code[TRANSLATION][0, 0].numpy()
 
 
-def detect(place: Path, **flags: Any) -> dict[str, Any]:
+def detect(place: Path, **flags: Any) -> list[dict[str, Any]]:
     out = place / "out.jsonl"
     flags = {"camera": place / "camera.json", "out": str(out), "overwrite": True} | flags
     model = flags.pop("model", place / "models" / "chair.onnx")
     assert run(DetectArguments(str(model), (str(place / "frame.png"),), **flags)) == 0
-    (found,) = json.loads(out.read_text())["detections"]
+    return json.loads(out.read_text())["detections"]
+
+
+def detect_one(place: Path, **flags: Any) -> dict[str, Any]:
+    (found,) = detect(place, **flags)
     return found
 
 
 def rotation_error_deg(place: Path, found: Mapping[str, Any]) -> float:
     with np.load(place / "truth.npz") as true:
-        turn = np.array(found["rotation"]) @ true["rotation"].T
+        return angle_deg(found, true["rotation"])
+
+
+def angle_deg(found: Mapping[str, Any], rotation: np.ndarray) -> float:
+    turn = np.array(found["rotation"]) @ rotation.T
     return float(np.degrees(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())))
 
 
 def test_the_pose_comes_nearer_to_the_truth(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With the mesh of the run that the model lies in; the box follows the pose."""
-    before, after = detect(place), detect(place, refine=True)
+    before, after = detect_one(place), detect_one(place, refine=True)
     assert "refined 1 of 1 poses" in capsys.readouterr().err
     assert rotation_error_deg(place, before) == pytest.approx(OFF_DEG, abs=0.1)
     assert rotation_error_deg(place, after) < 3
@@ -144,7 +171,7 @@ def test_the_pose_comes_nearer_to_the_truth(place: Path, capsys: pytest.CaptureF
 def test_the_mesh_that_is_named_counts(place: Path) -> None:
     mesh = place / "millimetres.ply"
     mesh.write_bytes(to_ply(Mesh(MESH.vertices_m * 1000, MESH.faces)))
-    assert rotation_error_deg(place, detect(place, refine=True, mesh=mesh, mesh_unit="mm")) < 3
+    assert rotation_error_deg(place, detect_one(place, refine=True, mesh=(mesh,), mesh_unit="mm")) < 3
 
 
 @pytest.mark.parametrize(
@@ -158,24 +185,24 @@ def test_another_mesh_is_refused(place: Path, tmp_path: Path, scale: float, shif
     mesh = tmp_path / "other.ply"
     mesh.write_bytes(to_ply(Mesh(MESH.vertices_m * scale + shift, MESH.faces)))
     with pytest.raises(UsageError, match=told):
-        detect(place, refine=True, mesh=mesh)
+        detect_one(place, refine=True, mesh=(mesh,))
 
 
 def test_a_model_apart_from_its_run_needs_a_mesh(place: Path, tmp_path: Path) -> None:
     copy = tmp_path / "chair.onnx"
     copy.write_bytes((place / "models" / "chair.onnx").read_bytes())
-    with pytest.raises(UsageError, match="give --mesh FILE, the mesh that chair was trained with"):
-        detect(place, model=copy, refine=True)
+    with pytest.raises(UsageError, match=r"found no mesh of chair for .*--mesh FILE"):
+        detect_one(place, model=copy, refine=True)
 
 
 @pytest.mark.parametrize(
     ("flags", "told"),
     [
-        ({"mesh": Path("part.ply")}, "--mesh is for --refine and --overlays"),
+        ({"mesh": (Path("part.ply"),)}, "--mesh is for --refine and --overlays"),
         ({"mesh_unit": "mm"}, "--mesh-unit is for --mesh"),
-        ({"overlays": Path("drawn"), "mesh": Path("missing.ply")}, "missing.ply: the mesh cannot be read"),
+        ({"overlays": Path("drawn"), "mesh": (Path("missing.ply"),)}, "missing.ply: the mesh cannot be read"),
         ({"refine": True, "ray": "local"}, "leave out --ray"),
-        ({"refine": True, "mesh": Path("missing.ply")}, "missing.ply: the mesh cannot be read"),
+        ({"refine": True, "mesh": (Path("missing.ply"),)}, "missing.ply: the mesh cannot be read"),
     ],
 )
 def test_calls_that_cannot_be_carried_out_are_refused(
@@ -183,7 +210,7 @@ def test_calls_that_cannot_be_carried_out_are_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError, match=told):
-        detect(place, **flags)
+        detect_one(place, **flags)
 
 
 def test_drawings_show_the_contour_of_a_mesh_that_is_known(place: Path, tmp_path: Path) -> None:
@@ -198,7 +225,7 @@ def test_drawings_show_the_contour_of_a_mesh_that_is_known(place: Path, tmp_path
     apart = tmp_path / "chair.onnx"
     apart.write_bytes((place / "models" / "chair.onnx").read_bytes())
     of_run, box = drawn(), drawn(model=apart)
-    assert (drawn(model=apart, mesh=place / "part.ply") == of_run).all()
+    assert (drawn(model=apart, mesh=(place / "part.ply",)) == of_run).all()
     assert (box != of_run).any(axis=2).sum() > 1000
 
 
@@ -208,10 +235,86 @@ def test_drawings_do_without_the_extra_unless_a_mesh_is_named(
     monkeypatch.setattr(refinement, "_MODULE", "curio_train_is_not_here")
     detect(place, overlays=tmp_path / "drawn")
     with pytest.raises(UsageError, match=r"--mesh needs the extra train.*pip install 'curio-pose\[train\]'"):
-        detect(place, overlays=tmp_path / "drawn", mesh=place / "part.ply")
+        detect(place, overlays=tmp_path / "drawn", mesh=(place / "part.ply",))
 
 
 def test_a_missing_extra_is_named(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refinement, "_MODULE", "curio_train_is_not_here")
     with pytest.raises(UsageError, match=r"pip install 'curio-pose\[train\]'"):
-        detect(place, refine=True)
+        detect_one(place, refine=True)
+
+
+BENCH = Mesh(MESH.vertices_m * [1.6, 0.7, 1.0], MESH.faces)
+OBJECTS = {"chair": MESH, "bench": BENCH}
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model of two objects in a frame that shows both 1 mm thinner than their files, turned and too far away."""
+    folder = tmp_path_factory.mktemp("several")
+    pool = cv2.resize(np.random.default_rng(4).integers(0, 256, (24, 32, 3), np.uint8), (640, 480))[None]
+    kinds = [
+        ObjectKind(name, (slot,), mesh.diameter_m, mesh.box_corners_m)
+        for slot, (name, mesh) in enumerate(OBJECTS.items())
+    ]
+    members = [
+        Object(
+            kind, inset(OBJECTS[kind.name], 1e-3), Intrinsics(K, 640, 480), 0.5, 1.0, lambda _: ClutterBackgrounds(pool)
+        )
+        for kind in kinds
+    ]
+    world = SeveralObjectsWorld("linemod", members)
+    code = world.sample(1, (3,)) | {CONFIDENCE: torch.ones(1, 2, 1)}
+    code[TRANSLATION] = torch.tensor([[[-0.12, 0.0, 0.65], [0.12, 0.02, 0.75]]])
+    picture = world.render(code, members[0].backgrounds(Path()).draw(1, 640, 480, (2,)))[0]
+    pixels = (picture.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+    cv2.imwrite(str(folder / "frame.png"), cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
+    (folder / "camera.json").write_text(json.dumps({"camera_matrix": K.tolist(), "width": 640, "height": 480}))
+    rotation, translation = matrix_from_rotation_6d(code[ROTATION_6D][0]).numpy(), code[TRANSLATION][0].numpy()
+    np.savez(folder / "truth.npz", rotation=rotation, translation=translation)
+    turn = Rotation.from_rotvec(np.radians(OFF_DEG) * np.array([0.6, 0.0, 0.8])).as_matrix()
+    found = {
+        name: (mesh, turn @ rotation[slot], translation[slot] * OFF_DEPTH)
+        for slot, (name, mesh) in enumerate(OBJECTS.items())
+    }
+    constant_model(folder / "two.onnx", "linemod", found)
+    (folder / "meshes").mkdir()
+    for name, mesh in (OBJECTS | {"other": chair(0.1)}).items():
+        (folder / "meshes" / f"{name}.ply").write_bytes(to_ply(mesh))
+    (folder / "meshes" / "models_info.json").write_text("{}")
+    return folder
+
+
+def test_each_of_several_objects_is_refined(several: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With its own mesh out of a folder; of templates' depth and the refined one the mean counts."""
+    found = {
+        one["object"]: one
+        for one in detect(several, model=several / "two.onnx", refine=True, mesh=(several / "meshes",))
+    }
+    assert "refined 2 of 2 poses" in capsys.readouterr().err
+    with np.load(several / "truth.npz") as true:
+        for name, rotation, translation in zip(OBJECTS, true["rotation"], true["translation"], strict=True):
+            assert angle_deg(found[name], rotation) < 3
+            x, y, z = found[name]["translation_m"]
+            assert z / translation[2] == pytest.approx(OFF_DEPTH**0.5, abs=0.01)
+            assert [x / z, y / z] == pytest.approx(translation[:2] / translation[2], abs=0.004)
+
+
+def test_meshes_are_named_one_by_one(several: Path) -> None:
+    """In any order; an object without one is named."""
+    spec = read_spec((several / "two.onnx").read_bytes(), "two.onnx")
+    chair_file, bench_file, other_file = (several / "meshes" / f"{name}.ply" for name in ("chair", "bench", "other"))
+    refinement.load_refiner(spec, "two.onnx", [bench_file, chair_file], None)
+    with pytest.raises(
+        UsageError, match=r"found 2 mesh files, but none of bench for two\.onnx; .*--mesh FILE once for each"
+    ):
+        refinement.load_refiner(spec, "two.onnx", [chair_file, other_file], None)
+    with pytest.raises(UsageError, match=r"found no mesh of chair, bench for two\.onnx"):
+        refinement.load_refiner(spec, "two.onnx", [], None)
+
+
+def test_mesh_takes_one_file_each_time() -> None:
+    """So images may stand after it."""
+    call = ["model", "--refine", "--mesh", "a.ply", "--mesh", "b.ply", "frames"]
+    arguments = tyro.cli(DetectArguments, args=call)
+    assert (arguments.mesh, arguments.images) == ((Path("a.ply"), Path("b.ply")), ("frames",))

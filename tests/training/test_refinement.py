@@ -1,5 +1,6 @@
 """Refined poses: nearer to the truth where the picture shows the object, and left alone where it does not."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,13 +14,17 @@ from curio_train.errors import UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.scores import add_errors
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.meshes.meshes import Mesh
 from curio_train.meshes.shapes import chair
 from curio_train.refinement.crops import rotation_from_vector
 from curio_train.refinement.inpainting import inpainted
+from curio_train.refinement.predictions import of_slot, with_refinement
 from curio_train.refinement.render_and_compare import RenderAndCompare
-from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, poses
+from curio_train.refinement.template_poses import with_mean_depth
+from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode, poses
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.generated.circles import Circles
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation
@@ -141,8 +146,41 @@ def test_rotations_of_vectors_are_scipys() -> None:
     assert vectors.grad[1, 2] == pytest.approx(-1, abs=1e-4)
 
 
+def test_each_of_several_objects_is_refined_and_takes_the_mean_of_both_depths(world: TwoStageWorld) -> None:
+    """Objects of LineMOD's world of several are read by templates."""
+    bench = Mesh(MESH.vertices_m * [1.6, 0.7, 1.0], MESH.faces)
+    members = [
+        replace(world.object, kind=ObjectKind(name, (slot,), mesh.diameter_m, mesh.box_corners_m), mesh=mesh)
+        for slot, (name, mesh) in enumerate({"chair": MESH, "bench": bench}.items())
+    ]
+    several = SeveralObjectsWorld("linemod", members)
+    true = several.sample(2, (1,)) | {CONFIDENCE: torch.ones(2, 2, 1)}
+    true[TRANSLATION] = torch.tensor([[[-0.12, 0.0, 0.65], [0.12, 0.02, 0.75]], [[0.1, 0.05, 0.8], [-0.1, 0.0, 0.7]]])
+    behind = world.backgrounds(Path()).draw(2, 640, 480, (2,))
+    images = (several.render(true, behind).clamp(0, 1) * 255).round().byte()
+    estimate = true | {TRANSLATION: true[TRANSLATION] * 1.04 + torch.tensor([0.003, -0.002, 0.0])}
+    found = with_refinement(lambda _: estimate, several, "sleep")(images)
+    for slot, member in enumerate(members):
+        alone = RenderAndCompare(member.mesh, several.camera, member.kind.diameter_m)
+        refined, accepted = alone.refine(images, of_slot(estimate, slot))
+        assert accepted.all()
+        expected = (refined[TRANSLATION][..., 2:] * estimate[TRANSLATION][:, slot : slot + 1, 2:]).sqrt()
+        expected = refined[TRANSLATION] * expected / refined[TRANSLATION][..., 2:]
+        assert torch.allclose(found[TRANSLATION][:, slot : slot + 1], expected, atol=1e-4)
+        turned = matrix_from_rotation_6d(found[ROTATION_6D][:, slot]) - matrix_from_rotation_6d(
+            true[ROTATION_6D][:, slot]
+        )
+        assert turned.abs().max() < 0.05
+    assert torch.equal(found[CONFIDENCE], true[CONFIDENCE])
+
+
+def test_rejected_refinements_leave_depth_to_the_bit() -> None:
+    code = {TRANSLATION: torch.rand(1000, 1, 3) + 0.1}
+    assert torch.equal(with_mean_depth(code, code)[TRANSLATION], code[TRANSLATION])
+
+
 def test_worlds_without_one_object_are_refused(tmp_path: Path, write_run) -> None:
-    with pytest.raises(UsageError, match="--refine: world circles cannot be refined, expected one object"):
+    with pytest.raises(UsageError, match="--refine: world circles cannot be refined, expected objects in free"):
         RenderAndCompare.in_world(Circles())
     with pytest.raises(UsageError, match="--refine: world circles"):
         evaluate(write_run(tmp_path / "run"), refine=True, cache=tmp_path)

@@ -67,8 +67,9 @@ class DetectArguments:
     """With --track: of a folder's images and of videos that say none, frames/s."""
     refine: tyro.conf.FlagCreatePairsOff[bool] = False
     """Improve each pose by render-and-compare with the object's mesh: seconds a pose, and the extra train."""
-    mesh: Path | None = None
-    """Mesh of the model's object, for --refine and --overlays. None: that of the run in whose folder the model lies."""
+    mesh: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """Mesh for --refine and --overlays; of several objects, once for each, or the folder of all files. None: those
+    of the run in whose folder the model lies."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
     """Unit of --mesh; the file's own, or metres, unless given. BOP's meshes are in mm."""
     exif_rotation: bool = False

@@ -102,7 +102,7 @@ def run(arguments: DetectArguments) -> int:
             results = in_order(partial(_answer, estimators, form), content, arguments.jobs)
         else:  # other nodes have another working folder
             there = [os.path.abspath(model) if os.path.exists(model) else model for model in models]
-            placed = replace(arguments, mesh=arguments.mesh and arguments.mesh.absolute())
+            placed = replace(arguments, mesh=tuple(mesh.absolute() for mesh in arguments.mesh))
             results = over_cluster(arguments.ray, partial(_answering, placed, there, settings), remaining)
         with (
             closing(results),

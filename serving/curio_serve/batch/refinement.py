@@ -22,7 +22,7 @@ from curio_serve.batch.images.source_image import SourceImage
 from curio_serve.errors import UsageError
 from curio_serve.imaging.camera import PinholeCamera
 
-_MODULE, _REFINER, _SURFACE = "curio_train.commands.refine", "refiner", "surface"
+_MODULE, _REFINER, _SURFACES = "curio_train.commands.refine", "refiner", "surfaces"
 
 
 class Refiner(Protocol):
@@ -46,21 +46,21 @@ class Refiner(Protocol):
         """
 
 
-def load_refiner(spec: ModelSpec, model: str, mesh: Path | None, unit: str | None) -> Refiner:
-    """Render-and-compare for the object of a model.
+def load_refiner(spec: ModelSpec, model: str, meshes: Sequence[Path], unit: str | None) -> Refiner:
+    """Render-and-compare for the objects of a model.
 
     Args:
         spec: Of the model.
-        model: Its path; the mesh may lie beside it.
-        mesh: The object's; None: that of the run which the model lies in.
-        unit: Of the mesh's coordinates; None: the file's own, or metres.
+        model: As it was named: meshes are looked for where it lies.
+        meshes: The objects' files, or folders of them; none: those of the run which the model lies in.
+        unit: Of the meshes' coordinates; None: the files' own, or metres.
 
     Raises:
-        UsageError: The extra is not installed, there is no mesh, or it is none of the model's object.
+        UsageError: The extra is not installed, an object has no mesh, or it is another object's.
     """
     try:
         make = getattr(importlib.import_module(_MODULE), _REFINER)
-        made: Refiner = make(spec, model, mesh, unit)
+        made: Refiner = make(spec, model, meshes, unit)
     except ImportError as exc:
         raise UsageError(f"--refine needs the extra train ({exc}): pip install 'curio-pose[train]'") from exc
     return made
@@ -96,7 +96,7 @@ def refining(arguments: DetectArguments, model: str, estimators: list[Estimator]
     if arguments.ray is not None or arguments.video is not None or arguments.track:
         raise UsageError("--refine takes seconds a pose, in this process alone: leave out --ray, --video and --track")
     if len(estimators) != 1:
-        raise UsageError(f"--refine needs the mesh of one model, found {len(estimators)} models; name one")
+        raise UsageError(f"--refine needs the meshes of one model, found {len(estimators)} models; name one")
     refiner = load_refiner(estimators[0].spec, model, arguments.mesh, arguments.mesh_unit)
     estimators[0] = RefiningEstimator(estimators[0], refiner)
     return refiner
@@ -108,23 +108,23 @@ def outlining(arguments: DetectArguments, models: Sequence[str], estimators: Seq
     Raises:
         UsageError: The call names a mesh for nothing or for several models, it cannot be read, or the extra is missing.
     """
-    if arguments.mesh is None and arguments.mesh_unit is not None:
+    if not arguments.mesh and arguments.mesh_unit is not None:
         raise UsageError("--mesh-unit is for --mesh; name the mesh, too")
-    if arguments.mesh is not None and arguments.overlays is None and not arguments.refine:
+    if arguments.mesh and arguments.overlays is None and not arguments.refine:
         raise UsageError("--mesh is for --refine and --overlays; add one of them, or leave it out")
     if arguments.overlays is None:
         return
-    if arguments.mesh is not None and len(estimators) != 1:
-        raise UsageError(f"--mesh is the mesh of one model, found {len(estimators)} models; name one, or leave it out")
+    if arguments.mesh and len(estimators) != 1:
+        raise UsageError(
+            f"--mesh is for the objects of one model, found {len(estimators)} models; name one, or leave it out"
+        )
     for model, estimator in zip(models, estimators, strict=True):
-        if arguments.mesh is None and not os.path.exists(model):
+        if not arguments.mesh and not os.path.exists(model):
             continue
         try:
-            read = getattr(importlib.import_module(_MODULE), _SURFACE)
+            read = getattr(importlib.import_module(_MODULE), _SURFACES)
         except ImportError as exc:
-            if arguments.mesh is None:
+            if not arguments.mesh:
                 return  # boxes do without
             raise UsageError(f"--mesh needs the extra train ({exc}): pip install 'curio-pose[train]'") from exc
-        found = read(estimator.spec, model, arguments.mesh, arguments.mesh_unit)
-        if found is not None:
-            estimator.surfaces = {estimator.spec.objects[0].name: found}
+        estimator.surfaces = read(estimator.spec, model, arguments.mesh, arguments.mesh_unit)

@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 
 import grpc
 
+from curio_serve import memory
 from curio_serve.api.admission import QueueEntry
 from curio_serve.errors import CallCancelled
-from curio_serve.server import memory
 from curio_serve.telemetry import log
 
 _TICK_S = 0.1

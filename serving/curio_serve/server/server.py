@@ -15,6 +15,7 @@ from grpc_health.v1 import health, health_pb2
 from grpc_reflection.v1alpha import reflection, reflection_pb2
 from prometheus_client import CollectorRegistry
 
+from curio_serve import memory
 from curio_serve.api.admission import WorkQueue
 from curio_serve.api.kserve import InferenceService
 from curio_serve.api.pose_detector import Limits, PoseService
@@ -24,7 +25,6 @@ from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.models.model_check import ChildCheck
 from curio_serve.models.repository import Change, Repository
 from curio_serve.models.runtime import Runtime, on_processor, read_providers
-from curio_serve.server import memory
 from curio_serve.server.config import ServeConfig
 from curio_serve.server.metrics_port import MetricsPort
 from curio_serve.server.reception import Reception, ReceptionLimits

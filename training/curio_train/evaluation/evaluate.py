@@ -22,7 +22,7 @@ from curio_train.learning.runs.initial import uses_synthetic_labels
 from curio_train.learning.runs.provenance import machine
 from curio_train.metrics.calibration import auroc, calibration_error, reliability_bins
 from curio_train.metrics.poses import ADD_THRESHOLD
-from curio_train.refinement.render_and_compare import with_refinement
+from curio_train.refinement.predictions import with_refinement
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
 from curio_train.worlds.base import Split, World
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
@@ -93,7 +93,7 @@ def evaluate(
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
     if num_images is None:
         num_images = QUICK if isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld) else ALL
-    better = replace(subject, predict=with_refinement(subject.predict, subject.world)) if refine else None
+    better = _refining(subject) if refine else None
     progress(f"{num_images} images of the {split} split")
     held_out = draw(subject.world, split, num_images, cache)
     result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images)}
@@ -126,6 +126,11 @@ def evaluate(
         except ReportError as exc:
             warn(str(exc))
     return result
+
+
+def _refining(subject: Subject) -> Subject:
+    """The same network with refined poses."""
+    return replace(subject, predict=with_refinement(subject.predict, subject.world, subject.config.method))
 
 
 @torch.no_grad()

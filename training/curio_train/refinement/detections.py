@@ -1,7 +1,9 @@
 """Render-and-compare on the detections of serving: the frame as the model saw it, poses there and back."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,35 +15,52 @@ from curio_serve.imaging.view import CanonicalCamera, PinholeCrop, PinholeFrame
 from curio_serve.models.detector import transformed
 
 from curio_train.geometry import rotation_6d_from_matrix
+from curio_train.meshes.inset import inset
 from curio_train.meshes.meshes import Mesh
 from curio_train.meshes.of_model import refuse_other_mesh
 from curio_train.refinement.render_and_compare import DEFAULT_LIGHT, RenderAndCompare
+from curio_train.refinement.template_poses import uses_templates
 from curio_train.scene_code import COLOR, LIGHT, ROTATION_6D, TRANSLATION, SceneCode, poses
 from curio_train.worlds.base import Camera
+from curio_train.worlds.linemod import SCAN_EXCESS_M
+
+
+class NamedMesh(NamedTuple):
+    """The mesh of an object."""
+
+    label: str
+    """Names it in errors."""
+    mesh: Mesh
+    """As in its file."""
 
 
 class DetectionRefiner:
-    """Refines the detections of one object; safe to share between threads, which take turns."""
+    """Refines the detections of a model; safe to share between threads, which take turns."""
 
-    def __init__(self, mesh: Mesh, spec: ModelSpec, label: str) -> None:
-        """Build the renderer.
+    def __init__(self, spec: ModelSpec, meshes: Mapping[str, NamedMesh]) -> None:
+        """Build a renderer for each object.
 
         Args:
-            mesh: Of the object.
-            spec: Of a model that finds one kind of object, with K*.
-            label: Names the mesh in errors.
+            spec: Of a model with K*.
+            meshes: Of its objects, by their names.
 
         Raises:
-            MeshError: The mesh is of another size or lies otherwise in its frame than the one the model learned.
+            MeshError: A mesh is of another size or lies otherwise in its frame than the one the model learned.
         """
-        (kind,) = spec.objects
-        self._corners = np.reshape(kind.box_corners_m, (-1, 3)).tolist()
-        refuse_other_mesh(mesh, kind, label)
-        camera = spec.camera
-        matrix = np.reshape(camera.camera_matrix, (3, 3))
-        self._canonical = CanonicalCamera(camera.width, camera.height, matrix)
-        self._refiner = RenderAndCompare(mesh, Camera(camera.width, camera.height, matrix), kind.diameter_m)
-        self._lock = Lock()  # the renderer is not thread-safe
+        matrix = np.reshape(spec.camera.camera_matrix, (3, 3))
+        self._canonical = CanonicalCamera(spec.camera.width, spec.camera.height, matrix)
+        camera = Camera(spec.camera.width, spec.camera.height, matrix)
+        from_templates = uses_templates(_method(spec), spec.world, len(spec.objects))
+        excess_m = SCAN_EXCESS_M if from_templates and spec.world == "linemod" else 0.0
+        self._corners, self._refiners = {}, {}
+        for kind in spec.objects:
+            label, mesh = meshes[kind.name]
+            refuse_other_mesh(mesh, kind, label)
+            self._corners[kind.name] = np.reshape(kind.box_corners_m, (-1, 3)).tolist()
+            self._refiners[kind.name] = RenderAndCompare(
+                inset(mesh, excess_m) if excess_m else mesh, camera, kind.diameter_m, from_templates=from_templates
+            )
+        self._lock = Lock()  # the renderers are not thread-safe
         self.num_detections = self.num_refined = 0
 
     def __call__(
@@ -56,10 +75,18 @@ class DetectionRefiner:
             light: [3] towards the light in the frame's camera; none: from above.
         """
         crop = PinholeFrame(pixels, camera, self._canonical).crop()
+        for name, refiner in self._refiners.items():
+            if of_object := [one for one in detections if one.object == name]:
+                self._refine(refiner, crop, of_object, light)
+
+    def _refine(
+        self, refiner: RenderAndCompare, crop: PinholeCrop, detections: Sequence[Detection], light: Sequence[float]
+    ) -> None:
+        """Those of one object."""
         image = torch.from_numpy(np.ascontiguousarray(crop.image)).permute(2, 0, 1)[None]
         code = _code(detections, light, crop.canonical_from_cam)
         with self._lock:
-            refined, accepted = self._refiner.refine(image.expand(len(detections), -1, -1, -1), code)
+            refined, accepted = refiner.refine(image.expand(len(detections), -1, -1, -1), code)
             self.num_detections += len(detections)
             self.num_refined += int(accepted.sum())
         for detection, pose, is_better in zip(detections, poses(refined), accepted.tolist(), strict=True):
@@ -72,7 +99,16 @@ class DetectionRefiner:
         detection.rotation[:] = rotation
         detection.rotation_6d[:] = [*rotation[0::3], *rotation[1::3]]
         detection.quaternion_xyzw[:] = quaternion_xyzw(rotation)
-        detection.box_px[:] = crop.project(transformed(self._corners, rotation, translation))
+        detection.box_px[:] = crop.project(transformed(self._corners[detection.object], rotation, translation))
+
+
+def _method(spec: ModelSpec) -> str:
+    """That the model was trained with; empty where its recipe does not say it."""
+    try:
+        recipe = json.loads(spec.recipe)
+    except ValueError:
+        return ""
+    return str(recipe.get("method", "")) if isinstance(recipe, dict) else ""
 
 
 def _code(detections: Sequence[Detection], light: Sequence[float], canonical_from_cam: np.ndarray) -> SceneCode:

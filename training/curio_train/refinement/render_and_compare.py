@@ -12,7 +12,7 @@ the estimate, and enough of the silhouette is inliers: pixels that the backgroun
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -28,6 +28,7 @@ from curio_train.meshes.meshes import Mesh
 from curio_train.networks.crop_camera import cut_crops
 from curio_train.refinement.crops import Crops, PoseAndLight, PoseUpdate
 from curio_train.refinement.inpainting import blurred, dilated, inpainted
+from curio_train.refinement.template_poses import with_mean_depth
 from curio_train.rendering.renderer import Renderer
 from curio_train.scene_code import COLOR, LIGHT, ROTATION_6D, TRANSLATION, SceneCode, index
 from curio_train.worlds.base import Camera, World
@@ -66,52 +67,41 @@ DEFAULT_LIGHT = 0.0, -0.4, -0.5  # from above the camera, for poses that are not
 _BATCH_SIZE = 32  # of poses that are not optimised
 
 
-def with_refinement(predict: Callable[[Tensor], SceneCode], world: World) -> Callable[[Tensor], dict[str, Tensor]]:
-    """Predictions with refined poses.
-
-    Args:
-        predict: uint8 images [batch, 3, height, width] of the world's camera to scene codes.
-        world: Of one object.
-
-    Raises:
-        UsageError: The world is another.
-    """
-    refiner = RenderAndCompare.in_world(world)
-    return lambda images: refiner.refine(images, predict(images))[0]
-
-
 class RenderAndCompare:
     """Refines poses of one object in frames of one camera."""
 
     diameter_m: float
     """Of the object."""
 
-    def __init__(self, mesh: Mesh, camera: Camera, diameter_m: float) -> None:
+    def __init__(self, mesh: Mesh, camera: Camera, diameter_m: float, *, from_templates: bool = False) -> None:
         """Build the renderer.
 
         Args:
             mesh: Of the object.
             camera: Of the frames, with K.
             diameter_m: Of the object; crops and limits are measured in it.
+            from_templates: Estimates are poses of template matching, see
+                :func:`~curio_train.refinement.template_poses.with_mean_depth`.
         """
         self._camera = camera
         self._matrix = torch.from_numpy(np.asarray(camera.matrix)).float()
-        self.diameter_m = diameter_m
+        self.diameter_m, self._from_templates = diameter_m, from_templates
         self._renderer = Renderer([mesh], [0], CROP_PX, CROP_PX, ambient=AMBIENT)
 
     @classmethod
-    def in_world(cls, world: World) -> "RenderAndCompare":
-        """Build the refiner for a world's object and camera.
+    def in_world(cls, world: World, *, from_templates: bool = False) -> "RenderAndCompare":
+        """Build the refiner for a world's object and camera; templates show the object as thick as the real one.
 
         Raises:
             UsageError: The world does not have one object before a pinhole camera.
         """
         if not isinstance(world, SingleObjectWorld):
             raise UsageError(
-                f"--refine: world {world.name} cannot be refined, expected one object before a camera (linemod, "
-                "capture); leave it out"
+                f"--refine: world {world.name} cannot be refined, expected objects in free space before a "
+                "camera (linemod, capture without --plane); leave it out"
             )
-        return cls(world.object.mesh, world.camera, world.object.kind.diameter_m)
+        object_ = world.object.without_scan_excess() if from_templates else world.object
+        return cls(object_.mesh, world.camera, object_.kind.diameter_m, from_templates=from_templates)
 
     def refine(self, images: Tensor, code: SceneCode) -> tuple[dict[str, Tensor], Bool[Tensor, " batch"]]:
         """Refine the poses of a batch, all at once.
@@ -129,7 +119,8 @@ class RenderAndCompare:
         refined = {
             name: torch.where(accepted[:, None, None], result[name], code[name]) for name in (TRANSLATION, ROTATION_6D)
         }
-        return dict(code) | refined, accepted
+        found = dict(code) | refined
+        return (with_mean_depth(code, found) if self._from_templates else found), accepted
 
     def steps(self, images: Tensor, code: SceneCode) -> Iterator[tuple[dict[str, Tensor], Float[Tensor, " batch"]]]:
         """The code after each step of the optimisation, and the mean residual before the step, 0 to 1.

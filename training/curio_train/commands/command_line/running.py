@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from curio_serve.memory import keep_freed
 from rich.console import Console
 
 from curio_train.errors import CurioError, UsageError
@@ -18,7 +19,11 @@ _EXTRAS = {"pycolmap": "capture", "viser": "view", "ray": "ray"}
 
 
 def answer(work: Callable[[Interruption], int]) -> int:
-    """Do a command's work and return its exit status; each deliberate error is one message on stderr."""
+    """Do a command's work and return its exit status; each deliberate error is one message on stderr.
+
+    The process keeps the memory that it frees, see :func:`~curio_serve.memory.keep_freed`.
+    """
+    keep_freed()
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     with interruptible() as interruption:
         try:

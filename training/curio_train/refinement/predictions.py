@@ -1,0 +1,53 @@
+"""A network's predictions with refined poses: each object by render-and-compare with its own mesh."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from curio_train.refinement.render_and_compare import RenderAndCompare
+from curio_train.refinement.template_poses import uses_templates
+from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode
+from curio_train.worlds.base import World
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+
+
+def with_refinement(
+    predict: Callable[[Tensor], SceneCode], world: World, method: str
+) -> Callable[[Tensor], dict[str, Tensor]]:
+    """Predictions with refined poses.
+
+    Args:
+        predict: uint8 images [batch, 3, height, width] of the world's camera to scene codes.
+        world: Of one object, or of several with a slot each.
+        method: That the network was trained with.
+
+    Raises:
+        UsageError: The world is another.
+    """
+    refiners = _refiners(world, method)
+
+    def refined(images: Tensor) -> dict[str, Tensor]:
+        code = predict(images)
+        slots = [refiner.refine(images, of_slot(code, slot))[0] for slot, refiner in enumerate(refiners)]
+        return dict(code) | {
+            name: torch.cat([one[name] for one in slots], dim=1) for name in (TRANSLATION, ROTATION_6D)
+        }
+
+    return refined
+
+
+def of_slot(code: SceneCode, slot: int) -> dict[str, Tensor]:
+    """Codes of one object alone: per-object fields [batch, 1, size], and what the whole scene has in common."""
+    return {name: value[:, slot : slot + 1] if value.ndim == 3 else value for name, value in code.items()}
+
+
+def _refiners(world: World, method: str) -> list[RenderAndCompare]:
+    """One a slot."""
+    from_templates = uses_templates(method, world.name, len(world.objects))
+    if not isinstance(world, SeveralObjectsWorld):
+        return [RenderAndCompare.in_world(world, from_templates=from_templates)]
+    return [
+        RenderAndCompare(one.mesh, world.camera, one.kind.diameter_m, from_templates=from_templates)
+        for one in world.members
+    ]
