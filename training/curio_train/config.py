@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Suppress
 
 from curio_train.errors import UsageError
 
-MethodName = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic", "templates"]
+MethodName = Literal["our", "noncur", "super", "sleep", "wake_sleep", "wake_sleep_critic", "hypotheses", "templates"]
 Preset = Literal["laptop", "paper"]
 DecoderKind = Literal["whole", "cells"]
 
@@ -30,13 +30,15 @@ class Method:
     """Error of what the network predicts for renderings of known scene codes."""
     label: bool = False
     """Error of what the network predicts for training images whose scene codes are given."""
+    hypotheses: bool = False
+    """Error against the scene whose rendering, among many hypotheses, has the lowest image loss."""
     templates: bool = False
     """Nothing is trained: renderings of the object are stored and compared with frames by pretrained features."""
 
     @property
     def reads_images(self) -> bool:
         """Whether the network is run on training images at all; else it learns from renderings alone."""
-        return self.image or self.curiosity or self.label
+        return self.image or self.curiosity or self.label or self.hypotheses
 
     @property
     def perturbs_predictions(self) -> bool:
@@ -51,6 +53,7 @@ METHODS: Mapping[MethodName, Method] = {
     "sleep": Method(sleep=True),
     "wake_sleep": Method(image=True, sleep=True),
     "wake_sleep_critic": Method(image=True, curiosity=True, sleep=True),
+    "hypotheses": Method(hypotheses=True),
     "templates": Method(templates=True),
 }
 """All methods by name; the first three are the paper's."""
@@ -214,8 +217,8 @@ class RunConfig:
     method: MethodName = "our"
     """our: image loss and critic. noncur: image loss alone. super: true scene codes. Beyond the paper, sleep: regress
     the scene codes of renderings, drawn from the world's known range. wake_sleep: image loss, and sleep with half of
-    the codes around own predictions. wake_sleep_critic: that and the critic. templates: no
-    training; renderings of the object are compared with frames by pretrained features."""
+    the codes around own predictions. wake_sleep_critic: that and the critic. hypotheses: image
+    loss minimised over many rendered hypotheses instead of by its gradient. templates: no training; renderings of the object are compared with frames by pretrained features."""
     labels: float = 1.0
     """Fraction of the training images that --method super sees, with their true codes (paper: 0.05, 0.1, 1)."""
     preset: Preset = "laptop"
@@ -245,6 +248,8 @@ class RunConfig:
             raise UsageError(
                 f"--labels {self.labels} with --method {self.method}, which uses none; expected --method super"
             )
+        if self.terms.hypotheses and self.network.reading != "cells":
+            raise UsageError("--method hypotheses teaches the dense decoder alone; add --reading cells")
         if self.stop_below and not self.terms.image:
             raise UsageError(f"--stop-below watches the image loss, which --method {self.method} does not have")
         for name in ("minutes", "images"):

@@ -116,6 +116,8 @@ class Trainer:
                     losses["curiosity"] = curiosity_loss(self._judge, rendered)
             if terms.label and batch.code is not None:
                 losses["label"] = world.code_loss(code, batch.code)
+            if terms.hypotheses and batch.code is not None:
+                losses["hypotheses"] = world.code_loss(code, batch.code)
 
             # Sleep: render known codes, predict them.
             if terms.perturbs_predictions:

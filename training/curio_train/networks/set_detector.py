@@ -146,11 +146,11 @@ def dense_loss(
         kinds: Slots of each kind of object.
         grid: The cells.
         predicted: From :meth:`SetDetector.decode`.
-        true: The scene's own code.
+        true: The scene's own code. Where it has a confidence, objects of confidence 0 teach nothing.
     """
     of_slot = torch.cat([torch.full((len(slots),), kind) for kind, slots in enumerate(kinds)])
     splat = grid.splat_weights(grid.project(true[TRANSLATION]))
-    present = true[CONFIDENCE] if CONFIDENCE in layout else torch.ones_like(true[TRANSLATION][..., :1])
+    present = true[CONFIDENCE] if CONFIDENCE in true else torch.ones_like(true[TRANSLATION][..., :1])
     num_cells = predicted[HEAT_MAP].shape[2]
     splat = SplatWeights(of_slot.to(splat.cell)[:, None] * num_cells + splat.cell, splat.weight * present)
     names = [field.name for field in layout.fields if per_cell(field.name) in predicted]

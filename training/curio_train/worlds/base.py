@@ -1,7 +1,7 @@
 """What every world is: a scene code, a distribution of scenes, and a differentiable renderer.
 
-What only some worlds can do stands in small protocols: :class:`StagedWorld`, :class:`AugmentedWorld` and
-:class:`NovelViewWorld`.
+What only some worlds can do stands in small protocols: :class:`StagedWorld`, :class:`AugmentedWorld`,
+:class:`HypothesisWorld` and :class:`NovelViewWorld`.
 """
 
 from abc import ABC, abstractmethod
@@ -242,6 +242,18 @@ class AugmentedWorld(Protocol):
 
     def augment(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
         """Renderings [batch, 3, height, width] with the differences applied, for the loss term ``sleep``."""
+
+
+@runtime_checkable
+class HypothesisWorld(Protocol):
+    """A world that finds the scenes of images by rendering many hypotheses."""
+
+    def explained(self, source: ImageSource) -> ImageSource:
+        """The images with the codes that were found for them, of which none is a label.
+
+        Raises:
+            UsageError: Scenes of this world cannot be found so.
+        """
 
 
 @runtime_checkable

@@ -68,6 +68,10 @@ class StoredImages(ImageSource):
         backgrounds = None if self._backgrounds is None else self._backgrounds[:count]
         return StoredImages(self.images[:count], code, seed=self._seed, shuffle=self._shuffle, backgrounds=backgrounds)
 
+    def with_code(self, code: SceneCode) -> "StoredImages":
+        """The same images with these codes."""
+        return StoredImages(self.images, code, seed=self._seed, shuffle=self._shuffle, backgrounds=self._backgrounds)
+
     def batch(self, step: int, size: int) -> Batch:
         """Images ``step * size`` to ``(step + 1) * size`` of the endless sequence of epochs."""
         rows = self._rows(np.arange(step * size, (step + 1) * size))

@@ -144,7 +144,7 @@ class MeshWorld(World):
         """Eq. 1, or of the dense detector the loss of all cells, mean over the batch."""
         if HEAT_MAP not in predicted:
             return super().code_loss(predicted, true)
-        grid = self._grid.to(true[TRANSLATION].device)
+        grid = self.grid.to(true[TRANSLATION].device)
         return dense_loss(self.layout, self._slots_of_kinds, grid, predicted, true).mean()
 
     @property
@@ -152,7 +152,8 @@ class MeshWorld(World):
         return tuple(kind.slots for kind in self.objects)
 
     @cached_property
-    def _grid(self) -> CellGrid:
+    def grid(self) -> CellGrid:
+        """The cells of the world's images."""
         return self._new_grid()
 
     def _new_grid(self) -> CellGrid:
