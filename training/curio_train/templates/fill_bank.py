@@ -16,6 +16,7 @@ from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FI
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.templates.describe import features, low_rank, mean_cosine
 from curio_train.templates.drawing import APPEARANCES, CropTemplateRenderer
+from curio_train.templates.outline import outlines
 
 _SEED = 20_211
 _BATCH = 64  # of drawings
@@ -58,7 +59,7 @@ def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> 
     described = torch.cat([F.normalize(_sum(of_surface(seen) for seen in some), dim=1) for some in fine])
     points = _surface_points(mesh, views, depth, focal_px)
     on_surface = _chosen(inside, points / geometry.diameter_m, described)
-    return Bank(of_crop, of_surface, filters, weights, *on_surface)
+    return Bank(of_crop, of_surface, filters, weights, *on_surface, *outlines(mesh, geometry))
 
 
 def _sum(of_appearances: Iterable[Tensor]) -> Tensor:

@@ -11,8 +11,11 @@ COARSE_SIZE = 24
 RANK = 56
 """Filters that all templates are sums of."""
 
-NUM_POINTS = 80
+NUM_POINTS = 76
 """Surface points a template that poses are aligned by."""
+
+NUM_OUTLINE_POINTS = 32
+"""Points of the outline in each direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,3 +34,7 @@ class Bank:
     """On the surface, object frame, diameters."""
     described: Float[Tensor, "templates points channels"]
     """Fine descriptors of the points."""
+    outline: Float[Tensor, "views points 3"]
+    """Points on the outline in each direction, object frame, diameters."""
+    outward: Float[Tensor, "views points 3"]
+    """Unit vectors out of the outline, across the line of sight, object frame."""

@@ -5,10 +5,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from curio_train.networks.templates.bank import COARSE_SIZE, NUM_POINTS, RANK, Bank
+from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import normalised
 from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, NUM_VIEWS, viewpoints
-from curio_train.networks.templates.quantisation import CODEWORDS, to_bytes, to_codes
+from curio_train.networks.templates.quantisation import CODEWORDS, LARGEST_BYTE, to_bytes, to_codes
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH
 
 _PARTS = 4
@@ -38,6 +38,12 @@ class Banks(nn.Module):
     """Bytes [objects, templates, points, parts]: codewords of the points' fine descriptors."""
     codewords: Tensor
     """[objects, parts, CODEWORDS, FINE_WIDTH / parts]."""
+    outline: Tensor
+    """Bytes [objects, directions, points, 3]."""
+    outline_scale: Tensor
+    """Diameters a unit, [objects]."""
+    outward: Tensor
+    """Bytes [objects, directions, points, 3]; their lengths do not matter."""
     rotations: Tensor
     """cam_from_obj of an object on the optical axis, [templates, 3, 3]; the same for every object."""
 
@@ -56,6 +62,9 @@ class Banks(nn.Module):
             ("points_scale", (), torch.float32),
             ("codes", (num, NUM_POINTS, _PARTS), torch.uint8),
             ("codewords", (_PARTS, CODEWORDS, FINE_WIDTH // _PARTS), torch.float16),
+            ("outline", (NUM_VIEWS, NUM_OUTLINE_POINTS, 3), torch.int8),
+            ("outline_scale", (), torch.float32),
+            ("outward", (NUM_VIEWS, NUM_OUTLINE_POINTS, 3), torch.int8),
         ):
             self.register_buffer(name, torch.zeros(num_objects, *shape, dtype=dtype))
         self.register_buffer("rotations", viewpoints(NUM_VIEWS, NUM_ROLLS), persistent=False)
@@ -76,6 +85,10 @@ class Banks(nn.Module):
         codes, codewords = to_codes(bank.described.flatten(0, 1), _PARTS)
         self.codes[number] = codes.view_as(self.codes[number])
         self.codewords[number] = codewords
+        outline, of_outline = to_bytes(bank.outline.flatten()[None])
+        self.outline[number] = outline.view_as(self.outline[number])
+        self.outline_scale[number] = of_outline[0]
+        self.outward[number] = (LARGEST_BYTE * bank.outward).round().to(torch.int8)
 
     def match(
         self, features: Float[Tensor, "batch objects num channels rows columns"]
@@ -110,3 +123,12 @@ class Banks(nn.Module):
         first = number[:, None, None] * _PARTS + torch.arange(_PARTS, device=templates.device)
         codeword = first * CODEWORDS + self.codes.flatten(0, 1)[row].long()
         return points, self.codewords.flatten(0, 2)[codeword].float().flatten(2)
+
+    def outlines(
+        self, templates: Int[Tensor, " batch*objects"]
+    ) -> tuple[Float[Tensor, "batch*objects points 3"], Float[Tensor, "batch*objects points 3"]]:
+        """Points on the outlines of templates, diameters, and vectors out of them; a template an object."""
+        number = torch.arange(self.num_objects, device=templates.device).repeat(templates.shape[0] // self.num_objects)
+        row = number * NUM_VIEWS + torch.div(templates, NUM_ROLLS, rounding_mode="floor")
+        points = self.outline.flatten(0, 1)[row].float() * self.outline_scale[number][:, None, None]
+        return points, self.outward.flatten(0, 1)[row].float()

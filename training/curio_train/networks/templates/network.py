@@ -22,7 +22,7 @@ class TemplateNetwork(nn.Module):
     geometry: Geometry
     """Of frames and object."""
 
-    def __init__(self, geometry: Geometry, steps: tuple[int, int] = STEPS) -> None:
+    def __init__(self, geometry: Geometry, steps: tuple[int, int, int] = STEPS) -> None:
         """Build for frames and an object; all templates are still empty.
 
         Args:

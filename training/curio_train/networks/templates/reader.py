@@ -12,6 +12,7 @@ from curio_train.networks.crop_camera import cut_crops
 from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.banks import Banks
 from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
+from curio_train.networks.templates.outline import outline_log_factor
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
@@ -19,8 +20,11 @@ NUM_HYPOTHESES = 3
 NUM_NEIGHBOURS = 12
 """Templates around the best hypothesis whose answers are averaged."""
 
-STEPS = (5, 4)
-"""Of the alignment: of every hypothesis, then of the best one with its neighbours."""
+NUM_CLOSER = 2
+"""Hypotheses of the first look around which crops are cut again, at their own distance."""
+
+STEPS = (3, 5, 4)
+"""Of the alignment: of every hypothesis of the first look and of the second, then of the best with its neighbours."""
 
 LAMP = (0.0, -0.7, -0.7)
 """The light that templates are drawn under and that is answered: it is not read from images."""
@@ -44,8 +48,8 @@ class Places(NamedTuple):
 class CalibrationFeatures(NamedTuple):
     """Calibration features: the inputs of the two logits whose probabilities make up the confidence."""
 
-    right: Float[Tensor, "batch objects 2"]
-    """Ten times the final score, and how well the neighbours agree about the distance."""
+    right: Float[Tensor, "batch objects 3"]
+    """Ten times the final score, and how well the neighbours, and descriptors and outline, agree about the distance."""
     there: Float[Tensor, "batch objects 2"]
     """Ten times the final score, and the score of the place that it was found at."""
 
@@ -53,6 +57,8 @@ class CalibrationFeatures(NamedTuple):
 class _Crops(NamedTuple):
     """Crops of cameras that look at places: image after image, object after object, place after place."""
 
+    pictures: Float[Tensor, "crops 3 side side"]
+    """SRGB in [0, 1]."""
     fine: FeatureMaps
     """Descriptors of the object that is looked for, at stride 4."""
     coarse: Float[Tensor, "batch objects num channels rows columns"]
@@ -75,6 +81,10 @@ class _Hypotheses(NamedTuple):
     place_score: Float[Tensor, " rows"]
     """Of the place that the crop looks at."""
 
+    def in_frame(self, crops: _Crops) -> Float[Tensor, "rows 3"]:
+        """Positions in the camera frame of the image, diameters."""
+        return (crops.cam_from_crop[self.crop] @ self.pose.position[..., None])[..., 0]
+
 
 class PoseReader(nn.Module):
     """Matches and aligns the templates of several objects in frames of one camera."""
@@ -82,15 +92,15 @@ class PoseReader(nn.Module):
     banks: Banks
     """All templates."""
     pose_correct: Tensor
-    """Weights [objects, 2] and offset of the pose-correct logit, [objects, 3]; calibrated on renderings."""
+    """Weights of the pose-correct logit's features and its offset, [objects, 4]; calibrated on renderings."""
     presence: Tensor
-    """Likewise of the presence logit."""
+    """Those of the presence logit, [objects, 3]."""
     _matrix: Tensor
     _diameter_m: Tensor
     _nearest_m: Tensor
     _lamp: Tensor
 
-    def __init__(self, geometries: Sequence[Geometry], steps: tuple[int, int] = STEPS) -> None:
+    def __init__(self, geometries: Sequence[Geometry], steps: tuple[int, int, int] = STEPS) -> None:
         """Build for objects in frames of one camera; all templates are still empty.
 
         Args:
@@ -100,7 +110,7 @@ class PoseReader(nn.Module):
         super().__init__()
         num = len(geometries)
         self.banks, self._steps = Banks(num), steps
-        self.register_buffer("pose_correct", torch.tensor([1.0, 0.0, 0.0]).repeat(num, 1))
+        self.register_buffer("pose_correct", torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]).repeat(num, 1))
         for name, values in {
             "_matrix": torch.from_numpy(geometries[0].matrix).float(),
@@ -120,21 +130,47 @@ class PoseReader(nn.Module):
         self, trunk: Trunk, images: Float[Tensor, "batch 3 height width"], places: Places
     ) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code without its confidence, and what that is made of."""
+        places = self._closer(trunk, images, places)
         crops = self._crops(trunk, images, places)
-        best = _best(self._aligned(crops, self._hypotheses(crops, places)))
+        best = _best(self._aligned(crops, self._hypotheses(crops, places), self._steps[1]))
         pose, spread = self._averaged(crops, best)
+        pose, gap = self._between(crops, best.crop, pose)
 
         def by_object(values: Tensor) -> Tensor:
             return values.unflatten(0, (-1, self.banks.num_objects))
 
-        turn = crops.cam_from_crop[best.crop]
-        position_m = by_object((turn @ pose.position[..., None])[..., 0]) * self._diameter_m[:, None]
-        score, spread, place = by_object(10 * pose.score), by_object(-100 * spread), by_object(best.place_score)
+        found = best._replace(pose=pose)
+        position_m = by_object(found.in_frame(crops)) * self._diameter_m[:, None]
+        score, place = by_object(10 * pose.score), by_object(best.place_score)
         return {
             TRANSLATION: position_m,
-            ROTATION_6D: by_object(rotation_6d_from_matrix(turn @ pose.rotation)),
+            ROTATION_6D: by_object(rotation_6d_from_matrix(crops.cam_from_crop[best.crop] @ pose.rotation)),
             LIGHT: self._lamp.expand(images.shape[0], 3),
-        }, CalibrationFeatures(torch.stack([score, spread], dim=2), torch.stack([score, place], dim=2))
+        }, CalibrationFeatures(
+            torch.stack([score, by_object(-100 * spread), by_object(-100 * gap.abs())], dim=2),
+            torch.stack([score, place], dim=2),
+        )
+
+    def _closer(self, trunk: Trunk, images: Tensor, places: Places) -> Places:
+        """Where the likeliest hypotheses put each object.
+
+        Places are some per cent too near or too far. Templates match better in crops at the distance that alignment
+        finds.
+        """
+        crops = self._crops(trunk, images, places)
+        found = self._aligned(crops, self._hypotheses(crops, places), self._steps[0])
+        score, position, place_score = (
+            values.unflatten(0, (-1, NUM_HYPOTHESES))
+            for values in (found.pose.score, found.in_frame(crops), found.place_score)
+        )
+        best = score.topk(NUM_CLOSER, dim=1).indices
+        chosen = position.gather(1, best[..., None].expand(-1, -1, 3)).unflatten(0, (-1, self.banks.num_objects))
+        chosen = chosen * self._diameter_m[:, None, None]
+        in_front = torch.maximum(chosen[..., 2:], self._nearest_m[:, None, None])
+        return Places(
+            torch.cat([chosen[..., :2], in_front], dim=3),
+            place_score.gather(1, best).unflatten(0, (-1, self.banks.num_objects)),
+        )
 
     def _crops(self, trunk: Trunk, images: Tensor, places: Places) -> _Crops:
         """Crops in which templates can be shifted."""
@@ -148,7 +184,7 @@ class PoseReader(nn.Module):
         fine, coarse = trunk(pictures)
         by_object = coarse.unflatten(0, (-1, self.banks.num_objects, num))
         maps = FeatureMaps.of(self.banks.fine(fine, num))
-        return _Crops(maps, by_object, crop_from_cam.transpose(1, 2), distance_m, focal_px)
+        return _Crops(pictures, maps, by_object, crop_from_cam.transpose(1, 2), distance_m, focal_px)
 
     def _hypotheses(self, crops: _Crops, places: Places) -> _Hypotheses:
         """The best match, the best of those that differ from it, and so on, of each object in each image."""
@@ -189,11 +225,11 @@ class PoseReader(nn.Module):
             scores = torch.where(beside[:, :, None] & alike[:, None], _SUPPRESSED, scores)
         return picked
 
-    def _aligned(self, crops: _Crops, found: _Hypotheses) -> _Hypotheses:
+    def _aligned(self, crops: _Crops, found: _Hypotheses, num_steps: int) -> _Hypotheses:
         """Each hypothesis moved to where the template nearest to it fits best."""
         templates = self._nearest(found.pose, 1).unflatten(0, (-1, NUM_HYPOTHESES))[..., 0]
         surface = self.banks.surface(templates)
-        pose = align(crops.fine, found.crop, *surface, found.pose, crops.focal_px[found.crop], self._steps[0])
+        pose = align(crops.fine, found.crop, *surface, found.pose, crops.focal_px[found.crop], num_steps)
         return found._replace(pose=pose)
 
     def _averaged(self, crops: _Crops, best: _Hypotheses) -> tuple[Aligned, Float[Tensor, " rows"]]:
@@ -201,7 +237,7 @@ class PoseReader(nn.Module):
         surface = self.banks.surface(self._nearest(best.pose, NUM_NEIGHBOURS))
         start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in best.pose))
         crop = best.crop.repeat_interleave(NUM_NEIGHBOURS)
-        found = align(crops.fine, crop, *surface, start, crops.focal_px[crop], self._steps[1])
+        found = align(crops.fine, crop, *surface, start, crops.focal_px[crop], self._steps[2])
         rotation, position, score = (of_all.unflatten(0, (-1, NUM_NEIGHBOURS)) for of_all in found)
         weight = (_SHARPNESS * score).softmax(dim=1)
         log_depth = position[..., 2].clamp(min=1e-3).log()
@@ -212,6 +248,12 @@ class PoseReader(nn.Module):
         placed = torch.cat([slope * mean.exp(), mean.exp()], dim=1)
         spread = (weight * (log_depth - mean).square()).sum(dim=1).clamp(min=1e-12).sqrt()
         return Aligned(turn, placed, (weight * score).sum(dim=1)), spread
+
+    def _between(self, crops: _Crops, crop: Tensor, pose: Aligned) -> tuple[Aligned, Float[Tensor, " rows"]]:
+        """The pose at the mean of the distances that descriptors and outline tell, and the logarithm of their ratio."""
+        outline = self.banks.outlines(self._nearest(pose, 1)[:, 0])
+        gap = outline_log_factor(crops.pictures[crop], *outline, pose, crops.focal_px[crop])
+        return pose._replace(position=pose.position * (gap / 2).exp()[:, None]), gap
 
     def _nearest(self, pose: Aligned, num: int) -> Int[Tensor, "rows num"]:
         """Templates whose rotations are nearest to what poses show."""
@@ -243,7 +285,7 @@ def _shifts() -> Float[Tensor, "shifts 2"]:
 
 
 def _probability(
-    features: Float[Tensor, "batch objects 2"], weights: Float[Tensor, "objects 3"]
+    features: Float[Tensor, "batch objects size"], weights: Float[Tensor, "objects size+1"]
 ) -> Float[Tensor, "batch objects"]:
     """Sigmoid of the weighted sum of calibration features; the last weight is the offset."""
     return torch.sigmoid((features * weights[:, :-1]).sum(dim=2) + weights[:, -1])
