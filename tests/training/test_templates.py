@@ -10,7 +10,7 @@ import torch
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.export.onnx import to_onnx
 from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
-from curio_train.networks.templates.bank import COARSE_SIZE, NUM_POINTS, Bank
+from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, Bank
 from curio_train.networks.templates.bank import RANK as BANK_RANK
 from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, NUM_VIEWS, Geometry, viewpoints
@@ -109,7 +109,7 @@ def test_the_localiser_finds_the_template_it_holds() -> None:
     assert float(found.score[0, 0]) > 0.9
 
 
-def _random_network(steps: tuple[int, int] = STEPS) -> TemplateNetwork:
+def _random_network(steps: tuple[int, int, int] = STEPS) -> TemplateNetwork:
     network, random = TemplateNetwork(GEOMETRY, steps), torch.Generator().manual_seed(0)
     network.trunk.load_state_dict(Trunk.pretrained().state_dict())
     for name, buffer in (*network.localiser.named_buffers(), *network.reader.banks.named_buffers()):
@@ -128,6 +128,8 @@ def _random_bank(random: torch.Generator) -> Bank:
         torch.randn(num, BANK_RANK, generator=random) * 0.05,
         torch.randn(num, NUM_POINTS, 3, generator=random) * 0.2,
         torch.randn(num, NUM_POINTS, FINE_WIDTH, generator=random) * 0.2,
+        torch.randn(NUM_VIEWS, NUM_OUTLINE_POINTS, 3, generator=random) * 0.3,
+        torch.nn.functional.normalize(torch.randn(NUM_VIEWS, NUM_OUTLINE_POINTS, 3, generator=random), dim=2),
     )
 
 
@@ -153,7 +155,7 @@ class _Graph(torch.nn.Module):
 
 
 def test_the_exported_graph_equals_torch_for_any_batch() -> None:
-    graph, random = _Graph(_random_network((1, 1))).eval(), np.random.default_rng(0)
+    graph, random = _Graph(_random_network((1, 1, 1))).eval(), np.random.default_rng(0)
     names = ["translation_m", "rotation_6d", "light", "confidence"]
     session = onnxruntime.InferenceSession(to_onnx(graph, 640, 480, names).SerializeToString())
     coarse = torch.from_numpy(random.integers(0, 255, (3, 3, 60, 80))).float()

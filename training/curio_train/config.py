@@ -217,8 +217,9 @@ class RunConfig:
     method: MethodName = "our"
     """our: image loss and critic. noncur: image loss alone. super: true scene codes. Beyond the paper, sleep: regress
     the scene codes of renderings, drawn from the world's known range. wake_sleep: image loss, and sleep with half of
-    the codes around own predictions. wake_sleep_critic: that and the critic. hypotheses: image
-    loss minimised over many rendered hypotheses instead of by its gradient. templates: no training; renderings of the object are compared with frames by pretrained features."""
+    the codes around own predictions. wake_sleep_critic: that and the critic. hypotheses: image loss minimised over many
+    rendered hypotheses of each image before training. templates: no training; renderings of the object are compared
+    with frames by pretrained features."""
     labels: float = 1.0
     """Fraction of the training images that --method super sees, with their true codes (paper: 0.05, 0.1, 1)."""
     preset: Preset = "laptop"

@@ -58,8 +58,8 @@ def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> 
     of_surface.mean.copy_((fine_background.mean(dim=(0, 2, 3)) + of_object) / 2)
     described = torch.cat([F.normalize(_sum(of_surface(seen) for seen in some), dim=1) for some in fine])
     points = _surface_points(mesh, views, depth, focal_px)
-    on_surface = _chosen(inside, points / geometry.diameter_m, described)
-    return Bank(of_crop, of_surface, filters, weights, *on_surface, *outlines(mesh, geometry))
+    on_points, of_points = _chosen(inside, points / geometry.diameter_m, described)
+    return Bank(of_crop, of_surface, filters, weights, on_points, of_points, *outlines(mesh, geometry))
 
 
 def _sum(of_appearances: Iterable[Tensor]) -> Tensor:
