@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from curio_train.errors import UsageError
@@ -92,7 +91,7 @@ class GeneratedWorld(MeshWorld):
         """
         if self.setup.ground_srgb is None or YAW not in self.layout or LIGHT in self.layout:
             raise UsageError(
-                f"--method hypotheses: finds objects that stand under a sun that does not move, as in chairs and multi, "
+                f"--method hypotheses: finds objects that stand under a fixed sun, as in chairs and multi, "
                 f"and {self.name} is another world; use --method our or sleep"
             )
         assert isinstance(source, StoredImages)  # all generated worlds have those
