@@ -201,9 +201,26 @@ def test_images_on_which_rounding_decides_can_tell_nothing() -> None:
     graph = Graph(_Brighter(), Circles())
     images = torch.zeros(8, 128, 128, 3, dtype=torch.uint8)
     images[:5, :, 64:] = 100
-    assert numerically_stable(graph, images).tolist() == [True] * 5 + [False] * 3
+    assert numerically_stable(graph, images).tolist() == [[True]] * 5 + [[False]] * 3
     with pytest.raises(ExportError, match=r"answers to 7 of 8 check images"):
         numerically_stable(graph, images[[0, 5, 6, 7, 5, 6, 7, 5]])
+
+
+class _BrighterAndFixed(_Brighter):
+    """Of two objects one is where it always is."""
+
+    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        moved = super().forward(images)[TRANSLATION]
+        return {TRANSLATION: torch.cat([moved, torch.ones_like(moved)], dim=1)}
+
+
+def test_each_object_of_an_image_is_judged_by_itself() -> None:
+    graph = Graph(_BrighterAndFixed(), Circles())
+    images = torch.zeros(8, 128, 128, 3, dtype=torch.uint8)
+    images[:1, :, 64:] = 100
+    assert numerically_stable(graph, images).tolist() == [[True, True]] + [[False, True]] * 7
+    with pytest.raises(ExportError, match=r"answers to 7 of 7 check images"):
+        numerically_stable(graph, images[1:])
 
 
 class _Surer(torch.nn.Module):

@@ -47,7 +47,7 @@ _NUM_CHECK_IMAGES = 4  # of either kind
 _CHECK_SEED = (20_210,)
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
-_LEAST_STABLE = 0.25  # of the check images
+_LEAST_STABLE = 0.25  # of the answers to check images
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def export(
     shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
     config = triton_config(target.path.name, tuple(images.shape[1:]), shapes)
     target.refuse_other_tensors(config)
-    known = numerically_stable(deployed if half else trained, images)
+    stable = numerically_stable(deployed if half else trained, images)
 
     model = traced(deployed, deployed.network, world.camera, list(expected))
     if half:
@@ -156,16 +156,15 @@ def export(
     )
     put_spec(model, spec)
 
-    images = images[known]
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
     weights = _weights(half, rounding_error)
-    parity_error = refuse_disparity({name: v[known] for name, v in (expected if half else learned).items()}, found)
+    parity_error = refuse_disparity(_where(stable, expected if half else learned), _where(stable, found))
     if reduce is not None:
         exact, reduced = found, reduce(world, model)
         model, weights = reduced.model, reduced.weights
         put_spec(model, spec)
         found = ExportedModel(model.SerializeToString(), "the reduced graph")(images)
-        rounding_error = largest_difference(exact, found)
+        rounding_error = largest_difference(_where(stable, exact), _where(stable, found))
     spec.parity_max_abs_error = parity_error if reduce is None else rounding_error
     put_spec(model, spec)
     version = target.next_version()
@@ -174,19 +173,25 @@ def export(
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),
-        GOLDEN_FILE: _golden(images, found),
+        GOLDEN_FILE: _golden(images, found, int(stable.all(dim=1).int().argmax())),
         WEIGHTS_FILE: weights_file(state, folder.config, half=half),
     }
     path = target.add(version, files, config, text)
     return Exported(path, parity_error, rounding_error, model.ByteSize(), weights)
 
 
-def _golden(images: Tensor, outputs: Mapping[str, Tensor]) -> bytes:
-    """The first of the images and what onnxruntime made of it, by name, without a batch."""
+def _golden(images: Tensor, outputs: Mapping[str, Tensor], number: int) -> bytes:
+    """One of the images and what onnxruntime made of it, by name, without a batch."""
     file = io.BytesIO()
-    answers = {name: values[0].numpy() for name, values in outputs.items()}
-    np.savez_compressed(file, allow_pickle=False, image=images[0].numpy(), **answers)
+    answers = {name: values[number].numpy() for name, values in outputs.items()}
+    np.savez_compressed(file, allow_pickle=False, image=images[number].numpy(), **answers)
     return file.getvalue()
+
+
+def _where(stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The stable answers: rows of slots, or of images where an output is the whole scene's."""
+    whole = stable.all(dim=1)
+    return {name: values[stable if values.dim() > 2 else whole] for name, values in outputs.items()}
 
 
 def _weights(half: bool, rounding_error: float) -> str:
@@ -233,34 +238,37 @@ def check_images(world: World) -> Tensor:
 
 
 @torch.no_grad()
-def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, " batch"]:
-    """Which images can tell whether a runtime computes the same: their last digits do not move the answer.
+def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slots"]:
+    """Which answers can tell whether a runtime computes the same: the last digits of an image do not move them.
 
-    Where the answer is a choice among equals (the likeliest cell, say, of a network that has learned next to nothing),
-    rounding decides, and torch differs from itself on another machine. It rounds in every layer, and cells that read
-    the same pixels almost alike are moved together by these: so layers are jittered, too.
+    Where the answer is a choice among equals (the likeliest cell, say, of a network that has learned next to nothing,
+    or the place of an object that is not there), rounding decides, and torch differs from itself on another machine. It
+    rounds in every layer, and cells that read the same pixels almost alike are moved together by these: so layers are
+    jittered, too.
 
     Args:
         graph: The network that is exported.
         images: uint8 [batch, height, width, 3].
 
     Raises:
-        ExportError: Too few can.
+        ExportError: Too few can, or to no image all of them.
     """
     answers, generator = graph.outputs(images), torch.Generator().manual_seed(*_CHECK_SEED)
     pixels = images.permute(0, 3, 1, 2).float() / 255
-    known = torch.ones(len(images), dtype=torch.bool)
+    num_slots = max(values.shape[1] for values in answers.values() if values.dim() > 2)
+    stable = torch.ones(len(images), num_slots, dtype=torch.bool)
     with _jittered_layers(graph.network, generator):
         for _ in range(NUM_JITTERED):
             jittered = graph.read(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
             for name, values in answers.items():
-                known &= (values - jittered[name]).abs().flatten(1).amax(dim=1) <= LARGEST_PARITY_ERROR
-    if known.float().mean() < _LEAST_STABLE:
+                moved = (values - jittered[name]).abs().amax(dim=-1)
+                stable &= (moved if values.dim() > 2 else moved[:, None]) <= LARGEST_PARITY_ERROR
+    if stable.float().mean() < _LEAST_STABLE or not stable.all(dim=1).any():
         raise ExportError(
-            f"the network's answers to {int((~known).sum())} of {len(images)} check images change with their last "
-            "digits or are not finite; nothing was written. Has the training diverged, or hardly begun?"
+            f"the network's answers to {int((~stable.all(dim=1)).sum())} of {len(images)} check images change with "
+            "their last digits or are not finite; nothing was written. Has the training diverged, or hardly begun?"
         )
-    return known
+    return stable
 
 
 @contextmanager

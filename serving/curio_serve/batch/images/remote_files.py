@@ -247,8 +247,8 @@ def _is_final(exc: Exception) -> bool:
 
 def _reason(exc: Exception) -> str:
     if isinstance(exc, FileNotFoundError):
-        # Stores say in words that a bucket is missing, and name an object that is missing without a word.
-        return str(exc) if "does not exist" in str(exc) else os.strerror(errno.ENOENT)
+        # Stores say in words that a bucket is missing; an object that is missing is told like a file.
+        return str(exc) if "bucket" in str(exc) else os.strerror(errno.ENOENT)
     if isinstance(exc, TimeoutError):
         return "it did not answer in time"
     return (exc.strerror if isinstance(exc, OSError) and exc.strerror else str(exc)) or type(exc).__name__

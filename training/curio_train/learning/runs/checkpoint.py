@@ -10,7 +10,6 @@
         history.jsonl  samples.png  tensorboard/     written by ``progress``
 """
 
-import fcntl
 import hashlib
 import json
 import os
@@ -22,6 +21,7 @@ from pathlib import Path
 
 import torch
 from curio_serve.files import read_file
+from curio_serve.systems import lock
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
@@ -93,15 +93,11 @@ class RunFolder:
         except OSError as exc:
             raise self._not_writable(exc) from exc
         with sessions:
-            try:
-                fcntl.flock(sessions, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as exc:
+            if not lock(sessions.fileno()):
                 raise CheckpointError(
                     f"another process trains {self.path}: {last_session(self.path)}; end it first, or name another "
                     "folder: --out"
-                ) from exc
-            except OSError:
-                pass  # a file system without locks
+                )
             yield
 
     def checkpoints(self) -> list[Path]:
