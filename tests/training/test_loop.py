@@ -26,7 +26,7 @@ THIN = NetworkConfig(
 )
 FAST = Recipe(batch_size=8, micro_batch_size=8, learning_rate=3e-3, critic_learning_rate=1e-4, critic_weight=0.1)
 ALONE = Ranks(0, 1, torch.device("cpu"))
-TRAINED = [name for name, terms in METHODS.items() if not terms.templates]
+TRAINED = [name for name, terms in METHODS.items() if not (terms.templates or terms.hypotheses)]
 
 
 class SameBatch(ImageSource):

@@ -35,7 +35,7 @@ FAST = Recipe(
     sleep_weight=0.1,
     sleep_drawn=1.0,
 )
-TRAINED = [name for name, terms in METHODS.items() if not terms.templates]
+TRAINED = [name for name, terms in METHODS.items() if not (terms.templates or terms.hypotheses)]
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ from curio_train.learning.runs.initial import weights_file
 from curio_train.learning.runs.provenance import run_sessions
 from curio_train.networks.templates.trunk import Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
-from curio_train.scene_code import Field
+from curio_train.scene_code import TRANSLATION, Field
 from curio_train.worlds import build
 from curio_train.worlds.base import ObjectKind, World
 
@@ -83,9 +83,13 @@ class Exported:
 class Graph(nn.Module):
     """The module that is traced: it takes a camera's pixels and returns physical quantities."""
 
+    of_scene: frozenset[str]
+    """Names of outputs that a scene has once, not each object."""
+
     def __init__(self, network: nn.Module, world: World) -> None:
         super().__init__()
         self.network = network
+        self.of_scene = frozenset(field.name for field in world.outputs.fields if not field.per_object)
         self._world = world
         self.eval()
 
@@ -103,6 +107,11 @@ class Graph(nn.Module):
     def read(self, pixels: Tensor) -> dict[str, Tensor]:
         """Outputs by name, for pixels [batch, 3, height, width] in [0, 1]."""
         return self._world.outputs.from_code(self.network(pixels))
+
+    def where(self, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The stable answers, one a row: of objects, or of whole scenes where an output is these'."""
+        whole = stable.all(dim=1)
+        return {name: values[whole if name in self.of_scene else stable] for name, values in outputs.items()}
 
 
 def _pixels(image: Tensor) -> Tensor:
@@ -158,13 +167,14 @@ def export(
 
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
     weights = _weights(half, rounding_error)
-    parity_error = refuse_disparity(_where(stable, expected if half else learned), _where(stable, found))
+    known = deployed.where(stable, expected if half else learned)
+    parity_error = refuse_disparity(known, deployed.where(stable, found))
     if reduce is not None:
         exact, reduced = found, reduce(world, model)
         model, weights = reduced.model, reduced.weights
         put_spec(model, spec)
         found = ExportedModel(model.SerializeToString(), "the reduced graph")(images)
-        rounding_error = largest_difference(_where(stable, exact), _where(stable, found))
+        rounding_error = largest_difference(deployed.where(stable, exact), deployed.where(stable, found))
     spec.parity_max_abs_error = parity_error if reduce is None else rounding_error
     put_spec(model, spec)
     version = target.next_version()
@@ -186,12 +196,6 @@ def _golden(images: Tensor, outputs: Mapping[str, Tensor], number: int) -> bytes
     answers = {name: values[number].numpy() for name, values in outputs.items()}
     np.savez_compressed(file, allow_pickle=False, image=images[number].numpy(), **answers)
     return file.getvalue()
-
-
-def _where(stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The stable answers: rows of slots, or of images where an output is the whole scene's."""
-    whole = stable.all(dim=1)
-    return {name: values[stable if values.dim() > 2 else whole] for name, values in outputs.items()}
 
 
 def _weights(half: bool, rounding_error: float) -> str:
@@ -255,14 +259,14 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slot
     """
     answers, generator = graph.outputs(images), torch.Generator().manual_seed(*_CHECK_SEED)
     pixels = images.permute(0, 3, 1, 2).float() / 255
-    num_slots = max(values.shape[1] for values in answers.values() if values.dim() > 2)
-    stable = torch.ones(len(images), num_slots, dtype=torch.bool)
+    stable = torch.ones(answers[TRANSLATION].shape[:2], dtype=torch.bool)
     with _jittered_layers(graph.network, generator):
         for _ in range(NUM_JITTERED):
             jittered = graph.read(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
             for name, values in answers.items():
-                moved = (values - jittered[name]).abs().amax(dim=-1)
-                stable &= (moved if values.dim() > 2 else moved[:, None]) <= LARGEST_PARITY_ERROR
+                kept = 1 if name in graph.of_scene else 2
+                moved = (values - jittered[name]).abs().reshape(*values.shape[:kept], -1).amax(dim=-1)
+                stable &= moved.reshape(len(images), -1) <= LARGEST_PARITY_ERROR
     if stable.float().mean() < _LEAST_STABLE or not stable.all(dim=1).any():
         raise ExportError(
             f"the network's answers to {int((~stable.all(dim=1)).sum())} of {len(images)} check images change with "
