@@ -12,7 +12,7 @@ from curio_train.commands.linemod_data import with_linemod
 from curio_train.config import NetworkConfig, RunConfig
 from curio_train.errors import DataError, UsageError
 from curio_train.learning.runs.configuration import CONFIG_FILE
-from curio_train.worlds.options import CaptureOptions, LinemodOptions
+from curio_train.worlds.options import CaptureOptions, LinemodOptions, names_several
 
 
 def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report: Callable[[str], None]) -> RunConfig:
@@ -36,6 +36,11 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
             "which linemod and capture have"
         )
     if isinstance(options, LinemodOptions):
+        if config.recipe.self_training and names_several(options.class_name):
+            raise UsageError(
+                f"--self-training {config.recipe.self_training}: only detectors for one object learn from photographs; "
+                f"leave it out, and --class {options.class_name} corrects its distances by them"
+            )
         options = with_linemod(options, cache, report)
         config = replace(config, world=options)
         _refuse_unreadable(options)

@@ -64,6 +64,11 @@ ALL_CLASSES = "all"
 """Names every object of a data set."""
 
 
+def names_several(class_name: str) -> bool:
+    """Whether ``--class`` asks for a detector for several objects."""
+    return class_name == ALL_CLASSES or "," in class_name
+
+
 @dataclass(frozen=True)
 class LinemodOptions(WorldOptions):
     """One object of the LineMOD data set in six degrees of freedom, over cluttered backgrounds."""
@@ -82,7 +87,8 @@ class LinemodOptions(WorldOptions):
     photos: Path | None = None
     """Folder of unlabelled frames of the data set's camera. Towards the end of training the two-stage detector learns
     from them, with the poses that it estimates there itself (--self-training, which is 0 without them). Frames of one
-    scene from several viewpoints, in the order of their names, correct each other."""
+    scene from several viewpoints, in the order of their names, correct each other. A detector for several objects
+    corrects its distances by them."""
     views: Path | None = None
     """File with the camera poses of --photos, in metres, as capture --calibrate --views-out writes it. Without it they
     are recovered from the photographs, and their scale from the estimated object poses."""

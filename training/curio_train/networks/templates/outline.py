@@ -15,6 +15,8 @@ from curio_train.networks.templates.alignment import Aligned
 _REACH_PX = 4  # crop pixels across the outline in which edges are looked for
 _WIDTH_PX = 3  # of the strips inside and outside whose mean colours are compared
 _CLEAR = 0.02  # squared difference of colours at which an edge counts a half
+_GOLDEN = 0.618034  # multiples of it are spread evenly, whatever their number
+_PREFERENCE = 1e-3  # for the distance as it is: decides where no edge is seen
 _FARTHEST, _NUM_SCALES = 0.06, 25  # of the logarithm of the distance
 
 
@@ -41,12 +43,23 @@ def outline_log_factor(
     centre = pose.position[:, None, :2] / pose.position[:, None, 2:].clamp(min=1e-3)
     lever_px = focal_px[:, None] * ((slope - centre) * across).sum(dim=-1)
     middle = (pictures.shape[-1] - 1) / 2
-    edges = _edges(pictures, focal_px[:, None, None] * slope + middle, across)
+    shift_px = _shifts_px(slope)
+    edges = _edges(pictures, focal_px[:, None, None] * slope + middle + shift_px * across, across)
     factors = torch.linspace(-_FARTHEST, _FARTHEST, _NUM_SCALES, device=pictures.device)
-    column = (_REACH_PX - lever_px[..., None] * factors).clamp(0, 2 * _REACH_PX)
+    column = (_REACH_PX - lever_px[..., None] * factors - shift_px).clamp(0, 2 * _REACH_PX)
     left = column.floor().clamp(max=2 * _REACH_PX - 1)
     near, far = edges.gather(2, left.long()), edges.gather(2, left.long() + 1)
-    return _peak(torch.lerp(near, far, column - left).mean(dim=1), factors)
+    scores = torch.lerp(near, far, column - left).mean(dim=1)
+    return _peak(scores - _PREFERENCE * factors.abs(), factors)
+
+
+def _shifts_px(points: Float[Tensor, "rows points 2"]) -> Float[Tensor, "points 1"]:
+    """By less than half a pixel for each point: what lies between whole pixels is interpolated, and has no peaks there.
+
+    Shifted differently, points of one distance from the centre still show together where between pixels an edge lies.
+    """
+    number = torch.arange(points.shape[1], device=points.device, dtype=points.dtype)
+    return (_GOLDEN * number % 1 - 0.5)[:, None]
 
 
 def _edges(

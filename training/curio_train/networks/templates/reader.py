@@ -95,6 +95,8 @@ class PoseReader(nn.Module):
     """Weights of the pose-correct logit's features and its offset, [objects, 4]; calibrated on renderings."""
     presence: Tensor
     """Those of the presence logit, [objects, 3]."""
+    distance_factor: Tensor
+    """What each object's distances are multiplied by, [objects]; 1 unless measured on photographs."""
     _matrix: Tensor
     _diameter_m: Tensor
     _nearest_m: Tensor
@@ -112,6 +114,7 @@ class PoseReader(nn.Module):
         self.banks, self._steps = Banks(num), steps
         self.register_buffer("pose_correct", torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]).repeat(num, 1))
+        self.register_buffer("distance_factor", torch.ones(num))
         for name, values in {
             "_matrix": torch.from_numpy(geometries[0].matrix).float(),
             "_diameter_m": torch.tensor([geometry.diameter_m for geometry in geometries]),
@@ -140,7 +143,7 @@ class PoseReader(nn.Module):
             return values.unflatten(0, (-1, self.banks.num_objects))
 
         found = best._replace(pose=pose)
-        position_m = by_object(found.in_frame(crops)) * self._diameter_m[:, None]
+        position_m = by_object(found.in_frame(crops)) * (self.distance_factor * self._diameter_m)[:, None]
         score, place = by_object(10 * pose.score), by_object(best.place_score)
         return {
             TRANSLATION: position_m,
