@@ -38,8 +38,8 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
     if isinstance(options, LinemodOptions):
         if config.recipe.self_training and names_several(options.class_name):
             raise UsageError(
-                f"--self-training {config.recipe.self_training}: only detectors for one object learn from photographs; "
-                f"leave it out, and --class {options.class_name} corrects its distances by them"
+                f"--self-training {config.recipe.self_training}: only detectors for one object learn from photographs, "
+                f"and --class {options.class_name} names several; leave out --self-training and --photos"
             )
         options = with_linemod(options, cache, report)
         config = replace(config, world=options)

@@ -99,7 +99,7 @@ def learn(
 
         def finish() -> None:
             if isinstance(world, StagedWorld):
-                world.calibrate(trainer.state.pose.network, cache)
+                world.calibrate_confidence(trainer.state.pose.network, cache)
 
         with reporting(path, trainer.state.progress) if here.leads else nullcontext() as reporter:
             outcome = train(

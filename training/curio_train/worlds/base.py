@@ -227,8 +227,8 @@ class StagedWorld(Protocol):
     def assemble(self, networks: Sequence[StageNetwork]) -> nn.Module:
         """The networks of all stages as one, from image to scene code; this is what is exported."""
 
-    def calibrate(self, network: nn.Module, cache: Path) -> None:
-        """Calibrate the assembled network's confidence, and its distances where that can be done, in place."""
+    def calibrate_confidence(self, network: nn.Module, cache: Path) -> None:
+        """Calibrate the assembled network's confidence in place, after training."""
 
 
 def stages_of(world: World) -> tuple[World, ...]:

@@ -126,16 +126,16 @@ def build(options: LinemodOptions) -> World:
         others = [dataset.mesh(other) for other in dataset.classes if other not in names]
         return ClutterBackgrounds.cached(cache, others)
 
-    photographs = None
-    if options.photos is not None:
-        photographs = LinemodPhotographs(options.photos, dataset.camera, options.views)
     members = [_object(dataset, name, slot, backgrounds) for slot, name in enumerate(names)]
     if len(members) > 1:
-        return SeveralObjectsWorld("linemod", [member.without_scan_excess() for member in members], photographs)
+        return SeveralObjectsWorld("linemod", [member.without_scan_excess() for member in members])
     (object_,) = members
     if not options.gaze:
         layout = pose_layout(position_field(object_), confidence=False)
         return SingleObjectWorld("linemod", object_, squeezed(dataset.camera, SIDE_PX), layout)
+    photographs = None
+    if options.photos is not None:
+        photographs = LinemodPhotographs(options.photos, dataset.camera, options.views)
     return TwoStageWorld("linemod", object_, photographs)
 
 

@@ -87,8 +87,7 @@ class LinemodOptions(WorldOptions):
     photos: Path | None = None
     """Folder of unlabelled frames of the data set's camera. Towards the end of training the two-stage detector learns
     from them, with the poses that it estimates there itself (--self-training, which is 0 without them). Frames of one
-    scene from several viewpoints, in the order of their names, correct each other. A detector for several objects
-    corrects its distances by them."""
+    scene from several viewpoints, in the order of their names, correct each other."""
     views: Path | None = None
     """File with the camera poses of --photos, in metres, as capture --calibrate --views-out writes it. Without it they
     are recovered from the photographs, and their scale from the estimated object poses."""

@@ -11,17 +11,20 @@ from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matri
 from curio_train.networks.crop_camera import cut_crops
 from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.banks import Banks
-from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
+from curio_train.networks.templates.geometry import CROP_PX, FILL, MAX_ROLL_DEG, NUM_ROLLS, Geometry
 from curio_train.networks.templates.outline import outline_log_factor
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
 NUM_HYPOTHESES = 3
-NUM_NEIGHBOURS = 12
-"""Templates around the best hypothesis whose answers are averaged."""
+NUM_NEIGHBOURS = 4
+"""Templates around the best hypothesis whose answers are averaged, in each crop of its place."""
 
 NUM_CLOSER = 2
 """Hypotheses of the first look around which crops are cut again, at their own distance."""
+
+ROLLS_DEG = (-2 * MAX_ROLL_DEG / NUM_ROLLS, 0.0, 2 * MAX_ROLL_DEG / NUM_ROLLS)
+"""By which these crops are rolled, from where the object stands upright: there are templates of just these rolls."""
 
 STEPS = (3, 5, 4)
 """Of the alignment: of every hypothesis of the first look and of the second, then of the best with its neighbours."""
@@ -95,8 +98,6 @@ class PoseReader(nn.Module):
     """Weights of the pose-correct logit's features and its offset, [objects, 4]; calibrated on renderings."""
     presence: Tensor
     """Those of the presence logit, [objects, 3]."""
-    distance_factor: Tensor
-    """What each object's distances are multiplied by, [objects]; 1 unless measured on photographs."""
     _matrix: Tensor
     _diameter_m: Tensor
     _nearest_m: Tensor
@@ -114,7 +115,6 @@ class PoseReader(nn.Module):
         self.banks, self._steps = Banks(num), steps
         self.register_buffer("pose_correct", torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]).repeat(num, 1))
-        self.register_buffer("distance_factor", torch.ones(num))
         for name, values in {
             "_matrix": torch.from_numpy(geometries[0].matrix).float(),
             "_diameter_m": torch.tensor([geometry.diameter_m for geometry in geometries]),
@@ -133,8 +133,8 @@ class PoseReader(nn.Module):
         self, trunk: Trunk, images: Float[Tensor, "batch 3 height width"], places: Places
     ) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code without its confidence, and what that is made of."""
-        places = self._closer(trunk, images, places)
-        crops = self._crops(trunk, images, places)
+        places, roll = self._closer(trunk, images, places)
+        crops = self._crops(trunk, images, places, roll)
         best = _best(self._aligned(crops, self._hypotheses(crops, places), self._steps[1]))
         pose, spread = self._averaged(crops, best)
         pose, gap = self._between(crops, best.crop, pose)
@@ -143,7 +143,7 @@ class PoseReader(nn.Module):
             return values.unflatten(0, (-1, self.banks.num_objects))
 
         found = best._replace(pose=pose)
-        position_m = by_object(found.in_frame(crops)) * (self.distance_factor * self._diameter_m)[:, None]
+        position_m = by_object(found.in_frame(crops)) * self._diameter_m[:, None]
         score, place = by_object(10 * pose.score), by_object(best.place_score)
         return {
             TRANSLATION: position_m,
@@ -154,11 +154,11 @@ class PoseReader(nn.Module):
             torch.stack([score, place], dim=2),
         )
 
-    def _closer(self, trunk: Trunk, images: Tensor, places: Places) -> Places:
-        """Where the likeliest hypotheses put each object.
+    def _closer(self, trunk: Trunk, images: Tensor, places: Places) -> tuple[Places, Float[Tensor, "crops 2"]]:
+        """Where the likeliest hypotheses put each object, and by what angles crops there are rolled.
 
-        Places are some per cent too near or too far. Templates match better in crops at the distance that alignment
-        finds.
+        Places are some per cent too near or too far, and objects lean to one side. Templates match better in crops at
+        the distance that alignment finds, and where the object leans as it does in templates.
         """
         crops = self._crops(trunk, images, places)
         found = self._aligned(crops, self._hypotheses(crops, places), self._steps[0])
@@ -166,16 +166,18 @@ class PoseReader(nn.Module):
             values.unflatten(0, (-1, NUM_HYPOTHESES))
             for values in (found.pose.score, found.in_frame(crops), found.place_score)
         )
+        upward = (crops.cam_from_crop[found.crop] @ found.pose.rotation)[..., 2].unflatten(0, (-1, NUM_HYPOTHESES))
         best = score.topk(NUM_CLOSER, dim=1).indices
-        chosen = position.gather(1, best[..., None].expand(-1, -1, 3)).unflatten(0, (-1, self.banks.num_objects))
+        of_rows = best[..., None].expand(-1, -1, 3)
+        chosen = position.gather(1, of_rows).unflatten(0, (-1, self.banks.num_objects))
         chosen = chosen * self._diameter_m[:, None, None]
         in_front = torch.maximum(chosen[..., 2:], self._nearest_m[:, None, None])
-        return Places(
-            torch.cat([chosen[..., :2], in_front], dim=3),
-            place_score.gather(1, best).unflatten(0, (-1, self.banks.num_objects)),
-        )
+        closer = torch.cat([chosen[..., :2], in_front], dim=3)
+        of_places = place_score.gather(1, best).unflatten(0, (-1, self.banks.num_objects))
+        roll = _rolls(closer.flatten(0, 2), upward.gather(1, of_rows).flatten(0, 1))
+        return Places(*(of_all.repeat_interleave(len(ROLLS_DEG), dim=2) for of_all in (closer, of_places))), roll
 
-    def _crops(self, trunk: Trunk, images: Tensor, places: Places) -> _Crops:
+    def _crops(self, trunk: Trunk, images: Tensor, places: Places, roll: Tensor | None = None) -> _Crops:
         """Crops in which templates can be shifted."""
         num, side = places.score.shape[2], CROP_PX + 2 * _MARGIN_PX
         by_image = places.position_m.flatten(1, 2)
@@ -183,7 +185,7 @@ class PoseReader(nn.Module):
         nearest, diameter_m = (self._of_rows(one, rows, num) for one in (self._nearest_m, self._diameter_m))
         distance_m = torch.maximum(by_image.flatten(0, 1).square().sum(dim=1).sqrt(), nearest)
         focal_px = FILL * CROP_PX * distance_m / diameter_m
-        pictures, crop_from_cam = cut_crops(images, self._matrix, by_image, focal_px, side, oversampling=1)
+        pictures, crop_from_cam = cut_crops(images, self._matrix, by_image, focal_px, side, oversampling=1, roll=roll)
         fine, coarse = trunk(pictures)
         by_object = coarse.unflatten(0, (-1, self.banks.num_objects, num))
         maps = FeatureMaps.of(self.banks.fine(fine, num))
@@ -237,11 +239,16 @@ class PoseReader(nn.Module):
 
     def _averaged(self, crops: _Crops, best: _Hypotheses) -> tuple[Aligned, Float[Tensor, " rows"]]:
         """The mean of what the templates around a pose answer, and the spread of the logarithm of their distances."""
-        surface = self.banks.surface(self._nearest(best.pose, NUM_NEIGHBOURS))
-        start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in best.pose))
-        crop = best.crop.repeat_interleave(NUM_NEIGHBOURS)
+        siblings, pose = _in_siblings(crops, best.crop, best.pose)
+        templates = self._nearest(pose, NUM_NEIGHBOURS).unflatten(0, (-1, len(ROLLS_DEG))).flatten(1)
+        surface = self.banks.surface(templates)
+        start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in pose))
+        crop = siblings.repeat_interleave(NUM_NEIGHBOURS)
         found = align(crops.fine, crop, *surface, start, crops.focal_px[crop], self._steps[2])
-        rotation, position, score = (of_all.unflatten(0, (-1, NUM_NEIGHBOURS)) for of_all in found)
+        rotation, position, score = (of_all.unflatten(0, templates.shape) for of_all in found)
+        cam_from_crop = crops.cam_from_crop[crop].unflatten(0, templates.shape)
+        back = crops.cam_from_crop[best.crop].transpose(1, 2)[:, None] @ cam_from_crop
+        rotation, position = back @ rotation, (back @ position[..., None])[..., 0]
         weight = (_SHARPNESS * score).softmax(dim=1)
         log_depth = position[..., 2].clamp(min=1e-3).log()
         mean = (weight * log_depth).sum(dim=1, keepdim=True)
@@ -254,8 +261,13 @@ class PoseReader(nn.Module):
 
     def _between(self, crops: _Crops, crop: Tensor, pose: Aligned) -> tuple[Aligned, Float[Tensor, " rows"]]:
         """The pose at the mean of the distances that descriptors and outline tell, and the logarithm of their ratio."""
-        outline = self.banks.outlines(self._nearest(pose, 1)[:, 0])
-        gap = outline_log_factor(crops.pictures[crop], *outline, pose, crops.focal_px[crop])
+        points, outward = (
+            of_all.repeat_interleave(len(ROLLS_DEG), dim=0)
+            for of_all in self.banks.outlines(self._nearest(pose, 1)[:, 0])
+        )
+        siblings, seen = _in_siblings(crops, crop, pose)
+        gaps = outline_log_factor(crops.pictures[siblings], points, outward, seen, crops.focal_px[siblings])
+        gap = gaps.unflatten(0, (-1, len(ROLLS_DEG))).mean(dim=1)
         return pose._replace(position=pose.position * (gap / 2).exp()[:, None]), gap
 
     def _nearest(self, pose: Aligned, num: int) -> Int[Tensor, "rows num"]:
@@ -278,6 +290,34 @@ def _best(found: _Hypotheses) -> _Hypotheses:
     by_object = found.pose.score.unflatten(0, (-1, NUM_HYPOTHESES))
     row = torch.arange(by_object.shape[0], device=by_object.device) * NUM_HYPOTHESES + by_object.argmax(dim=1)
     return _Hypotheses(Aligned(*(of_all[row] for of_all in found.pose)), found.crop[row], found.place_score[row])
+
+
+def _rolls(position: Float[Tensor, "looks 3"], upward: Float[Tensor, "looks 3"]) -> Float[Tensor, "looks*rolls 2"]:
+    """Cosines and sines of the angles by which crops at positions are rolled.
+
+    Args:
+        position: Of objects, camera frame, any unit.
+        upward: The objects' z axes, camera frame.
+    """
+    axis = position.new_tensor([0.0, 0.0, 1.0]).expand_as(position)
+    x, y = (rotation_between(position, axis) @ upward[..., None])[:, :2, 0].unbind(1)
+    length = (x.square() + y.square()).clamp(min=1e-12).sqrt()
+    upright = torch.stack([-y / length, -x / length], dim=1)
+    angles = torch.tensor(ROLLS_DEG, device=position.device).deg2rad()
+    turn = torch.stack([angles.cos(), angles.sin()], dim=1)
+    cosine = upright[:, :1] * turn[:, 0] - upright[:, 1:] * turn[:, 1]
+    sine = upright[:, 1:] * turn[:, 0] + upright[:, :1] * turn[:, 1]
+    return torch.stack([cosine, sine], dim=2).flatten(0, 1)
+
+
+def _in_siblings(crops: _Crops, crop: Int[Tensor, " rows"], pose: Aligned) -> tuple[Int[Tensor, " looks"], Aligned]:
+    """The crops of the same place in all rolls, and poses in their cameras, one after the other."""
+    num = len(ROLLS_DEG)
+    siblings = (crop - crop % num)[:, None] + torch.arange(num, device=crop.device)
+    turn = crops.cam_from_crop[siblings].transpose(2, 3) @ crops.cam_from_crop[crop][:, None]
+    rotation, position = turn @ pose.rotation[:, None], (turn @ pose.position[:, None, :, None])[..., 0]
+    scores = pose.score.repeat_interleave(num)
+    return siblings.flatten(), Aligned(rotation.flatten(0, 1), position.flatten(0, 1), scores)
 
 
 def _shifts() -> Float[Tensor, "shifts 2"]:

@@ -14,27 +14,25 @@ from curio_train.networks.several_objects.locator import LocatorNetwork
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.templates.geometry import Geometry
 from curio_train.worlds.several_objects.confidence import calibrate
-from curio_train.worlds.several_objects.distances import correct_distances
 from curio_train.worlds.several_objects.locator_stage import LocatorStage
 from curio_train.worlds.several_objects.scenes import ObjectScenes
-from curio_train.worlds.single_object.two_stage import TrainingPhotographs, frame_camera
+from curio_train.worlds.single_object.two_stage import frame_camera
 from curio_train.worlds.single_object.world import Object, pose_layout, position_field
 
 
 class SeveralObjectsWorld(ObjectScenes):
     """Several objects of one camera in six degrees of freedom, each at most once in a frame."""
 
-    def __init__(self, name: str, members: Sequence[Object], photographs: TrainingPhotographs | None = None) -> None:
+    def __init__(self, name: str, members: Sequence[Object]) -> None:
         """Build the stage.
 
         Args:
             name: As on the command line.
             members: The objects, each with the slot of its place in this order.
-            photographs: By which distances are corrected; they are not read before. None: there are none.
         """
         layout = pose_layout(position_field(members[0]), confidence=True, num_slots=len(members))
         super().__init__(name, members, frame_camera(members[0].camera), layout)
-        self._stage, self._photographs = LocatorStage(members, self.camera), photographs
+        self._stage = LocatorStage(members, self.camera)
 
     @property
     def stages(self) -> tuple[LocatorStage]:
@@ -63,10 +61,7 @@ class SeveralObjectsWorld(ObjectScenes):
             member.far_m,
         )
 
-    def calibrate(self, network: nn.Module, cache: Path) -> None:
-        """Calibrate confidences on renderings that the network was not trained with, then distances on photographs."""
+    def calibrate_confidence(self, network: nn.Module, cache: Path) -> None:
+        """Calibrate the network's confidence on renderings that it was not trained with."""
         assert isinstance(network, ObjectsNetwork)
-        network.reader.distance_factor.fill_(1)
         calibrate(network, self, cache)
-        if self._photographs is not None:
-            correct_distances(network, self, self._photographs.unlabelled())

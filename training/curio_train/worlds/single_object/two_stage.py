@@ -79,7 +79,7 @@ class TwoStageWorld(SingleObjectWorld):
         )
         return TwoStageNetwork(localisation, crop_pose, optics)
 
-    def calibrate(self, network: nn.Module, cache: Path) -> None:
+    def calibrate_confidence(self, network: nn.Module, cache: Path) -> None:
         """Calibrate the network's confidence on renderings that it was not trained with."""
         assert isinstance(network, TwoStageNetwork)
         calibrate(network, self, cache)
