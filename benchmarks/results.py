@@ -27,6 +27,9 @@ World = Literal["circles", "spheres", "chairs", "varied", "multi", "light"]
 BUDGETS = {"circles": 48_000, "spheres": 32_000, "chairs": 32_000, "varied": 32_000, "multi": 32_000, "light": 32_000}
 SEVERAL_SEEDS = {"circles", "spheres"}
 _SEEDED = {"super_1.0", "noncur", "our"}
+# Objects that stand under a fixed sun are found among hypotheses.
+_HYPOTHESES = "hypotheses_cells"
+_STANDING = {"chairs", "multi"}
 # Not in Circles: one thing alone needs no cells.
 _CELLS = ("sleep_cells", "super_1.0_cells", "noncur_cells", "our_cells")
 # Quick ones first, so that a reference is there early.
@@ -78,6 +81,7 @@ def plan(settings: Settings) -> list[QueuedRun]:
 
 def _rows_of(world: str) -> tuple[str, ...]:
     rows = (*_METHODS, *_ABLATIONS) if world in _ABLATED else _METHODS
+    rows = (*rows, _HYPOTHESES) if world in _STANDING else rows
     return tuple(row for row in rows if row not in _CELLS or world != "circles")
 
 

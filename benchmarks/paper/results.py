@@ -34,6 +34,7 @@ ORDER: Sequence[str] = (
     "super_1.0_cells",
     "noncur_cells",
     "our_cells",
+    "hypotheses_cells",
     "sleep_cells",
 )
 """Of the methods in tables: the paper's, then what goes beyond it."""

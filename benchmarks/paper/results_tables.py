@@ -26,10 +26,11 @@ _COLOURS: Mapping[str, str] = {
     "super_1.0_cells": "#9aa0a6",
     "noncur_cells": "#b98900",
     "our_cells": "#1e6b35",
+    "hypotheses_cells": "#1f6f8b",
     "sleep_cells": "#5f3b9e",
 }
 _CELLS = "_cells"
-_UNLABELLED = ("noncur", "our", "sleep", "noncur_cells", "our_cells", "sleep_cells")
+_UNLABELLED = ("noncur", "our", "sleep", "noncur_cells", "our_cells", "hypotheses_cells", "sleep_cells")
 _NOTHING = "–"
 Figures = Mapping[str, Sequence[float]]
 
@@ -45,7 +46,8 @@ def markdown(results: Results, command: str) -> str:
         " Eq. 1. `sleep`, `wake_sleep` and `wake_sleep_critic` go beyond the paper: they learn from renderings of codes"
         " drawn from the world's known range, synthetic labels in the sense of the paper's LineMOD table. Rows of"
         " `…_cells` have another network, which reads images cell by cell (`--reading cells`): full supervision, image"
-        " loss alone, the paper's loss, and sleep.",
+        " loss alone, the paper's loss, hypotheses (image loss minimised over rendered hypotheses of each image before"
+        " training), and sleep.",
         "![Ratios by world](worlds.png)",
         "## Table 2: Img",
         _ratios(results, others, lambda row: row["img_ratio"], paper.IMG),
