@@ -152,3 +152,14 @@ def test_gaze_has_gradients_straight_ahead() -> None:
     rotation_6d_from_matrix(gaze.rotation).sum().backward()
     assert torch.isfinite(direction.grad).all()
     assert direction.grad.abs().sum() > 0
+
+
+def test_a_crop_rolled_by_a_quarter_is_the_crop_turned_clockwise() -> None:
+    images = torch.rand(1, 3, 60, 80, generator=torch.Generator().manual_seed(0))
+    matrix = torch.tensor([[90.0, 0.0, 39.5], [0.0, 90.0, 29.5], [0.0, 0.0, 1.0]])
+    position_m, focal_px = torch.tensor([[[0.1, -0.05, 1.0]]]), torch.tensor([120.0])
+    upright, crop_from_cam = crop_camera.cut_crops(images, matrix, position_m, focal_px, 16)
+    quarter = torch.tensor([[0.0, 1.0]])
+    rolled, rolled_from_cam = crop_camera.cut_crops(images, matrix, position_m, focal_px, 16, roll=quarter)
+    torch.testing.assert_close(rolled, upright.rot90(-1, (2, 3)), atol=1e-4, rtol=0)
+    torch.testing.assert_close(rolled_from_cam, crop_camera.about_axis(quarter) @ crop_from_cam)
