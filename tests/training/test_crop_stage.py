@@ -10,8 +10,9 @@ from curio_serve.models.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNo
 from curio_serve.models.model import from_bytes
 from curio_train.config import NetworkConfig
 from curio_train.export.crop_stage import traced
-from curio_train.export.graph import Graph, model_spec
+from curio_train.export.graph import Graph
 from curio_train.export.onnx import put_spec, store_half
+from curio_train.export.spec import model_spec
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object

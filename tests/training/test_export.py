@@ -18,11 +18,9 @@ from curio_train.export.card import EVALUATION_FILE, Provenance, card, portable
 from curio_train.export.folder import ModelFolder
 from curio_train.export.graph import (
     Exported,
-    Graph,
     check_images,
     export,
     largest_difference,
-    numerically_stable,
     refuse_disparity,
 )
 from curio_train.exported_model import ExportedModel, find_model
@@ -186,64 +184,6 @@ def test_disagreement_is_refused_and_leaves_nothing(tmp_path: Path, write_run: W
 def test_a_graph_that_computes_something_else_is_refused() -> None:
     with pytest.raises(ExportError, match=r"torch and onnxruntime differ by 0.5 in translation_m, expected at most"):
         refuse_disparity({TRANSLATION: torch.tensor([1.0, 2.0])}, {TRANSLATION: torch.tensor([1.0, 2.5])})
-
-
-class _Brighter(torch.nn.Module):
-    """Right of the middle if the right half of a picture is brighter: of equal halves rounding decides."""
-
-    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
-        left, right = images.double().chunk(2, dim=3)
-        side = torch.where(right.mean((1, 2, 3)) > left.mean((1, 2, 3)), 0.2, -0.2)
-        return {TRANSLATION: torch.stack([side, side, 0 * side], dim=1)[:, None].float()}
-
-
-def test_images_on_which_rounding_decides_can_tell_nothing() -> None:
-    graph = Graph(_Brighter(), Circles())
-    images = torch.zeros(8, 128, 128, 3, dtype=torch.uint8)
-    images[:5, :, 64:] = 100
-    assert numerically_stable(graph, images).tolist() == [[True]] * 5 + [[False]] * 3
-    with pytest.raises(ExportError, match=r"answers to 7 of 8 check images"):
-        numerically_stable(graph, images[[0, 5, 6, 7, 5, 6, 7, 5]])
-
-
-class _BrighterAndFixed(_Brighter):
-    """Of two objects one is where it always is."""
-
-    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
-        moved = super().forward(images)[TRANSLATION]
-        return {TRANSLATION: torch.cat([moved, torch.ones_like(moved)], dim=1)}
-
-
-def test_each_object_of_an_image_is_judged_by_itself() -> None:
-    graph = Graph(_BrighterAndFixed(), Circles())
-    images = torch.zeros(8, 128, 128, 3, dtype=torch.uint8)
-    images[:1, :, 64:] = 100
-    assert numerically_stable(graph, images).tolist() == [[True, True]] + [[False, True]] * 7
-    with pytest.raises(ExportError, match=r"answers to 7 of 7 check images"):
-        numerically_stable(graph, images[1:])
-
-
-class _Surer(torch.nn.Module):
-    """The surer of two cells that read the same pixel almost alike."""
-
-    def __init__(self, difference: float) -> None:
-        super().__init__()
-        self.cells = torch.nn.Conv2d(3, 2, 1)
-        torch.nn.init.ones_(self.cells.weight)
-        assert self.cells.bias is not None
-        self.cells.bias.data = torch.tensor([0.0, difference])
-
-    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
-        side = 0.2 * self.cells(images)[:, :, 0, 0].argmax(dim=1).float()
-        return {TRANSLATION: torch.stack([side, side, 0 * side], dim=1)[:, None]}
-
-
-@pytest.mark.parametrize(("difference", "expected"), [(1e-3, 8), (1e-6, 4)])
-def test_layers_that_rounding_decides_can_tell_nothing(difference: float, expected: int) -> None:
-    """Two cells are moved alike by any pixel, so pixels do not tell; where all is black they differ by all they say."""
-    images = torch.full((8, 128, 128, 3), 200, dtype=torch.uint8)
-    images[4:] = 0
-    assert numerically_stable(Graph(_Surer(difference), Circles()), images).sum() == expected
 
 
 def test_weights_too_large_for_half_are_refused(tmp_path: Path, write_run: WriteRun) -> None:

@@ -3,7 +3,7 @@
 import copy
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +12,8 @@ import numpy as np
 import onnx
 import torch
 import torch.nn.functional as F
-from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec, ObjectModel, Symmetry
-from curio_proto.v1.model_spec_pb2 import Field as FieldSpec
 from curio_serve.models.golden import GOLDEN_FILE
 from curio_serve.models.model_folder import MODEL_FILE
-from curio_serve.models.spec import SCHEMA_VERSION
 from jaxtyping import Bool
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
@@ -26,6 +23,7 @@ from curio_train.export.card import Provenance, card
 from curio_train.export.crop_stage import STAGE_TENSORS, traced
 from curio_train.export.folder import ModelFolder, triton_config
 from curio_train.export.onnx import put_spec, store_half
+from curio_train.export.spec import model_spec
 from curio_train.exported_model import WEIGHTS_FILE, ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
@@ -33,9 +31,9 @@ from curio_train.learning.runs.initial import weights_file
 from curio_train.learning.runs.provenance import run_sessions
 from curio_train.networks.templates.trunk import Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
-from curio_train.scene_code import TRANSLATION, Field
+from curio_train.scene_code import TRANSLATION
 from curio_train.worlds import build
-from curio_train.worlds.base import ObjectKind, World
+from curio_train.worlds.base import World
 
 LARGEST_PARITY_ERROR = 1e-4
 """Largest absolute difference between torch and onnxruntime that an export may have, in any output."""
@@ -316,46 +314,3 @@ def refuse_disparity(expected: dict[str, Tensor], found: dict[str, Tensor]) -> f
             f"{LARGEST_PARITY_ERROR:g}; nothing was written. Has the training diverged?"
         )
     return errors[worst]
-
-
-def model_spec(world: World, name: str) -> ModelSpec:
-    """The specification of a world's model, without its origin."""
-    camera = world.camera
-    matrix: Sequence[float] = [] if camera.matrix is None else np.asarray(camera.matrix, float).ravel().tolist()
-    return ModelSpec(
-        schema_version=SCHEMA_VERSION,
-        name=name,
-        world=world.name,
-        num_slots=world.layout.num_slots,
-        fields=[_field_spec(field) for field in world.outputs.fields],
-        objects=[_object_model(kind) for kind in world.objects],
-        camera=CanonicalCamera(
-            width=camera.width, height=camera.height, camera_matrix=matrix, is_default=camera.is_default
-        ),
-    )
-
-
-def _field_spec(field: Field) -> FieldSpec:
-    return FieldSpec(
-        name=field.name,
-        size=field.size,
-        per_object=field.per_object,
-        unit=field.unit,
-        frame=field.frame,
-        lower=field.lower,
-        upper=field.upper,
-        activation=field.activation,
-    )
-
-
-def _object_model(kind: ObjectKind) -> ObjectModel:
-    discrete = [Symmetry(transform=np.asarray(matrix, float).ravel()) for matrix in kind.symmetries]
-    continuous = [Symmetry(axis=axis, offset_m=offset) for axis, offset in kind.symmetry_axes]
-    return ObjectModel(
-        name=kind.name,
-        mesh_sha256=kind.mesh_sha256,
-        diameter_m=kind.diameter_m,
-        box_corners_m=np.asarray(kind.box_corners_m, float).ravel(),
-        symmetries=discrete + continuous,
-        slots=kind.slots,
-    )
