@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 from dataclasses import replace
+from threading import Thread
 
 from curio_serve.errors import CurioError
 from curio_serve.server.config import ServeConfig, read_config, to_toml
@@ -43,7 +44,8 @@ def _serve(config: ServeConfig) -> None:
         server = PoseServer(config)
         for number in STOP_SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup sets it
-                signal.signal(number, lambda _number, _frame: server.stop())
+                # From a thread of its own: the one that a signal interrupts may hold the lock that stop() takes.
+                signal.signal(number, lambda _number, _frame: Thread(target=server.stop, daemon=True).start())
         address, *metrics = server.start()
         _announce([f"listening on {address}", *(f"metrics on {url}" for url in metrics)])
         server.serve_until_stopped()
