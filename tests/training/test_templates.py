@@ -9,6 +9,7 @@ import pytest
 import torch
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.export.onnx import to_onnx
+from curio_train.networks.crop_camera import cut_crops
 from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, Bank
 from curio_train.networks.templates.bank import RANK as BANK_RANK
@@ -16,6 +17,7 @@ from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, NUM_VIEWS, Geometry, viewpoints
 from curio_train.networks.templates.localiser import RANK, Localiser
 from curio_train.networks.templates.network import STEPS, TemplateNetwork
+from curio_train.networks.templates.rolls import ROLLS_DEG, upright_rolls
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
 from curio_train.templates.build import template_network
 from curio_train.worlds import build
@@ -58,6 +60,22 @@ def test_viewpoints_are_rotations_of_the_upper_hemisphere() -> None:
     assert (torch.linalg.det(found) > 0).all()
     camera_height = -(found[:, 2, 2])  # the camera looks along the third row, from above downwards
     assert (camera_height > 0).all()
+
+
+def test_crops_are_rolled_until_objects_stand_as_in_templates() -> None:
+    random = torch.Generator().manual_seed(0)
+    position = torch.randn(20, 3, generator=random) * 0.2 + torch.tensor([0.0, 0.0, 1.0])
+    upward = torch.randn(20, 3, generator=random)
+    matrix = torch.from_numpy(MATRIX).float()
+    each = position.repeat_interleave(len(ROLLS_DEG), dim=0)
+    roll = upright_rolls(position, upward)
+    _, crop_from_cam = cut_crops(torch.zeros(1, 3, 8, 8), matrix, each[None], torch.full((60,), 100.0), 4, roll=roll)
+    x, y, _ = (crop_from_cam @ upward.repeat_interleave(len(ROLLS_DEG), dim=0)[..., None])[..., 0].unbind(1)
+    leaning = torch.atan2(x, -y).rad2deg()  # clockwise from upright; y points down
+    torch.testing.assert_close(leaning, torch.tensor(ROLLS_DEG).repeat(20), atol=0.01, rtol=0)
+    of_templates = torch.atan2(*(viewpoints(1, NUM_ROLLS)[:, :2, 2] * torch.tensor([1, -1])).unbind(1)).rad2deg()
+    for angle in ROLLS_DEG:
+        assert (of_templates - angle).abs().min() < 0.01
 
 
 def test_descriptors_have_unit_length_and_lose_what_all_backgrounds_share() -> None:

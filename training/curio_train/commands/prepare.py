@@ -12,7 +12,7 @@ from curio_train.commands.linemod_data import with_linemod
 from curio_train.config import NetworkConfig, RunConfig
 from curio_train.errors import DataError, UsageError
 from curio_train.learning.runs.configuration import CONFIG_FILE
-from curio_train.worlds.options import CaptureOptions, LinemodOptions, names_several
+from curio_train.worlds.options import CaptureOptions, LinemodOptions
 
 
 def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report: Callable[[str], None]) -> RunConfig:
@@ -36,11 +36,6 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
             "which linemod and capture have"
         )
     if isinstance(options, LinemodOptions):
-        if config.recipe.self_training and names_several(options.class_name):
-            raise UsageError(
-                f"--self-training {config.recipe.self_training}: only detectors for one object learn from photographs, "
-                f"and --class {options.class_name} names several; leave out --self-training and --photos"
-            )
         options = with_linemod(options, cache, report)
         config = replace(config, world=options)
         _refuse_unreadable(options)

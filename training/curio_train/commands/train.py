@@ -23,7 +23,6 @@ from curio_train.errors import UsageError, nearest
 from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.worlds import WORLDS
-from curio_train.worlds.options import names_several
 
 if TYPE_CHECKING:
     from curio_train.capture.structure import Structure
@@ -115,7 +114,6 @@ def _defaults(world: str, typed: list[str]) -> tuple[RunConfig, RunConfig | None
     first.add_argument("--preset", nargs="?", default="laptop")
     first.add_argument("--resume", nargs="?", type=Path)
     first.add_argument("--photos", nargs="?")
-    first.add_argument("--class", nargs="?", dest="class_name")
     seen, _ = first.parse_known_args(typed)
 
     stored = load_config(seen.resume) if seen.resume else None
@@ -124,8 +122,7 @@ def _defaults(world: str, typed: list[str]) -> tuple[RunConfig, RunConfig | None
     kind = WORLDS[world]
     preset: Preset = "paper" if seen.preset == "paper" else "laptop"  # an unknown preset is tyro's to refuse
     recipe = preset_recipe(preset, kind)
-    if world == "linemod" and (seen.photos is None or names_several(seen.class_name or "")):
-        # Then --self-training is an error, and its default must be none.
+    if world == "linemod" and seen.photos is None:  # then --self-training is an error, and its default must be none
         recipe = replace(recipe, self_training=0.0)
     return RunConfig(_unset(kind), method=kind.default_method, recipe=recipe), stored
 

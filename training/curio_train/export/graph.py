@@ -107,7 +107,7 @@ class Graph(nn.Module):
         return self._world.outputs.from_code(self.network(pixels))
 
     def where(self, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The stable answers, one a row: of objects, or of whole scenes where an output is these'."""
+        """The stable answers, one a row: of objects, or of scenes whose every answer is stable."""
         whole = stable.all(dim=1)
         return {name: values[whole if name in self.of_scene else stable] for name, values in outputs.items()}
 

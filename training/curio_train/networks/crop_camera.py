@@ -40,7 +40,7 @@ def _pixel_centres(like: Tensor, width: int, height: int) -> Tensor:
 
 
 def about_axis(angle: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotations about the optical axis, x towards y, from the cosines and sines of their angles."""
+    """Rotations about the optical axis, which turn pictures clockwise, from the cosines and sines of their angles."""
     cosine, sine = angle.unbind(-1)
     zero, one = torch.zeros_like(cosine), torch.ones_like(cosine)
     return torch.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
@@ -106,7 +106,7 @@ def cut_crops(
     focal_px: Float[Tensor, "images*num"],
     side: int,
     oversampling: int = 2,
-    roll: Float[Tensor, "images*num 2"] | None = None,
+    roll: Float[Tensor, "images*num 3 3"] | None = None,
 ) -> tuple[Float[Tensor, "images*num 3 {side} {side}"], Float[Tensor, "images*num 3 3"]]:
     """Crops by virtual cameras that look at positions.
 
@@ -117,7 +117,7 @@ def cut_crops(
         focal_px: Of the crops, pixels; those of one image after the other.
         side: Of the crops, pixels.
         oversampling: Samples a pixel, across and down; with two, near objects do not alias.
-        roll: Cosine and sine of the angle by which each camera turns its pictures clockwise; None: by none.
+        roll: What each camera turns what it sees by, see :func:`about_axis`; None: by nothing.
 
     Returns:
         The crops, and crop_from_cam.
@@ -126,7 +126,7 @@ def cut_crops(
     matrices = matrix.expand(focal_px.shape[0], 3, 3)
     camera = crop_camera_at(position_m.flatten(0, 1), oversampling * focal_px, fine_side, matrices)
     if roll is not None:
-        camera = camera._replace(rotation=about_axis(roll) @ camera.rotation)
+        camera = camera._replace(rotation=roll @ camera.rotation)
     grid = sampling_grid(camera, matrices, fine_side, images.shape[3], images.shape[2])
     # The crops of an image in one tall grid: no image is copied.
     tall = grid.view(-1, num * fine_side, fine_side, 2)

@@ -64,11 +64,6 @@ ALL_CLASSES = "all"
 """Names every object of a data set."""
 
 
-def names_several(class_name: str) -> bool:
-    """Whether ``--class`` asks for a detector for several objects."""
-    return class_name == ALL_CLASSES or "," in class_name
-
-
 @dataclass(frozen=True)
 class LinemodOptions(WorldOptions):
     """One object of the LineMOD data set in six degrees of freedom, over cluttered backgrounds."""
@@ -108,6 +103,11 @@ class LinemodOptions(WorldOptions):
         if not self.gaze and self.photos is not None:
             raise UsageError(
                 f"--photos {self.photos}: only the two-stage detector learns from them; leave out --one-stage"
+            )
+        if self.photos is not None and (self.class_name == ALL_CLASSES or "," in self.class_name):
+            raise UsageError(
+                f"--photos {self.photos}: only a detector for one object learns from them, and --class "
+                f"{self.class_name} names several; leave out --photos"
             )
 
 

@@ -11,8 +11,9 @@ from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matri
 from curio_train.networks.crop_camera import cut_crops
 from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.banks import Banks
-from curio_train.networks.templates.geometry import CROP_PX, FILL, MAX_ROLL_DEG, NUM_ROLLS, Geometry
+from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
 from curio_train.networks.templates.outline import outline_log_factor
+from curio_train.networks.templates.rolls import ROLLS_DEG, upright_rolls
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
@@ -22,9 +23,6 @@ NUM_NEIGHBOURS = 4
 
 NUM_CLOSER = 2
 """Hypotheses of the first look around which crops are cut again, at their own distance."""
-
-ROLLS_DEG = (-2 * MAX_ROLL_DEG / NUM_ROLLS, 0.0, 2 * MAX_ROLL_DEG / NUM_ROLLS)
-"""By which these crops are rolled, from where the object stands upright: there are templates of just these rolls."""
 
 STEPS = (3, 5, 4)
 """Of the alignment: of every hypothesis of the first look and of the second, then of the best with its neighbours."""
@@ -154,7 +152,7 @@ class PoseReader(nn.Module):
             torch.stack([score, place], dim=2),
         )
 
-    def _closer(self, trunk: Trunk, images: Tensor, places: Places) -> tuple[Places, Float[Tensor, "crops 2"]]:
+    def _closer(self, trunk: Trunk, images: Tensor, places: Places) -> tuple[Places, Float[Tensor, "crops 3 3"]]:
         """Where the likeliest hypotheses put each object, and by what angles crops there are rolled.
 
         Places are some per cent too near or too far, and objects lean to one side. Templates match better in crops at
@@ -174,7 +172,7 @@ class PoseReader(nn.Module):
         in_front = torch.maximum(chosen[..., 2:], self._nearest_m[:, None, None])
         closer = torch.cat([chosen[..., :2], in_front], dim=3)
         of_places = place_score.gather(1, best).unflatten(0, (-1, self.banks.num_objects))
-        roll = _rolls(closer.flatten(0, 2), upward.gather(1, of_rows).flatten(0, 1))
+        roll = upright_rolls(closer.flatten(0, 2), upward.gather(1, of_rows).flatten(0, 1))
         return Places(*(of_all.repeat_interleave(len(ROLLS_DEG), dim=2) for of_all in (closer, of_places))), roll
 
     def _crops(self, trunk: Trunk, images: Tensor, places: Places, roll: Tensor | None = None) -> _Crops:
@@ -239,11 +237,11 @@ class PoseReader(nn.Module):
 
     def _averaged(self, crops: _Crops, best: _Hypotheses) -> tuple[Aligned, Float[Tensor, " rows"]]:
         """The mean of what the templates around a pose answer, and the spread of the logarithm of their distances."""
-        siblings, pose = _in_siblings(crops, best.crop, best.pose)
+        rolled, pose = _in_all_rolls(crops, best.crop, best.pose)
         templates = self._nearest(pose, NUM_NEIGHBOURS).unflatten(0, (-1, len(ROLLS_DEG))).flatten(1)
         surface = self.banks.surface(templates)
         start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in pose))
-        crop = siblings.repeat_interleave(NUM_NEIGHBOURS)
+        crop = rolled.repeat_interleave(NUM_NEIGHBOURS)
         found = align(crops.fine, crop, *surface, start, crops.focal_px[crop], self._steps[2])
         rotation, position, score = (of_all.unflatten(0, templates.shape) for of_all in found)
         cam_from_crop = crops.cam_from_crop[crop].unflatten(0, templates.shape)
@@ -265,8 +263,8 @@ class PoseReader(nn.Module):
             of_all.repeat_interleave(len(ROLLS_DEG), dim=0)
             for of_all in self.banks.outlines(self._nearest(pose, 1)[:, 0])
         )
-        siblings, seen = _in_siblings(crops, crop, pose)
-        gaps = outline_log_factor(crops.pictures[siblings], points, outward, seen, crops.focal_px[siblings])
+        rolled, seen = _in_all_rolls(crops, crop, pose)
+        gaps = outline_log_factor(crops.pictures[rolled], points, outward, seen, crops.focal_px[rolled])
         gap = gaps.unflatten(0, (-1, len(ROLLS_DEG))).mean(dim=1)
         return pose._replace(position=pose.position * (gap / 2).exp()[:, None]), gap
 
@@ -292,32 +290,14 @@ def _best(found: _Hypotheses) -> _Hypotheses:
     return _Hypotheses(Aligned(*(of_all[row] for of_all in found.pose)), found.crop[row], found.place_score[row])
 
 
-def _rolls(position: Float[Tensor, "looks 3"], upward: Float[Tensor, "looks 3"]) -> Float[Tensor, "looks*rolls 2"]:
-    """Cosines and sines of the angles by which crops at positions are rolled.
-
-    Args:
-        position: Of objects, camera frame, any unit.
-        upward: The objects' z axes, camera frame.
-    """
-    axis = position.new_tensor([0.0, 0.0, 1.0]).expand_as(position)
-    x, y = (rotation_between(position, axis) @ upward[..., None])[:, :2, 0].unbind(1)
-    length = (x.square() + y.square()).clamp(min=1e-12).sqrt()
-    upright = torch.stack([-y / length, -x / length], dim=1)
-    angles = torch.tensor(ROLLS_DEG, device=position.device).deg2rad()
-    turn = torch.stack([angles.cos(), angles.sin()], dim=1)
-    cosine = upright[:, :1] * turn[:, 0] - upright[:, 1:] * turn[:, 1]
-    sine = upright[:, 1:] * turn[:, 0] + upright[:, :1] * turn[:, 1]
-    return torch.stack([cosine, sine], dim=2).flatten(0, 1)
-
-
-def _in_siblings(crops: _Crops, crop: Int[Tensor, " rows"], pose: Aligned) -> tuple[Int[Tensor, " looks"], Aligned]:
+def _in_all_rolls(crops: _Crops, crop: Int[Tensor, " rows"], pose: Aligned) -> tuple[Int[Tensor, " looks"], Aligned]:
     """The crops of the same place in all rolls, and poses in their cameras, one after the other."""
     num = len(ROLLS_DEG)
-    siblings = (crop - crop % num)[:, None] + torch.arange(num, device=crop.device)
-    turn = crops.cam_from_crop[siblings].transpose(2, 3) @ crops.cam_from_crop[crop][:, None]
+    rolled = (crop - crop % num)[:, None] + torch.arange(num, device=crop.device)
+    turn = crops.cam_from_crop[rolled].transpose(2, 3) @ crops.cam_from_crop[crop][:, None]
     rotation, position = turn @ pose.rotation[:, None], (turn @ pose.position[:, None, :, None])[..., 0]
     scores = pose.score.repeat_interleave(num)
-    return siblings.flatten(), Aligned(rotation.flatten(0, 1), position.flatten(0, 1), scores)
+    return rolled.flatten(), Aligned(rotation.flatten(0, 1), position.flatten(0, 1), scores)
 
 
 def _shifts() -> Float[Tensor, "shifts 2"]:

@@ -1,0 +1,34 @@
+"""How crop cameras are rolled so that objects stand in their pictures as they do in templates.
+
+Features do not turn with a picture. An object that leans between two templates is therefore read worse than one that
+leans as a template does.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from curio_train.geometry import rotation_between
+from curio_train.networks.crop_camera import about_axis
+from curio_train.networks.templates.geometry import MAX_ROLL_DEG, NUM_ROLLS
+
+ROLLS_DEG = (-2 * MAX_ROLL_DEG / NUM_ROLLS, 0.0, 2 * MAX_ROLL_DEG / NUM_ROLLS)
+"""From where the object stands upright: there are templates of just these rolls."""
+
+
+def upright_rolls(
+    position: Float[Tensor, "looks 3"], upward: Float[Tensor, "looks 3"]
+) -> Float[Tensor, "looks*rolls 3 3"]:
+    """What cameras that look at objects turn what they see by: :data:`ROLLS_DEG`, one after the other.
+
+    Args:
+        position: Of the objects, camera frame of the image, any unit.
+        upward: Their z axes, camera frame of the image.
+    """
+    axis = position.new_tensor([0.0, 0.0, 1.0]).expand_as(position)
+    x, y = (rotation_between(position, axis) @ upward[..., None])[:, :2, 0].unbind(1)
+    length = (x.square() + y.square()).clamp(min=1e-12).sqrt()
+    upright = about_axis(torch.stack([-y / length, -x / length], dim=1))
+    angles = torch.tensor(ROLLS_DEG, device=position.device).deg2rad()
+    further = about_axis(torch.stack([angles.cos(), angles.sin()], dim=1))
+    return (further @ upright[:, None]).flatten(0, 1)
