@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 import tyro
 from curio_serve.client import PoseClient
+from curio_train.learning.runs.progress import read_history
 from rich.console import Console
 from rich.table import Table
 
@@ -160,13 +161,9 @@ def watch(arguments: Arguments, runs: dict[str, "subprocess.Popen[bytes]"], cons
 
 
 def progress(run: Path) -> str:
-    """The last line of a run's history, in words."""
-    history = run / "history.jsonl"
-    lines = history.read_text(encoding="utf-8").splitlines() if history.exists() else []
-    if not lines or not lines[-1].endswith("}"):
-        return "…"
-    row = json.loads(lines[-1])
-    return f"{row['images']:,} images, image loss {row['image']:.0f}"
+    """The last image loss in a run's history, in words; other lines say other things."""
+    rows = [row for row in read_history(run) if "image" in row]
+    return f"{rows[-1]['images']:,} images, image loss {rows[-1]['image']:.0f}" if rows else "…"
 
 
 @contextmanager

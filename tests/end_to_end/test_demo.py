@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import cv2
+from demo import progress
 
 DEMO = Path(__file__).parents[2] / "benchmarks" / "demo.py"
 
@@ -34,6 +35,13 @@ def test_demo_measures_three_networks_and_draws_two(tmp_path: Path) -> None:
         assert error == 128 * widths[name]
         assert 20 < error < 91, "two steps from the untrained network: about as far off as a guess"
     assert cv2.imread(str(out / "demo.png")).shape[0] == 2 * 260
+
+
+def test_progress_is_the_last_image_loss_whatever_else_was_written_after_it(tmp_path: Path) -> None:
+    assert progress(tmp_path) == "…"
+    rows = [{"step": 20, "images": 1280, "image": 833.8}, {"step": 39, "images": 2496, "image_dssim": 0.02}]
+    (tmp_path / "history.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows) + '{"step": 40, "ima')
+    assert progress(tmp_path) == "1,280 images, image loss 834"
 
 
 def test_demo_says_which_command_failed(tmp_path: Path) -> None:
