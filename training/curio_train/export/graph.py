@@ -42,6 +42,7 @@ NUM_JITTERED = 12
 """Rounds of jitter in the check of numerical stability; it misses a tie once in 2 to the power of this."""
 
 _NUM_CHECK_IMAGES = 4  # of either kind
+_IMAGES_AT_ONCE = 2  # that torch reads: eight images of eight objects take 13 GB
 _CHECK_SEED = (20_210,)
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
@@ -106,6 +107,11 @@ class Graph(nn.Module):
         """Outputs by name, for pixels [batch, 3, height, width] in [0, 1]."""
         return self._world.outputs.from_code(self.network(pixels))
 
+    def in_parts(self, pixels: Tensor) -> dict[str, Tensor]:
+        """The same, few images at once."""
+        parts = [self.read(part) for part in pixels.split(_IMAGES_AT_ONCE)]
+        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
     def where(self, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The stable answers, one a row: of objects, or of scenes whose every answer is stable."""
         whole = stable.all(dim=1)
@@ -142,7 +148,7 @@ def export(
     deployed = Graph(_deployable(state.pose.network, half), world)
     images = check_images(world)
     with torch.no_grad():
-        learned, expected = trained.outputs(images), deployed.outputs(images)
+        learned, expected = trained.in_parts(_pixels(images)), deployed.in_parts(_pixels(images))
     rounding_error = largest_difference(learned, expected) if half else 0.0
 
     shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
@@ -255,12 +261,12 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slot
     Raises:
         ExportError: Too few can, or to no image all of them.
     """
-    answers, generator = graph.outputs(images), torch.Generator().manual_seed(*_CHECK_SEED)
-    pixels = images.permute(0, 3, 1, 2).float() / 255
+    pixels, generator = _pixels(images), torch.Generator().manual_seed(*_CHECK_SEED)
+    answers = graph.in_parts(pixels)
     stable = torch.ones(answers[TRANSLATION].shape[:2], dtype=torch.bool)
     with _jittered_layers(graph.network, generator):
         for _ in range(NUM_JITTERED):
-            jittered = graph.read(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
+            jittered = graph.in_parts(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
             for name, values in answers.items():
                 kept = 1 if name in graph.of_scene else 2
                 moved = (values - jittered[name]).abs().reshape(*values.shape[:kept], -1).amax(dim=-1)
