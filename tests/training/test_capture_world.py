@@ -215,6 +215,10 @@ def test_a_model_is_not_judged_by_what_it_learned_from(folder: Path, tmp_path: P
     read.clear()
     assert PseudoLabels.from_photographs(few, predict) is None
     assert not read
+    assert PseudoLabels.from_photographs(many, predict, seconds=0) is None
+    first, spread = greys(read[0]), greys(torch.cat(read[1:]))
+    assert len(first) == len(spread) == 20, "without time for more, one batch is tried and one is labelled"
+    assert max(spread) - min(spread) > max(first) - min(first)
 
 
 def test_what_contradicts_itself_is_refused(folder: Path, tmp_path: Path) -> None:

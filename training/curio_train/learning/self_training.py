@@ -14,12 +14,22 @@ ROUNDS, ROUNDS_OF_PRETRAINED = (0.6, 0.8), (0.2, 0.5, 0.8)
 """Fractions of the budget after which a pseudo-labelling round is due: late, when the network's poses are good enough;
 sooner for networks that began with trained weights (``--init``)."""
 
+LARGEST_SHARE = 0.15
+"""Of a budget of minutes that one round may take."""
+
 
 class SelfTraining:
     """Pseudo-labels of a world's photographs, for the last stage of its network."""
 
     def __init__(
-        self, network: nn.Module, world: World, fraction: float, device: torch.device, *, pretrained: bool = False
+        self,
+        network: nn.Module,
+        world: World,
+        fraction: float,
+        device: torch.device,
+        *,
+        pretrained: bool = False,
+        minutes: float | None = None,
     ) -> None:
         """Begin without any.
 
@@ -29,9 +39,11 @@ class SelfTraining:
             fraction: Of the last stage's images that are to be photographs; 0 never labels any.
             device: Of the network.
             pretrained: The network began with trained weights.
+            minutes: Budget of the training; None: it is not one of time.
         """
         self._world, self._network, self._fraction, self._device = world, network, fraction, device
         self._rounds = ROUNDS_OF_PRETRAINED if pretrained else ROUNDS
+        self._seconds = None if minutes is None else LARGEST_SHARE * 60 * minutes
         self._labels: PseudoLabels | None = None
         self._num_rounds = 0
 
@@ -47,7 +59,7 @@ class SelfTraining:
         """
         self._num_rounds = self._rounds_until(spent)
         self._network.eval()
-        self._labels = PseudoLabels.from_photographs(self._world, self._predict) or self._labels
+        self._labels = PseudoLabels.from_photographs(self._world, self._predict, self._seconds) or self._labels
         self._network.train()
 
     def mix_in(self, code: SceneCode, images: Tensor, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:

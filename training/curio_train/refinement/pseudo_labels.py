@@ -8,12 +8,13 @@ static scene, photographs correct each other (:mod:`~curio_train.refinement.mult
 used.
 """
 
+import time
 from collections.abc import Callable, Sequence
 from typing import Self
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from curio_train.data.photographs import CameraPoses, read_frames
@@ -32,6 +33,7 @@ MIN_CONSENSUS = 10
 """So many photographs with a multi-view consensus are better than all others with poses of their own."""
 
 _BATCH_SIZE = 20
+_PASSES = 2  # of render-and-compare over each photograph
 _GAINS = (0.8, 1.25)  # on crops: only the light varies, all else is the camera's own
 
 
@@ -83,8 +85,15 @@ class PseudoLabels:
         return cls(world, frames[accepted], index(twice, accepted)) if accepted.any() else None
 
     @classmethod
-    def from_photographs(cls, world: World, predict: Callable[[Tensor], SceneCode]) -> Self | None:
+    def from_photographs(
+        cls, world: World, predict: Callable[[Tensor], SceneCode], seconds: float | None = None
+    ) -> Self | None:
         """Predict and refine the poses in the unlabelled photographs of a world; None if it has none.
+
+        Args:
+            world: With or without photographs.
+            predict: Images [batch, 3, height, width] in [0, 1] to scene codes.
+            seconds: What it may take, about; where that is too little for all photographs, some are left out, evenly.
 
         Raises:
             DataError: A photograph cannot be read, or is not of the camera's size.
@@ -95,8 +104,12 @@ class PseudoLabels:
         paths, cameras = world.photographs.unlabelled()
         if not paths:
             return None
-        frames = read_frames(paths, world.object.camera, world.camera.width, world.camera.height)
-        return cls.from_predictions(world, torch.from_numpy(frames), predict, cameras)
+        frames = torch.from_numpy(read_frames(paths, world.object.camera, world.camera.width, world.camera.height))
+        if seconds is not None and len(frames) > _BATCH_SIZE:
+            chosen = _affordable(RenderAndCompare.in_world(world), frames, predict, seconds)
+            frames = frames[torch.from_numpy(chosen)]
+            cameras = None if cameras is None else cameras._replace(cam_from_world=cameras.cam_from_world[chosen])
+        return cls.from_predictions(world, frames, predict, cameras)
 
     def __len__(self) -> int:
         """Number of photographs."""
@@ -124,6 +137,18 @@ class PseudoLabels:
         gain = torch.from_numpy(random.uniform(*_GAINS, (count, 1, 1, 1))).float()
         labels = self._stage.label_crops(code, in_crop, rotation, assumed_depth_m[:, None])
         return labels, (gain * crops).clamp(0, 1)
+
+
+def _affordable(
+    refiner: RenderAndCompare, frames: Tensor, predict: Callable[[Tensor], SceneCode], seconds: float
+) -> Int[np.ndarray, " num"]:
+    """Photographs spread evenly over all of them, as many as the time is enough for; one batch at least."""
+    began = time.monotonic()
+    predict_and_refine(refiner, frames[:_BATCH_SIZE], predict)
+    spent = time.monotonic() - began
+    num = int((seconds - spent) / (_PASSES * spent) * _BATCH_SIZE)
+    num = min(max(num, _BATCH_SIZE), len(frames))
+    return np.arange(num) * len(frames) // num
 
 
 @torch.no_grad()
