@@ -51,7 +51,7 @@ def template_network(world: World) -> TemplateNetwork:
     if not isinstance(world, TwoStageWorld):
         raise UsageError(
             f"--method templates finds one object in six degrees of freedom, which {world.name} does not ask for here: "
-            "expected linemod without --no-gaze, or capture without --plane"
+            "expected linemod without --one-stage, or capture without --plane"
         )
     assert world.camera.matrix is not None
     one = world.object

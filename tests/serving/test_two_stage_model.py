@@ -1,4 +1,4 @@
-"""A model as gaze networks are exported: a large input that is not square, sampled by GridSample inside the graph."""
+"""A model as two-stage detectors are exported: a large input that is not square, sampled by GridSample inside the graph."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +23,7 @@ K_STAR = np.array([[430.0, 0, 244.0], [0, 440.0, 175.0], [0, 0, 1]])
 FRAME_K = np.array([[600.0, 0, 322.0], [0, 590.0, 236.0], [0, 0, 1]])
 
 
-def _gaze_onnx() -> onnx.ModelProto:
+def _two_stage_onnx() -> onnx.ModelProto:
     """Direction of the brightest spot, at a distance of 1 m, from an image that GridSample makes four times smaller."""
     rows, columns = HEIGHT // STRIDE, WIDTH // STRIDE
     x, y = np.meshgrid((np.arange(columns) + 0.5) * 2 / columns - 1, (np.arange(rows) + 0.5) * 2 / rows - 1)
@@ -73,7 +73,7 @@ def _gaze_onnx() -> onnx.ModelProto:
     shapes = {"translation_m": ["b", 1, 3], "rotation_6d": ["b", 1, 6], "rotation": ["b", 1, 3, 3]}
     graph = helper.make_graph(
         nodes,
-        "gaze",
+        "two_stage",
         [helper.make_tensor_value_info("image", TensorProto.UINT8, ["b", HEIGHT, WIDTH, 3])],
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in shapes.items()],
         constants,
@@ -81,7 +81,7 @@ def _gaze_onnx() -> onnx.ModelProto:
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
     spec = ModelSpec(
         schema_version=1,
-        name="gaze",
+        name="two_stage",
         world="linemod",
         num_slots=1,
         fields=[
@@ -102,14 +102,14 @@ def channel(
     start_server: Callable[..., Any], write_folder: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
 ) -> Any:
     root = tmp_path_factory.mktemp("models")
-    write_folder(root / "gaze", _gaze_onnx())  # with config.pbtxt and SHA256SUMS, which the server compares
+    write_folder(root / "two_stage", _two_stage_onnx())  # with config.pbtxt and SHA256SUMS, which the server compares
     with grpc.insecure_channel(start_server(root).address) as channel:
         yield channel
 
 
 def _detect(channel: grpc.Channel, data: bytes, regions: list[pb.Region]) -> list[np.ndarray]:
     request = pb.DetectRequest(
-        models=[pb.ModelSelector(name="gaze")],
+        models=[pb.ModelSelector(name="two_stage")],
         encoded=data,
         camera=pb.Camera(camera_matrix=FRAME_K.ravel()),
         regions=regions,
@@ -135,10 +135,10 @@ def test_frames_of_another_camera(
 
 def test_the_same_tensor_over_kserve(channel: grpc.Channel, spot_image: Callable[..., np.ndarray]) -> None:
     stub = GRPCInferenceServiceStub(channel)
-    described = stub.ModelMetadata(inference.ModelMetadataRequest(name="gaze"), timeout=60)
+    described = stub.ModelMetadata(inference.ModelMetadataRequest(name="two_stage"), timeout=60)
     assert list(described.inputs[0].shape) == [-1, HEIGHT, WIDTH, 3]
     pixels = np.stack([spot_image(WIDTH, HEIGHT, u, 100, 6, 6, (255, 255, 255)) for u in (150, 300)])
-    request = inference.ModelInferRequest(model_name="gaze")
+    request = inference.ModelInferRequest(model_name="two_stage")
     request.inputs.add(name="image", datatype="UINT8", shape=pixels.shape)
     request.raw_input_contents.append(pixels.tobytes())
     answer = stub.ModelInfer(request, timeout=60)
