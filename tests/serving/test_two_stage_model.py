@@ -1,4 +1,4 @@
-"""A model as two-stage detectors are exported: a large input that is not square, sampled by GridSample inside the graph."""
+"""A two-stage detector as it is exported: a large input that is not square, sampled by GridSample inside the graph."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from curio_train.commands.command_line.running import answer
 from curio_train.config import ConvStack, NetworkConfig, Recipe, RunConfig
 from curio_train.errors import CheckpointError, ResumeMismatch, UsageError
 from curio_train.learning.loop import Outcome
@@ -332,6 +333,18 @@ def test_outside_training_a_signal_stops_at_once_and_handlers_are_put_back() -> 
     with pytest.raises(Interrupted), interruptible():
         signal.raise_signal(signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_signal_that_a_library_makes_an_error_of_is_still_a_signal(capsys: pytest.CaptureFixture[str]) -> None:
+    def trace(_: Interruption) -> int:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except Interrupted as exc:
+            raise TypeError("argument 'size' failed to unpack the object") from exc
+        return 0
+
+    assert answer(trace) == 128 + signal.SIGTERM
+    assert "stopped by SIGTERM" in capsys.readouterr().err
 
 
 def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, cache: Path) -> None:

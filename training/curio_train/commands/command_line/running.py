@@ -35,11 +35,20 @@ def answer(work: Callable[[Interruption], int]) -> int:
             console.print("error:", _missing_extra(exc), style="bold red", markup=False)
             return UsageError.exit_status
         except Interrupted as exc:
-            console.print(f"stopped by {exc}; whatever was saved before is intact", markup=False)
-            return exc.exit_status
+            return _stopped(console, exc)
         except BrokenPipeError:  # the reader of our output (head, less) has seen enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
+        except Exception:
+            # Libraries written in C++ make errors of their own of what is raised within them.
+            if interruption.signum is None:
+                raise
+            return _stopped(console, Interrupted(interruption.signum))
+
+
+def _stopped(console: Console, by: Interrupted) -> int:
+    console.print(f"stopped by {by}; whatever was saved before is intact", markup=False)
+    return by.exit_status
 
 
 def _missing_extra(exc: ModuleNotFoundError) -> str:
