@@ -11,13 +11,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from curio_train.commands.command_line.running import answer
 from curio_train.config import ConvStack, NetworkConfig, Recipe, RunConfig
 from curio_train.errors import CheckpointError, ResumeMismatch, UsageError
 from curio_train.learning.loop import Outcome
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import load_config, refuse_other
-from curio_train.learning.runs.interruption import Interrupted, Interruption, interruptible
+from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.provenance import SESSIONS, record_session, run_sessions
 from curio_train.learning.session import learn
 from curio_train.learning.state import TrainState
@@ -316,35 +315,6 @@ def test_another_configuration_is_refused_field_by_field(tmp_path: Path) -> None
 
 def test_budgets_may_be_given_anew(tmp_path: Path) -> None:
     refuse_other(CONFIG, replace(CONFIG, images=None, minutes=3.0, stop_below=5.0), tmp_path)
-
-
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_signals_wait_for_the_step_at_hand_and_a_second_one_does_not(signum: signal.Signals) -> None:
-    with interruptible() as interruption, interruption.deferred():
-        signal.raise_signal(signum)
-        assert interruption.signum == signum
-        with pytest.raises(Interrupted) as caught:
-            signal.raise_signal(signum)
-    assert caught.value.exit_status == 128 + signum
-
-
-def test_outside_training_a_signal_stops_at_once_and_handlers_are_put_back() -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(Interrupted), interruptible():
-        signal.raise_signal(signal.SIGTERM)
-    assert signal.getsignal(signal.SIGTERM) is before
-
-
-def test_a_signal_that_a_library_makes_an_error_of_is_still_a_signal(capsys: pytest.CaptureFixture[str]) -> None:
-    def trace(_: Interruption) -> int:
-        try:
-            signal.raise_signal(signal.SIGTERM)
-        except Interrupted as exc:
-            raise TypeError("argument 'size' failed to unpack the object") from exc
-        return 0
-
-    assert answer(trace) == 128 + signal.SIGTERM
-    assert "stopped by SIGTERM" in capsys.readouterr().err
 
 
 def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, cache: Path) -> None:

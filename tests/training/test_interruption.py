@@ -1,0 +1,36 @@
+"""Signals: training finishes its step first, everything else stops at once and in one line."""
+
+import signal
+
+import pytest
+from curio_train.commands.command_line.running import answer
+from curio_train.learning.runs.interruption import Interrupted, Interruption, interruptible
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_signals_wait_for_the_step_at_hand_and_a_second_one_does_not(signum: signal.Signals) -> None:
+    with interruptible() as interruption, interruption.deferred():
+        signal.raise_signal(signum)
+        assert interruption.signum == signum
+        with pytest.raises(Interrupted) as caught:
+            signal.raise_signal(signum)
+    assert caught.value.exit_status == 128 + signum
+
+
+def test_outside_training_a_signal_stops_at_once_and_handlers_are_put_back() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(Interrupted), interruptible():
+        signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_signal_that_a_library_makes_an_error_of_is_still_a_signal(capsys: pytest.CaptureFixture[str]) -> None:
+    def trace(_: Interruption) -> int:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except Interrupted as exc:
+            raise TypeError("argument 'size' failed to unpack the object") from exc
+        return 0
+
+    assert answer(trace) == 128 + signal.SIGTERM
+    assert "stopped by SIGTERM" in capsys.readouterr().err
