@@ -46,7 +46,6 @@ _IMAGES_AT_ONCE = 2  # that torch reads: eight images of eight objects take 13 G
 _CHECK_SEED = (20_210,)
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
-_NUM_NOISE = 1_000_003  # drawn values of jitter, shifted and repeated: drawing as many as layers have takes minutes
 _LEAST_STABLE = 0.25  # of the answers to check images
 
 
@@ -283,12 +282,9 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slot
 @contextmanager
 def _jittered_layers(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
     """Within the block every layer's output is jittered by about as much as another order of rounding changes it."""
-    noise = _LAYER_JITTER * torch.randn(_NUM_NOISE, generator=generator)
 
     def off(_layer: nn.Module, _given: object, output: Tensor) -> Tensor:
-        first = int(torch.randint(_NUM_NOISE, (1,), generator=generator))
-        repeated = noise.roll(first).repeat(-(-output.numel() // _NUM_NOISE))
-        return torch.addcmul(output, output, repeated[: output.numel()].view_as(output))
+        return output * (1 + _LAYER_JITTER * torch.randn(output.shape, generator=generator))
 
     layers = [module for module in network.modules() if module is not network and not list(module.children())]
     hooks = [layer.register_forward_hook(off) for layer in layers]

@@ -39,7 +39,7 @@ def answer(work: Callable[[Interruption], int]) -> int:
         except BrokenPipeError:  # the reader of our output (head, less) has seen enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
-        except Exception:
+        except (RuntimeError, TypeError):
             # Libraries written in C++ make errors of their own of what is raised within them.
             if interruption.signum is None:
                 raise
