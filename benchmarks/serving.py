@@ -18,8 +18,11 @@ p50_ms, p99_ms    latency at half the saturating rate, frames coming evenly, cou
 goodput_at_3x     good answers a second while three times the saturating rate is offered, over those at saturation;
                   ``tight_goodput_at_3x`` where calls have a deadline of 0.1 s instead of 1 s
 
-For the last two entries the server has one half of the cores and the load generator the other, so that making load does
+For the goodputs the server has one half of the cores and the load generator the other, so that making load does
 not pass for the server's weakness. ``offered_over_peak`` says what load was really made.
+
+objects8_frame_ms  CPU time a frame of models/lmo, which reads eight objects, served with one worker;
+                   ``bare_objects8_frame_ms`` of the bare loop
 
 With ``--peers``, other servers around the same decoding, warp and session stand beside ours under ``peers``, each with
 its version, the CPU time a request of all its processes, the answers a second at concurrency 4 with the load generator
@@ -31,6 +34,7 @@ import json
 import math
 import multiprocessing
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -56,6 +60,7 @@ from load.generator import (
     bare_cpu_ms,
     bare_latencies_ms,
     closed_loop,
+    closed_loop_of,
     make_frames,
     open_loop,
     pose_target,
@@ -66,6 +71,7 @@ from load.peers import all_peers, installed_version, prepare, running_peer
 _START_LIMIT_S = 60.0
 _WARM_UP_S = 2.0
 _TIGHT_DEADLINE_S = 0.1
+_OBJECTS8, _OBJECTS8_CALLS, _OBJECTS8_DEADLINE_S = Path("models/lmo"), 10, 60.0
 
 
 @dataclass(frozen=True)
@@ -93,6 +99,7 @@ def main() -> None:
         figures = {"ready_s": round(statistics.median(start_time_s(models) for _ in range(3)), 3)}
         figures |= cost(models, frames, arguments)
         figures |= limits(models, frames, arguments.seconds)
+        figures |= eight_objects(frames, arguments.seconds)
         if arguments.peers:
             figures["peers"] = beside_peers(models, frames, arguments.seconds)
     if arguments.json:
@@ -164,6 +171,22 @@ def limits(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any]:
         "codes_at_3x": flood["codes"],
         "reasons_at_3x": flood["reasons"],
     }
+
+
+def eight_objects(frames: list[bytes], seconds: float) -> dict[str, float]:
+    """CPU time a frame of the shipped model of eight objects, served and bare."""
+    core = sorted(os.sched_getaffinity(0))[:1]
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copytree(_OBJECTS8, Path(folder) / _OBJECTS8.name)
+        with running_server(Path(folder), core) as (address, pid), worker(core) as load:
+            target = pose_target(address, frames, pid, model=_OBJECTS8.name)
+            load(closed_loop_of, target, 1, 1, _OBJECTS8_DEADLINE_S)
+            before_s = cpu_s(pid)
+            load(closed_loop_of, target, 1, _OBJECTS8_CALLS, _OBJECTS8_DEADLINE_S)
+            served_ms = 1000 * (cpu_s(pid) - before_s) / _OBJECTS8_CALLS
+    with worker(core) as bare:
+        bare_ms = bare(bare_cpu_ms, _OBJECTS8, frames, 1, seconds)
+    return {"objects8_frame_ms": round(served_ms, 3), "bare_objects8_frame_ms": round(bare_ms, 3)}
 
 
 def beside_peers(models: Path, frames: list[bytes], seconds: float) -> dict[str, dict[str, Any]]:

@@ -118,11 +118,11 @@ class Target:
     processes: tuple[int, ...] = ()
 
 
-def pose_target(address: str, frames: list[bytes], *processes: int) -> Target:
+def pose_target(address: str, frames: list[bytes], *processes: int, model: str = MODEL) -> Target:
     """``Detect`` calls with these frames."""
     from curio_proto.v1.detector_pb2 import Camera, DetectRequest, ModelSelector
 
-    camera, models = Camera(camera_matrix=K.ravel()), [ModelSelector(name=MODEL)]
+    camera, models = Camera(camera_matrix=K.ravel()), [ModelSelector(name=model)]
     requests = [DetectRequest(models=models, camera=camera, encoded=frame).SerializeToString() for frame in frames]
     return Target(address, _METHOD, requests, processes)
 
@@ -132,9 +132,9 @@ def closed_loop(target: Target, concurrency: int, seconds: float) -> dict[str, A
     return asyncio.run(_closed_loop(target, concurrency, seconds))
 
 
-def closed_loop_of(target: Target, concurrency: int, num_calls: int) -> dict[str, int]:
+def closed_loop_of(target: Target, concurrency: int, num_calls: int, deadline_s: float = DEADLINE_S) -> dict[str, int]:
     """The same for that many calls; how many ended with each code."""
-    return asyncio.run(_closed_loop_of(target, concurrency, num_calls))
+    return asyncio.run(_closed_loop_of(target, concurrency, num_calls, deadline_s))
 
 
 def open_loop(target: Target, rate: float, seconds: float, deadline_s: float = DEADLINE_S) -> dict[str, Any]:
@@ -156,9 +156,9 @@ async def _closed_loop(target: Target, concurrency: int, seconds: float) -> dict
         return record.summary(time.perf_counter() - begun)
 
 
-async def _closed_loop_of(target: Target, concurrency: int, num_calls: int) -> dict[str, int]:
+async def _closed_loop_of(target: Target, concurrency: int, num_calls: int, deadline_s: float) -> dict[str, int]:
     async with grpc.aio.insecure_channel(target.address) as channel:
-        record = _Record(channel, target)
+        record = _Record(channel, target, deadline_s)
         numbers = iter(range(num_calls))
 
         async def caller() -> None:
