@@ -31,6 +31,18 @@ def test_a_network_that_computes_what_was_exported(folder: Path) -> None:
     assert load_version(folder, 1).version == 1
 
 
+def test_what_rounding_decides_is_not_compared(folder: Path) -> None:
+    golden = _golden(folder)
+    translation_m = np.array(golden["translation_m"])
+    translation_m[0, 0] = np.nan
+    np.savez(folder / "1" / "golden.npz", **golden | {"translation_m": translation_m})
+    assert load_version(folder, 1).version == 1
+    translation_m[0, 1] += 0.01
+    np.savez(folder / "1" / "golden.npz", **golden | {"translation_m": translation_m})
+    with pytest.raises(ModelError, match=r"translation_m is 0\.01 off"):
+        load_version(folder, 1)
+
+
 def test_another_networks_answer_is_refused_and_the_old_version_serves(folder: Path) -> None:
     repository = Repository(folder.parent)
     repository.refresh()

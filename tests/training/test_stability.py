@@ -22,7 +22,7 @@ def test_images_on_which_rounding_decides_can_tell_nothing() -> None:
     images = torch.zeros(8, 128, 128, 3, dtype=torch.uint8)
     images[:5, :, 64:] = 100
     assert numerically_stable(graph, images).tolist() == [[True]] * 5 + [[False]] * 3
-    with pytest.raises(ExportError, match=r"answers to 7 of 8 check images"):
+    with pytest.raises(ExportError, match=r"7 of the network's 8 answers to check images"):
         numerically_stable(graph, images[[0, 5, 6, 7, 5, 6, 7, 5]])
 
 
@@ -39,8 +39,7 @@ def test_each_object_of_an_image_is_judged_by_itself() -> None:
     images = torch.zeros(8, 128, 128, 3, dtype=torch.uint8)
     images[:1, :, 64:] = 100
     assert numerically_stable(graph, images).tolist() == [[True, True]] + [[False, True]] * 7
-    with pytest.raises(ExportError, match=r"answers to 7 of 7 check images"):
-        numerically_stable(graph, images[1:])
+    assert numerically_stable(graph, images[1:]).tolist() == [[False, True]] * 7
 
 
 class _Surer(torch.nn.Module):

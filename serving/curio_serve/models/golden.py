@@ -1,6 +1,7 @@
 """A version's golden image: the network's outputs where it was exported, to be compared with its outputs here.
 
-``golden.npz`` holds ``image``, uint8 [height, width, 3], and the outputs for it by name, without a batch.
+``golden.npz`` holds ``image``, uint8 [height, width, 3], and the outputs for it by name, without a batch. Entries that
+rounding decides on this image, such as the place of an object that it does not show, are nan and not compared.
 """
 
 import io
@@ -34,7 +35,9 @@ class Golden:
     """By name, without a batch; at least one."""
 
     def differences(self, model: Model) -> dict[str, float]:
-        """Largest absolute difference between each stored output and the model's; nan if either is not finite.
+        """Largest absolute difference between each stored output and the model's.
+
+        It is nan if the model's is not finite, or nothing of the stored one is.
 
         Raises:
             ModelError: The image cannot pass the graph, or an output is none of the graph's.
@@ -48,7 +51,14 @@ class Golden:
                 raise ModelError(
                     f"{self.path}: {name} {value.shape} is no output of the graph, which has {model.output_shapes}"
                 )
-        return {name: float(np.abs(found[name][0] - value).max(initial=0)) for name, value in self.outputs.items()}
+        return {name: _largest_difference(found[name][0], value) for name, value in self.outputs.items()}
+
+
+def _largest_difference(found: np.ndarray, stored: np.ndarray) -> float:
+    compared = np.isfinite(stored)
+    if not compared.any():
+        return float("nan")
+    return float(np.abs(found[compared] - stored[compared]).max())
 
 
 def read_golden(path: Path, model: Model) -> Golden:

@@ -23,6 +23,8 @@ from curio_train.worlds.base import World
 Predict = Callable[[Tensor], dict[str, Tensor]]
 """uint8 images [batch, 3, height, width] to their scene codes."""
 
+_PIXELS_AT_ONCE = 1 << 20  # three frames of 640x480
+
 
 @dataclass(frozen=True)
 class Subject:
@@ -87,7 +89,18 @@ def _reader(network: nn.Module) -> Predict:
         code: dict[str, Tensor] = network(images.float() / 255)
         return code
 
-    return predict
+    return _in_parts(predict)
+
+
+def _in_parts(predict: Predict) -> Predict:
+    """Read few images at once: crops of eight objects in twenty frames take 17 GB."""
+
+    def of_all(images: Tensor) -> dict[str, Tensor]:
+        num = max(1, _PIXELS_AT_ONCE // (images.shape[2] * images.shape[3]))
+        parts = [predict(part) for part in images.split(num)]
+        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+    return of_all
 
 
 def _from_model(file: Path, data: Path | None) -> Subject:
@@ -104,7 +117,7 @@ def model_reader(model: ExportedModel, world: World) -> Predict:
     def predict(images: Tensor) -> dict[str, Tensor]:
         return world.outputs.to_code(model(images.permute(0, 2, 3, 1).contiguous()))
 
-    return predict
+    return _in_parts(predict)
 
 
 def _config_of(model: ExportedModel, file: Path, data: Path | None) -> RunConfig:
