@@ -18,8 +18,8 @@ p50_ms, p99_ms    latency at half the saturating rate, frames coming evenly, cou
 goodput_at_3x     good answers a second while three times the saturating rate is offered, over those at saturation;
                   ``tight_goodput_at_3x`` where calls have a deadline of 0.1 s instead of 1 s
 
-For the goodputs the server has one half of the cores and the load generator the other, so that making load does
-not pass for the server's weakness. ``offered_over_peak`` says what load was really made.
+For these latencies and goodputs the server has one half of the cores and the load generator the other, so that making
+load does not pass for the server's weakness. ``offered_over_peak`` says what load was really made.
 
 objects8_frame_ms  CPU time a frame of models/lmo, which reads eight objects, served with one worker;
                    ``bare_objects8_frame_ms`` of the bare loop

@@ -1,10 +1,13 @@
 """Which answers of a network can tell whether a runtime computes the same."""
 
+import io
+
+import numpy as np
 import pytest
 import torch
 from curio_train.errors import ExportError
-from curio_train.export.graph import Graph, numerically_stable
-from curio_train.scene_code import TRANSLATION
+from curio_train.export.graph import Graph, _golden, numerically_stable
+from curio_train.scene_code import CONFIDENCE, LIGHT, TRANSLATION
 from curio_train.worlds.generated.circles import Circles
 
 
@@ -32,6 +35,23 @@ class _BrighterAndFixed(_Brighter):
     def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
         moved = super().forward(images)[TRANSLATION]
         return {TRANSLATION: torch.cat([moved, torch.ones_like(moved)], dim=1)}
+
+
+def test_golden_files_leave_out_what_rounding_decides() -> None:
+    graph = Graph(_BrighterAndFixed(), Circles())
+    images, stable = torch.zeros(2, 4, 4, 3, dtype=torch.uint8), torch.tensor([[False, False], [False, True]])
+    images[1] = 9
+    outputs = {TRANSLATION: torch.ones(2, 2, 3), CONFIDENCE: torch.ones(2, 2), LIGHT: torch.ones(2, 3)}
+    graph.of_scene = frozenset({LIGHT})
+    stored = dict(np.load(io.BytesIO(_golden(images, graph, stable, outputs))))
+    assert (stored.pop("image") == 9).all(), "the image with more stable answers"
+    assert stored.keys() == {TRANSLATION, CONFIDENCE}, "the light of a scene with unstable answers is left out"
+    assert np.isnan(stored[TRANSLATION][0]).all()
+    assert (stored[TRANSLATION][1] == 1).all()
+    assert np.isnan(stored[CONFIDENCE]).tolist() == [True, False]
+    whole = dict(np.load(io.BytesIO(_golden(images, graph, torch.ones_like(stable), outputs))))
+    assert whole.keys() == {"image", *outputs}
+    assert all(np.isfinite(whole[name]).all() for name in outputs)
 
 
 def test_each_object_of_an_image_is_judged_by_itself() -> None:

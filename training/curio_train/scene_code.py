@@ -4,7 +4,7 @@ A scene code is a mapping from field name to tensor: ``[batch, num_slots, size]`
 ``[batch, size]`` for per-scene ones. No code slices a vector by number; the layout names the fields.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -145,6 +145,11 @@ def detach(code: SceneCode) -> dict[str, Tensor]:
 def index(code: SceneCode, rows: Tensor | slice) -> dict[str, Tensor]:
     """The code of some images of the batch."""
     return {name: value[rows] for name, value in code.items()}
+
+
+def joined(codes: Sequence[SceneCode]) -> dict[str, Tensor]:
+    """The code of all images of several batches, at least one."""
+    return {name: torch.cat([code[name] for code in codes]) for name in codes[0]}
 
 
 def poses(code: SceneCode, slot: int = 0) -> list[Pose]:

@@ -55,7 +55,7 @@ class Golden:
 
 
 def _largest_difference(found: np.ndarray, stored: np.ndarray) -> float:
-    compared = np.isfinite(stored)
+    compared = ~np.isnan(stored)
     if not compared.any():
         return float("nan")
     return float(np.abs(found[compared] - stored[compared]).max())

@@ -23,7 +23,7 @@ from curio_train.learning.runs.provenance import machine
 from curio_train.metrics.calibration import auroc, calibration_error, reliability_bins
 from curio_train.metrics.poses import ADD_THRESHOLD
 from curio_train.refinement.predictions import with_refinement
-from curio_train.scene_code import CONFIDENCE, SceneCode, poses
+from curio_train.scene_code import CONFIDENCE, SceneCode, index, joined, poses
 from curio_train.worlds.base import Split, World
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.world import SingleObjectWorld
@@ -141,18 +141,11 @@ def draw(world: World, split: Split, num_images: int, cache: Path) -> HeldOut:
         num_images = min(num_images, len(source))
     batches = [source.batch(step, _BATCH_SIZE) for step in range(-(-num_images // _BATCH_SIZE))]
     images = torch.cat([(batch.images.clamp(0, 1) * 255).round().byte() for batch in batches])
-    codes = [batch.code for batch in batches if batch.code is not None]
-    code = {name: torch.cat([one[name] for one in codes])[:num_images] for name in codes[0]}
+    code = index(joined([batch.code for batch in batches if batch.code is not None]), slice(num_images))
     if not isinstance(world, SingleObjectWorld) or CONFIDENCE not in world.layout:
         return HeldOut(images[:num_images], code)
     behind = source.backgrounds(len(batches), _NUM_EMPTY)  # of steps that have not been drawn
     return HeldOut(images[:num_images], code, None if behind is None else (behind.clamp(0, 1) * 255).round().byte())
-
-
-def read(predict: Predict, images: Tensor) -> SceneCode:
-    """Scene codes of any number of images."""
-    batches = [predict(batch) for batch in images.split(_BATCH_SIZE)]
-    return {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
 
 
 def score(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, float]:
@@ -186,10 +179,10 @@ def _confidences(world: World, predicted: SceneCode, true: SceneCode) -> tuple[l
 
 
 def _scored(world: World, predict: Predict, held_out: HeldOut) -> tuple[SceneCode, dict[str, float]]:
-    predicted = read(predict, held_out.images)
+    predicted = predict(held_out.images)
     scores = score(world, predicted, held_out.code)
     if held_out.empty is not None:
-        scores |= calibration(world, predicted, held_out.code, read(predict, held_out.empty))
+        scores |= calibration(world, predicted, held_out.code, predict(held_out.empty))
     return predicted, scores
 
 

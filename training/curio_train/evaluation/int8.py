@@ -5,7 +5,7 @@ from pathlib import Path
 import onnx
 
 from curio_train.errors import ExportError
-from curio_train.evaluation.evaluate import draw, read
+from curio_train.evaluation.evaluate import draw
 from curio_train.evaluation.scores import accuracy
 from curio_train.evaluation.subject import Predict, model_reader
 from curio_train.export.graph import Reduce, Reduced
@@ -29,7 +29,7 @@ def int8(cache: Path) -> Reduce:
         quantised = to_int8(model, draw(world, "validation", NUM_CALIBRATION, cache).images)
         held_out = draw(world, "test", NUM_HELD_OUT, cache)
         before, after = (
-            accuracy(world, read(_reader(world, one), held_out.images), held_out.code) for one in (model, quantised)
+            accuracy(world, _reader(world, one)(held_out.images), held_out.code) for one in (model, quantised)
         )
         figures = f"accuracy on {len(held_out.images)} held-out renderings {after:.1%} in int8, {before:.1%} in float32"
         if after < before - LARGEST_LOSS:

@@ -17,11 +17,12 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, from_json
 from curio_train.learning.runs.provenance import run_sessions
 from curio_train.learning.state import TrainState
+from curio_train.scene_code import joined
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World
 
 Predict = Callable[[Tensor], dict[str, Tensor]]
-"""uint8 images [batch, 3, height, width] to their scene codes."""
+"""Any number of uint8 images [num, 3, height, width] to their scene codes."""
 
 _PIXELS_AT_ONCE = 1 << 20  # three frames of 640x480
 
@@ -97,8 +98,7 @@ def _in_parts(predict: Predict) -> Predict:
 
     def of_all(images: Tensor) -> dict[str, Tensor]:
         num = max(1, _PIXELS_AT_ONCE // (images.shape[2] * images.shape[3]))
-        parts = [predict(part) for part in images.split(num)]
-        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        return joined([predict(part) for part in images.split(num)])
 
     return of_all
 

@@ -31,7 +31,7 @@ from curio_train.learning.runs.initial import weights_file
 from curio_train.learning.runs.provenance import run_sessions
 from curio_train.networks.templates.trunk import Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
-from curio_train.scene_code import TRANSLATION
+from curio_train.scene_code import TRANSLATION, joined
 from curio_train.worlds import build
 from curio_train.worlds.base import World
 
@@ -110,8 +110,7 @@ class Graph(nn.Module):
 
     def in_parts(self, pixels: Tensor) -> dict[str, Tensor]:
         """The same, few images at once."""
-        parts = [self.read(part) for part in pixels.split(_IMAGES_AT_ONCE)]
-        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        return joined([self.read(part) for part in pixels.split(_IMAGES_AT_ONCE)])
 
     def where(self, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The stable answers, one a row: of objects, or of scenes whose every answer is stable."""
@@ -198,13 +197,13 @@ def export(
 def _golden(images: Tensor, graph: Graph, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> bytes:
     """The image with the most stable answers, and what onnxruntime made of it, by name, without a batch."""
     number = int(stable.sum(dim=1).argmax())
-    known = stable[number].numpy()
-    answers = {name: values[number].numpy() for name, values in outputs.items()}
-    for name in answers:
+    unknown, answers = ~stable[number], dict[str, np.ndarray]()
+    for name, values in outputs.items():
         if name not in graph.of_scene:
-            answers[name] = np.where(known.reshape(-1, *[1] * (answers[name].ndim - 1)), answers[name], np.nan)
-    if not known.all():
-        answers = {name: values for name, values in answers.items() if name not in graph.of_scene}
+            answers[name] = values[number].numpy().copy()
+            answers[name][unknown.numpy()] = np.nan
+        elif not unknown.any():
+            answers[name] = values[number].numpy()
     file = io.BytesIO()
     np.savez_compressed(file, allow_pickle=False, image=images[number].numpy(), **answers)
     return file.getvalue()

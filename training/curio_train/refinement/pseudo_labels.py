@@ -9,7 +9,7 @@ used.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Self
 
 import numpy as np
@@ -23,7 +23,7 @@ from curio_train.metrics.poses import symmetry_poses
 from curio_train.networks.crop_camera import cut_crops
 from curio_train.refinement.multi_view import Estimates, consensus_poses
 from curio_train.refinement.render_and_compare import RenderAndCompare
-from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, index
+from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, index, joined
 from curio_train.worlds.base import World
 from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
 from curio_train.worlds.single_object.crop_pose_stage import CROP_PX, FILL
@@ -156,7 +156,7 @@ def predict_and_refine(
     refiner: RenderAndCompare, frames: UInt8[Tensor, "num 3 height width"], predict: Callable[[Tensor], SceneCode]
 ) -> Estimates:
     """A network's predictions for photographs, and the same refined."""
-    predicted = _joined([predict(chunk.float() / 255) for chunk in frames.split(_BATCH_SIZE)])
+    predicted = joined([predict(chunk.float() / 255) for chunk in frames.split(_BATCH_SIZE)])
     return Estimates(predicted, *_refined(refiner, frames, predicted))
 
 
@@ -167,8 +167,4 @@ def _refined(
     """Refined poses, and where they were accepted."""
     batches = [slice(first, first + _BATCH_SIZE) for first in range(0, len(frames), _BATCH_SIZE)]
     parts = [refiner.refine(frames[batch], index(code, batch)) for batch in batches]
-    return _joined([part for part, _ in parts]), torch.cat([accepted for _, accepted in parts])
-
-
-def _joined(parts: Sequence[SceneCode]) -> dict[str, Tensor]:
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    return joined([part for part, _ in parts]), torch.cat([accepted for _, accepted in parts])

@@ -34,7 +34,6 @@ _TRUSTED, _DOUBTFUL = 0.9, 0.6
 _NAMES = ("own_view", "second_view")
 _AGREES = {"overlap": 0.75, "explained": 0.4}
 _NUM_IN_SPACE = 48
-_BATCH_SIZE = 50
 _DRAWN_AT_ONCE = 8  # frames of a camera are larger than images of a plane
 
 
@@ -85,7 +84,7 @@ def judge(world: World, predict: Predict) -> Judgement | None:
 
 def _on_plane(world: TabletopWorld, predict: Predict) -> Judgement:
     views = [view for view in (world.photographs.own, world.photographs.second) if view is not None]
-    code = _read(predict, views[0].photographs)
+    code = predict(views[0].photographs)
     drawn = [_drawn(world, number, code) for number in range(len(views))]
     agreed, *_ = _agreement(
         world, _certain(code), views[0].photographs.float() / 255, views[0].background_image.float() / 255
@@ -123,7 +122,7 @@ def _found(world: World, code: SceneCode) -> list[str]:
 def _in_space(
     world: World, predict: Predict, names: Sequence[str], photographs: Tensor, background_image: Tensor | None
 ) -> Judgement:
-    code = dict(_read(predict, (photographs * 255).round().byte()))
+    code = dict(predict((photographs * 255).round().byte()))
     if CONFIDENCE in code:  # drawn however unsure: whether it is right is the question
         code[CONFIDENCE] = torch.ones_like(code[CONFIDENCE])
     agreed, images, masks = _agreement(world, code, photographs, background_image)
@@ -177,11 +176,6 @@ def _means(numbers: Mapping[str, Tensor]) -> dict[str, float]:
 
 def _captions(numbers: Mapping[str, Tensor], order: Tensor) -> list[str]:
     return ["\n".join(f"{name} {values[row]:.2f}" for name, values in numbers.items()) for row in order.tolist()]
-
-
-def _read(predict: Predict, photographs: Tensor) -> SceneCode:
-    batches = [predict(batch) for batch in photographs.split(_BATCH_SIZE)]
-    return {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
 
 
 def _drawn(world: TabletopWorld, view: int, code: SceneCode) -> Tensor:

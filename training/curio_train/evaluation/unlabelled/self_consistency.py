@@ -40,7 +40,6 @@ from curio_train.worlds.single_object.world import Object, SingleObjectWorld
 
 _NEIGHBOURS = 4  # photographs before each that it is compared with: objects may be moved in longer times
 _FEWEST_PAIRS = 30
-_BATCH_SIZE = 10
 _NUM_POINTS = 300  # about so many vertices for ADD
 _LEAST = 1e-6  # nearer to 0 and 1 confidences say nothing
 _MOST_DEG = 180.0
@@ -90,8 +89,7 @@ def photographed_pairs(world: World, predict: Predict, photographs: UnlabelledPh
     objects, cameras = _objects(world), photographs.cameras
     assert cameras is not None
     frames = read_frames(photographs.paths, objects[0].camera, world.camera.width, world.camera.height)
-    chunks = [predict(chunk) for chunk in torch.from_numpy(frames).split(_BATCH_SIZE)]
-    code = {name: torch.cat([chunk[name] for chunk in chunks]) for name in chunks[0]}
+    code = predict(torch.from_numpy(frames))
     cam_from_world = Pose.from_matrix(cameras.cam_from_world)
     scene = Pose(cam_from_world.rotation, _scale(objects, cameras, code) * cam_from_world.translation_m)
     return [_pairs(one, slot, code, scene, cameras.known) for slot, one in enumerate(objects)]

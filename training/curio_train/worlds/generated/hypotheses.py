@@ -21,7 +21,7 @@ from jaxtyping import Float, Int, UInt8
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from curio_train.scene_code import COLOR, CONFIDENCE, TRANSLATION, YAW, index
+from curio_train.scene_code import COLOR, CONFIDENCE, TRANSLATION, YAW, index, joined
 from curio_train.worlds.generated.mesh_world import MeshWorld
 
 NUM_YAWS = 24
@@ -76,14 +76,14 @@ class GroundHypotheses:
     @torch.no_grad()
     def explain(self, images: UInt8[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """The scene codes found for images, with a confidence of 0 for slots whose object was not found."""
-        codes = [self._assigned(self._objects(image.float() / 255)) for image in images]
-        found = {name: torch.cat([code[name] for code in codes]) for name in codes[0]}
+        found = joined([self._assigned(self._objects(image.float() / 255)) for image in images])
         batches = range(0, len(images), _REFINED_AT_ONCE)
-        refined = [
-            self._refined(index(found, slice(n, n + _REFINED_AT_ONCE)), images[n : n + _REFINED_AT_ONCE])
-            for n in batches
-        ]
-        return {name: torch.cat([code[name] for code in refined]) for name in found}
+        return joined(
+            [
+                self._refined(index(found, slice(n, n + _REFINED_AT_ONCE)), images[n : n + _REFINED_AT_ONCE])
+                for n in batches
+            ]
+        )
 
     @torch.enable_grad()
     def _refined(self, code: dict[str, Tensor], images: Tensor) -> dict[str, Tensor]:
