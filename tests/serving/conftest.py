@@ -19,6 +19,7 @@ import numpy as np
 import onnx
 import pytest
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, Field, ModelSpec, ObjectModel
+from curio_serve.systems import STOP_SIGNALS
 from google.protobuf import json_format
 from onnx import TensorProto, helper, numpy_helper
 
@@ -251,6 +252,9 @@ class RunningServer:
 def start_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., RunningServer]]:
     """``start_server(models_dir, *flags)``: a real server on a free port of 127.0.0.1; ended after the tests."""
     running: list[RunningServer] = []
+    for number in STOP_SIGNALS:  # a run in the background (nohup, &) ignores some, and servers would inherit that
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
 
     def start(models: Path, *flags: str) -> RunningServer:
         log = tmp_path_factory.mktemp("server") / "log"
