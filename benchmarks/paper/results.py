@@ -6,7 +6,7 @@
                       seeds, images_seen, seconds, machine, commit, label_free, synthetic_labels}}}
 
 ``img`` is DSSIM from the novel view, ``para`` is Eq. 1; ``super_1.0`` is the reference of all ratios, and all rows of
-a world have seen as many images. Figures are means over the seeds.
+a world have seen as many images. Figures are means over the seeds; ``by_seed`` has each seed's.
 """
 
 import json
@@ -75,20 +75,27 @@ def _row(world: str, runs: Sequence[Mapping[str, Any]]) -> Row:
     by_seed = {
         "img": [run["metrics"]["novel_view_dssim"] for run in runs],
         "para": [run["metrics"]["scene_error"] for run in runs],
+        "seconds": [round(run["training_seconds"], 1) for run in runs],
+        **{name: [one[name] for one in parameters] for name in parameters[0]},
     }
     terms = METHODS[runs[0]["method"]]
     return {
-        **{name: mean(values) for name, values in by_seed.items()},
-        "per_parameter": {name: mean(one[name] for one in parameters) for name in parameters[0]},
+        **_means(by_seed),
         "by_seed": by_seed,
         "seeds": [run["seed"] for run in runs],
         "images_seen": runs[0]["images_seen"],
-        "seconds": round(mean(run["training_seconds"] for run in runs), 1),
         "machine": runs[0]["machine"],
         "commit": runs[-1]["commit"],
         "label_free": not terms.label,
         "synthetic_labels": terms.sleep,
     }
+
+
+def _means(by_seed: Mapping[str, Sequence[float]]) -> Row:
+    means = {name: mean(values) for name, values in by_seed.items()}
+    first = {name: means.pop(name) for name in ("img", "para")}
+    seconds = round(means.pop("seconds"), 1)
+    return {**first, "per_parameter": means, "seconds": seconds}
 
 
 def _parameters(metrics: Mapping[str, float]) -> dict[str, float]:
@@ -102,7 +109,8 @@ def _parameters(metrics: Mapping[str, float]) -> dict[str, float]:
 def merge(stored: Results, found: Results) -> Results:
     """Results with new rows in place of old ones, and all ratios.
 
-    A world's old rows stay where they have the new ones' budget and at least as many seeds where both have the row.
+    A world's old rows stay where they have the new ones' budget. Where both have the row, the old one's other seeds
+    are joined to the new one.
     """
     merged: Results = {}
     for world in (name for name in WORLDS if name in stored or name in found):
@@ -110,11 +118,31 @@ def merge(stored: Results, found: Results) -> Results:
         budget = {row["images_seen"] for row in rows.values()}
         for method, row in stored.get(world, {}).items():
             same_budget = not budget or row["images_seen"] in budget
-            if same_budget and (method not in rows or len(row["seeds"]) > len(rows[method]["seeds"])):
-                rows[method] = row
+            if same_budget:
+                rows[method] = _joined(row, rows[method]) if method in rows else row
         reference = rows.get(REFERENCE)
         merged[world] = {name: _with_ratios(rows[name], reference) for name in ORDER if name in rows}
     return merged
+
+
+def _joined(old: Row, new: Row) -> Row:
+    """The new row with the old one's other seeds; machine and commit are the new one's.
+
+    Old rows of several seeds that lack each seed's parameters cannot be taken apart: the row with more seeds stays.
+    """
+    others = [number for number, seed in enumerate(old["seeds"]) if seed not in new["seeds"]]
+    if not others:
+        return new
+    if not old["by_seed"].keys() >= new["by_seed"].keys():
+        return old if len(old["seeds"]) > len(new["seeds"]) else new
+    seeds = [*(old["seeds"][number] for number in others), *new["seeds"]]
+    by_seed = {
+        name: [*(old["by_seed"][name][number] for number in others), *values]
+        for name, values in new["by_seed"].items()
+    }
+    order = sorted(range(len(seeds)), key=seeds.__getitem__)
+    by_seed = {name: [values[number] for number in order] for name, values in by_seed.items()}
+    return {**new, **_means(by_seed), "by_seed": by_seed, "seeds": sorted(seeds)}
 
 
 def _with_ratios(row: Row, reference: Row | None) -> Row:

@@ -87,6 +87,25 @@ def test_a_row_of_fewer_seeds_does_not_replace_one_of_more() -> None:
     assert merge(old, new)["spheres"]["our"]["para"] == 9.0
 
 
+def test_other_seeds_are_joined_to_a_row() -> None:
+    rows = merge({}, collect([evaluation("our", metrics={"position_mm": 600.0})]))
+    for seed in (2, 1):  # one after another, each merged into what was stored
+        rows = merge(rows, collect([evaluation("our", seed, training_seconds=9.0 + seed)]))
+    our = rows["spheres"]["our"]
+    assert (our["seeds"], our["by_seed"]["seconds"]) == ([0, 1, 2], [9.0, 10.0, 11.0])
+    assert our["per_parameter"]["position_m"] == pytest.approx(0.4)
+    assert our["by_seed"]["position_m"] == pytest.approx([0.6, 0.3, 0.3])
+    assert our["seconds"] == 10.0
+
+
+def test_rows_of_seeds_that_cannot_be_taken_apart_stay_unless_others_are_more() -> None:
+    old = merge({}, collect([evaluation("our", seed, metrics={"scene_error": 9.0}) for seed in range(2)]))
+    old["spheres"]["our"]["by_seed"] = {"img": [0.1, 0.1], "para": [9.0, 9.0]}
+    assert merge(old, collect([evaluation("our", 2)]))["spheres"]["our"]["seeds"] == [0, 1]
+    new = merge(old, collect([evaluation("our", seed) for seed in (1, 2, 3)]))
+    assert new["spheres"]["our"]["seeds"] == [1, 2, 3]
+
+
 def test_tables_show_ours_beside_the_papers(tmp_path: Path) -> None:
     runs = [evaluation("super"), evaluation("our", metrics={"scene_error": 3.0}), evaluation("wake_sleep")]
     results = merge({}, collect(runs))
@@ -126,7 +145,7 @@ def command(folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_command_fills_the_table_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    flags = ["--only", "circles", "--methods", "super_1.0", "noncur", "--images", "64", "--seeds", "1"]
+    flags = ["--only", "circles", "--methods", "super_1.0", "noncur", "--images", "64", "--seeds", "0"]
     busy = tmp_path / "runs" / "circles-laptop-64" / "noncur-0.log"
     busy.parent.mkdir(parents=True)
     with busy.open("wb") as log:

@@ -8,12 +8,16 @@ from typing import Any
 
 import numpy as np
 import onnx
+import onnx_ir as ir
 import torch
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve.models.model import INPUT
 from curio_serve.models.spec import SPEC_KEY
 from google.protobuf import json_format
 from onnx import TensorProto, helper, numpy_helper
+from onnx_ir.passes import common as passes
+from onnxscript import optimizer, rewriter
+from onnxscript.rewriter.rules.common import materialize_reshape_shape_rule
 from torch import nn
 
 OPSET = 18
@@ -44,12 +48,36 @@ def to_onnx(network: nn.Module, width: int, height: int, outputs: Sequence[str])
             dynamo=True,
             external_data=False,
             verbose=False,
+            optimize=False,
         )
     assert program is not None  # with dynamo there always is one
+    _simplify(program.model)
     model: onnx.ModelProto = program.model_proto
     _strip(model)
     onnx.checker.check_model(model)
     return model
+
+
+def _simplify(model: ir.Model) -> None:
+    """Fold what is constant, and drop what is there twice or unused.
+
+    The exporter's own optimiser also tries rewrite rules, some of which compare each node with every other: ten minutes
+    for the thousands of nodes of template networks. Runtimes fuse nodes themselves. One rule is needed: where only the
+    batch is free, the shape of a Reshape becomes a constant, so that the crop-pose stage does not read its batch from
+    the whole image.
+    """
+    optimizer.inline(model)
+    optimizer.fold_constants(model)
+    rewriter.rewrite(model, pattern_rewrite_rules=[materialize_reshape_shape_rule])
+    for simplify in (
+        passes.RemoveUnusedNodesPass(),
+        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
+        passes.DeduplicateInitializersPass(),
+        passes.CommonSubexpressionEliminationPass(),
+        passes.OutputFixPass(),
+        passes.NameFixPass(),
+    ):
+        simplify(model)
 
 
 @contextmanager
@@ -68,9 +96,10 @@ def _quiet() -> Iterator[None]:
 
 
 def _strip(model: onnx.ModelProto) -> None:
-    """Drop the exporter's notes: stack traces with this machine's paths among them."""
+    """Drop the exporter's notes, stack traces with this machine's paths among them, and shapes that runtimes infer."""
     graph = model.graph
-    parts: list[Any] = [model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer]
+    del graph.value_info[:]
+    parts: list[Any] = [model, graph, *graph.node, *graph.input, *graph.output, *graph.initializer]
     for part in parts:
         del part.metadata_props[:]
         part.ClearField("doc_string")
