@@ -1,6 +1,7 @@
 """The paper's Tables 2 and 3: every method in every world, run by run, as far as they are not there yet.
 
-    python benchmarks/results.py [--only circles spheres] [--methods our noncur] [--images N] [--seeds 0 1 2] [--jobs 2] [--dry-run]
+    python benchmarks/results.py [--only circles spheres] [--methods our noncur] [--images N] [--seeds 0 1 2]
+                                 [--jobs 2] [--dry-run]
 
 Each run is trained and scored in a folder of its own under ``runs/results``; after each, docs/results/worlds.json,
 worlds.md and worlds.png are written anew. Stop it at any time: the same command goes on where it stopped, in the middle

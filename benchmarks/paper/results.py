@@ -137,8 +137,7 @@ def _joined(old: Row, new: Row) -> Row:
         return old if len(old["seeds"]) > len(new["seeds"]) else new
     seeds = [*(old["seeds"][number] for number in others), *new["seeds"]]
     by_seed = {
-        name: [*(old["by_seed"][name][number] for number in others), *values]
-        for name, values in new["by_seed"].items()
+        name: [*(old["by_seed"][name][number] for number in others), *values] for name, values in new["by_seed"].items()
     }
     order = sorted(range(len(seeds)), key=seeds.__getitem__)
     by_seed = {name: [values[number] for number in order] for name, values in by_seed.items()}

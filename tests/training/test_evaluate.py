@@ -16,6 +16,7 @@ from curio_train.data.bop import ModelInfo
 from curio_train.errors import CurioError, DataError, ExportError, UsageError
 from curio_train.evaluation.evaluate import draw, evaluate, score
 from curio_train.evaluation.real_frames import evaluate_real_frames
+from curio_train.evaluation.repeated import reading_repeatedly
 from curio_train.evaluation.reporting.tables import print_evaluation
 from curio_train.evaluation.scores import pose_scores, rotation_errors_deg
 from curio_train.evaluation.subject import Subject
@@ -176,6 +177,18 @@ def test_real_frames_are_scored_where_bop_asks(data: Path, tmp_path: Path) -> No
         assert np.array(row[4].split(), float) == pytest.approx(np.eye(3).ravel(), abs=1e-3)
         assert np.array(row[5].split(), float) == pytest.approx([0, 0, 800], abs=0.5)
         assert float(row[6]) > 0
+
+
+def test_what_agrees_in_several_reads_is_scored(data: Path) -> None:
+    """Whatever the camera: an object that is always read there is where the mean of the looks is."""
+    world = build(LinemodOptions("ape", data, gaze=False))
+    subject = reading_repeatedly(always_at(world, [0.0, 0.0, 0.8]), 5)
+    images = torch.zeros(2, 3, world.camera.height, world.camera.width, dtype=torch.uint8)
+    code = subject.predict(images)
+    assert code[TRANSLATION].shape == (2, 1, 3)
+    np.testing.assert_allclose(code[TRANSLATION][0, 0], [0, 0, 0.8], atol=0.01)
+    with pytest.raises(UsageError, match="--reads: 10 reads of an image: expected 1 to 9"):
+        reading_repeatedly(subject, 10)
 
 
 def test_visible_targets_are_left_out_where_nothing_is_known_of_them(data: Path) -> None:

@@ -181,6 +181,7 @@ def _settings(arguments: DetectArguments) -> "Settings":
         arguments.track_objects if arguments.track else None,
         arguments.frame_rate,
         arguments.max_instances,
+        arguments.reads,
     )
 
 
@@ -223,6 +224,8 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
             )
         if arguments.provider != DetectArguments.provider:
             raise UsageError(f"--provider {arguments.provider}: found a model on a server, which chooses its own")
+        if arguments.reads != 1:
+            raise UsageError(f"--reads {arguments.reads}: found a model on a server, which reads an image once")
         found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
     return found
 

@@ -60,6 +60,8 @@ class Settings:
     """Frames per second of images that carry no time."""
     max_instances: int | None = None
     """Largest number of instances of each kind of object; None: as many as one run of the network gives."""
+    num_reads: int = 1
+    """How often each image is read, by models on this machine."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +235,7 @@ class LocalEstimator(Estimator):
 
     def __init__(self, model: Model, settings: Settings) -> None:
         super().__init__(model.name, model.version, model.spec, settings)
-        self._detector = Detector(model)
+        self._detector = Detector(model, settings.num_reads)
         self._following, self._stream, self._num_frames = FollowingStream(), "", 0
 
     def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> Seen:

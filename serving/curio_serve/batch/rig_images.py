@@ -108,6 +108,7 @@ def read_rig(arguments: DetectArguments, models: Sequence[str]) -> list[RigCamer
         "--track": arguments.track,
         "--exif-rotation": arguments.exif_rotation,
         "--max-instances": arguments.max_instances,
+        "--reads": arguments.reads != 1,
         "--refine": arguments.refine,
     }
     if wrong := [flag for flag, value in given.items() if value]:

@@ -22,6 +22,7 @@ from curio_serve.models.crop_stage import CropPose
 from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Values
 from curio_serve.models.model import Model, Slot
 from curio_serve.models.reliability import add_interval, calibrated, region_status, status_of
+from curio_serve.models.repeated import RepeatedReader
 
 if TYPE_CHECKING:
     from google.protobuf.internal.containers import RepeatedCompositeFieldContainer
@@ -49,8 +50,18 @@ class Detector:
     depths_m: tuple[float, float]
     """Smallest and largest depth that the model was trained for, see :func:`trained_depths_m`."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, num_reads: int = 1) -> None:
+        """Take a model.
+
+        Args:
+            model: Any.
+            num_reads: How often each image is read, see :mod:`curio_serve.models.repeated`.
+
+        Raises:
+            UsageError: The model cannot read an image more than once, or not that often.
+        """
         self.model = model
+        self._run = model.run if num_reads == 1 else RepeatedReader(model.spec, model.run, num_reads)
         self.depths_m = trained_depths_m(model.spec)
         self._calibration = tuple(model.spec.reliability.calibration)
 
@@ -142,7 +153,7 @@ class Detector:
         for start in range(0, len(images), _MAX_BATCH):
             before_run()
             batch = images[start : start + _MAX_BATCH]
-            found = self.model.run(batch[0][None] if len(batch) == 1 else np.stack(batch))
+            found = self._run(batch[0][None] if len(batch) == 1 else np.stack(batch))
             rows = zip(*[value.tolist() for value in found.values()], strict=True)
             outputs += [dict(zip(found, row, strict=True)) for row in rows]
         return [self._calibrated(values) for values in outputs]

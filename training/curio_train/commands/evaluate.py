@@ -33,6 +33,8 @@ class EvaluateCommand:
     """Folder for a results file of the real frames in BOP's format."""
     refine: FlagCreatePairsOff[bool] = False
     """Score the poses once more after rendering and comparing; needs the renderer, as serving never does."""
+    reads: int = 1
+    """Read each image that many times, as curio-detect --reads does."""
     json: FlagCreatePairsOff[bool] = False
     """Print the result as one JSON object on the last line."""
     cache: Path = CACHE
@@ -51,7 +53,8 @@ def _evaluate(command: EvaluateCommand) -> int:
 
     if command.download and command.data is None:
         command = replace(command, data=fetched_linemod(command.cache, report, ask=False, frames=True))
-    given = {name: getattr(command, name) for name in ("split", "num_images", "data", "bop_results", "refine", "cache")}
+    names = ("split", "num_images", "data", "bop_results", "refine", "reads", "cache")
+    given = {name: getattr(command, name) for name in names}
     with Console(stderr=True).status("") as status:
         result = evaluate(command.path, **given, progress=status.update, warn=warn)
     print_evaluation(result, Console())

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from curio_train.errors import DataError, ReportError, UsageError
 from curio_train.evaluation.real_frames import evaluate_real_frames
+from curio_train.evaluation.repeated import reading_repeatedly
 from curio_train.evaluation.reporting.report import write_report
 from curio_train.evaluation.results import keep
 from curio_train.evaluation.scores import add_errors, pose_scores, scene_errors, scene_scores
 from curio_train.evaluation.several_objects import several_objects_scores
 from curio_train.evaluation.subject import Predict, Subject, load_subject
-from curio_train.evaluation.unlabelled.photographed import judge
+from curio_train.evaluation.unlabelled.photographed import Judgement, judge
 from curio_train.export.card import EVALUATION_FILE
 from curio_train.learning.runs.configuration import CONFIG_FILE, world_name
 from curio_train.learning.runs.initial import uses_synthetic_labels
@@ -56,6 +57,7 @@ def evaluate(
     data: Path | None = None,
     bop_results: Path | None = None,
     refine: bool = False,
+    reads: int = 1,
     cache: Path,
     progress: Callable[[str], None] = lambda text: None,
     warn: Callable[[str], None] = lambda text: None,
@@ -70,6 +72,7 @@ def evaluate(
         data: A BOP data set whose real frames are scored as well, in the LineMOD world.
         bop_results: Folder for a results file of those frames in BOP's format.
         refine: Score the poses once more after :class:`~curio_train.refinement.render_and_compare.RenderAndCompare`.
+        reads: How often each image is read, see :mod:`curio_serve.models.repeated`.
         cache: Where worlds keep their image sets.
         progress: Told what is being done.
         warn: Told why photographs could not be judged by, or a report not written: no evaluation is thrown away for
@@ -89,14 +92,15 @@ def evaluate(
     if bop_results is not None and data is None:
         raise UsageError("--bop-results needs the real frames: give --data DIR")
     subject = load_subject(path, data)
-    if data is not None and not isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld):
+    has_whole_frames = isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld)
+    if data is not None and not has_whole_frames:
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
-    if num_images is None:
-        num_images = QUICK if isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld) else ALL
+    subject = subject if reads == 1 else reading_repeatedly(subject, reads)
+    num_images = num_images or (QUICK if has_whole_frames else ALL)
     better = _refining(subject) if refine else None
     progress(f"{num_images} images of the {split} split")
     held_out = draw(subject.world, split, num_images, cache)
-    result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images)}
+    result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images), "reads": reads}
     progress("the network")
     predicted, result["metrics"] = _scored(subject.world, subject.predict, held_out)
     if held_out.empty is not None:
@@ -111,12 +115,8 @@ def evaluate(
         result["refined"] = {"metrics": _scored(better.world, better.predict, held_out)[1]}
         if data is not None:
             result["refined"]["real"] = evaluate_real_frames(better, data, bop_results, "-refined")
-    judgement = None
-    try:
-        if (judgement := judge(subject.world, subject.predict)) is not None:
-            result["photographs"] = judgement.summary
-    except DataError as exc:  # photographs that have moved since; the scores need none
-        warn(f"not judged by photographs: {exc}")
+    if (judgement := _judged(subject, warn)) is not None:
+        result["photographs"] = judgement.summary
     if (path / CONFIG_FILE).exists():
         keep(path / EVALUATION_FILE, result)
         progress("the report")
@@ -126,6 +126,15 @@ def evaluate(
         except ReportError as exc:
             warn(str(exc))
     return result
+
+
+def _judged(subject: Subject, warn: Callable[[str], None]) -> Judgement | None:
+    """What photographs say of the network; None: there are none, or they have moved since, and the scores need none."""
+    try:
+        return judge(subject.world, subject.predict)
+    except DataError as exc:
+        warn(f"not judged by photographs: {exc}")
+        return None
 
 
 def _refining(subject: Subject) -> Subject:

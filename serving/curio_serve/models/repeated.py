@@ -1,0 +1,94 @@
+"""Reads an image several times through slightly different cameras, and answers the pose on which most reads agree.
+
+As many runs of the network as reads. The mean of reads that agree is nearer to the truth than any of them, because
+each is misled by other pixels; and how many agree says more about a pose than the network's confidence does.
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from curio_proto.v1.model_spec_pb2 import ModelSpec
+
+from curio_serve.consensus.poses import angles_deg, mean_rotation
+from curio_serve.errors import UsageError
+from curio_serve.imaging.looks import LOOKS
+from curio_serve.models.symmetries import symmetry_rotations
+
+Array = np.ndarray
+Outputs = Mapping[str, Array]
+MAX_READS = len(LOOKS)
+_SAME_ROTATION_DEG = 25.0
+_SAME_PLACE = 0.5  # diameters
+
+
+class RepeatedReader:
+    """Runs a network once for each look; safe to share between threads as the network is."""
+
+    def __init__(self, spec: ModelSpec, run: Callable[[Array], Outputs], num_reads: int) -> None:
+        """Choose the looks.
+
+        Args:
+            spec: Of the model: K*, and one slot an object.
+            run: Outputs by name, [batch, ...], for uint8 RGB images [batch, height, width, 3].
+            num_reads: 2 to :data:`MAX_READS`.
+
+        Raises:
+            UsageError: The number is out of range, or the model is of a flat world, without rotations, or with several
+                slots an object, whose reads cannot be told apart.
+        """
+        if not 2 <= num_reads <= MAX_READS:
+            raise UsageError(f"{num_reads} reads of an image: expected 1 to {MAX_READS}")
+        has_rotation = any(field.name in ("rotation", "rotation_6d") for field in spec.fields)
+        if not spec.camera.camera_matrix or not has_rotation or any(len(kind.slots) != 1 for kind in spec.objects):
+            raise UsageError(
+                f"model {spec.name} cannot read an image more than once: that needs a camera in space, rotations, and "
+                "one answer an object; leave out --reads"
+            )
+        self._run, self._looks = run, LOOKS[:num_reads]
+        self._matrix = np.reshape(list(spec.camera.camera_matrix), (3, 3))
+        kinds = sorted(spec.objects, key=lambda kind: kind.slots[0])
+        self._symmetries = [symmetry_rotations(kind) for kind in kinds]
+        self._diameters_m = [kind.diameter_m for kind in kinds]
+
+    def __call__(self, images: Array) -> Outputs:
+        """Outputs of the network's names for uint8 RGB images [batch, height, width, 3], float32 [batch, ...]."""
+        reads = []
+        for look in self._looks:
+            seen = np.stack([look.image(pixels, self._matrix) for pixels in images])
+            reads.append({name: np.array(values, float) for name, values in self._run(seen).items()})
+            self._bring_back(reads[-1], len(reads) - 1)
+        rows = [[{name: values[row] for name, values in read.items()} for read in reads] for row in range(len(images))]
+        agreed = [self._agreed(of_image) for of_image in rows]
+        return {name: np.stack([one[name] for one in agreed]).astype(np.float32) for name in agreed[0]}
+
+    def _bring_back(self, read: dict[str, Array], number: int) -> None:
+        """Put the poses and the light of a look into the camera's frame."""
+        look = self._looks[number]
+        for row, positions in enumerate(read["translation_m"]):
+            for slot, position in enumerate(positions):
+                found = look.back(read["rotation"][row, slot], position)
+                read["rotation"][row, slot], positions[slot] = found
+        if "light" in read:
+            read["light"] = read["light"] @ look.look_from_cam
+
+    def _agreed(self, reads: list[dict[str, Array]]) -> dict[str, Array]:
+        """The outputs of one image."""
+        confidence = np.stack([read.get("confidence", np.ones(len(self._symmetries))) for read in reads])
+        rotation, position = (np.stack([read[name] for read in reads]) for name in ("rotation", "translation_m"))
+        found = {name: np.mean([read[name] for read in reads], axis=0) for name in reads[0]}
+        for slot, symmetries in enumerate(self._symmetries):
+            angle, turned = angles_deg(rotation[:, None, slot], rotation[:, slot], symmetries)
+            apart = np.linalg.norm(position[:, None, slot] - position[:, slot], axis=-1) / self._diameters_m[slot]
+            agree = (angle < _SAME_ROTATION_DEG) & (apart < _SAME_PLACE)
+            best = int((confidence[:, slot] @ agree).argmax())
+            members = np.flatnonzero(agree[:, best])
+            alike = rotation[members, slot] @ symmetries[turned[members, best]]
+            found["rotation"][slot] = mean_rotation(alike)
+            found["translation_m"][slot] = position[members, slot].mean(axis=0)
+            if "confidence" in found:
+                found["confidence"][slot] = confidence[members, slot].sum() / len(reads)
+            if "color" in found:
+                found["color"][slot] = np.mean([reads[member]["color"][slot] for member in members], axis=0)
+        if "rotation_6d" in found:
+            found["rotation_6d"] = np.concatenate([found["rotation"][..., 0], found["rotation"][..., 1]], axis=-1)
+        return found
