@@ -7,7 +7,7 @@ import trimesh
 from curio_train.meshes.meshes import Mesh
 from curio_train.networks.templates.alignment import Aligned
 from curio_train.networks.templates.bank import NUM_OUTLINE_POINTS
-from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_VIEWS, Geometry, viewpoints
+from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry, num_views, viewpoints
 from curio_train.networks.templates.outline import outline_log_factor
 from curio_train.templates.outline import outlines
 from torch import Tensor
@@ -52,8 +52,8 @@ def test_outlines_of_a_ball_are_great_circles_across_the_line_of_sight() -> None
     matrix = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
     geometry = Geometry(matrix, 640, 480, 0.1, 0.5, 1.5)
     found = outlines(mesh, geometry)
-    assert found.points.shape == found.outward.shape == (NUM_VIEWS, NUM_OUTLINE_POINTS, 3)
-    line_of_sight = viewpoints(NUM_VIEWS, 1)[:, None, 2]
+    assert found.points.shape == found.outward.shape == (num_views(False), NUM_OUTLINE_POINTS, 3)
+    line_of_sight = viewpoints(num_views(False), 1)[:, None, 2]
     assert (found.outward * line_of_sight).sum(dim=2).abs().max() < 1e-5
     across = found.points - (found.points * line_of_sight).sum(dim=2, keepdim=True) * line_of_sight
     pixel = 1 / (FILL * CROP_PX)  # in diameters

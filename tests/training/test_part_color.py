@@ -17,7 +17,7 @@ from curio_train.errors import UsageError
 from curio_train.scene_code import COLOR, CONFIDENCE
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object.base_colors import any_base_color, base_colors_near
+from curio_train.worlds.single_object.base_colors import any_base_color, base_colors_near, srgb_of
 
 WIDTH, HEIGHT = 160, 120
 SRGB = {"red": (0.78, 0.2, 0.16), "pale": (0.8, 0.78, 0.7), "black": (0.08, 0.08, 0.1), "teal": (0.1, 0.5, 0.5)}
@@ -121,19 +121,19 @@ def test_a_part_that_has_colours_takes_no_paint(folder: Path) -> None:
 
 
 def test_paint_is_drawn_about_its_colour_and_now_and_then_anywhere() -> None:
-    drawn = base_colors_near("#8a6f4c")(2000, np.random.default_rng(0))
+    drawn = base_colors_near(srgb_of("#8a6f4c"))(2000, np.random.default_rng(0))
     assert drawn.shape == (2000, 1, 3)
-    assert torch.equal(drawn, base_colors_near("8a6f4c")(2000, np.random.default_rng(0)))
+    assert torch.equal(drawn, base_colors_near(srgb_of("8a6f4c"))(2000, np.random.default_rng(0)))
     tints = drawn / drawn.amax(-1, keepdim=True)
     near = (tints - torch.tensor([0x8A, 0x6F, 0x4C]) / 0x8A).abs().amax(-1)[:, 0] < 0.2
     assert 0.8 < near.double().mean() < 0.95
     values = drawn[near].amax(-1)
     assert values.min() < 0.65 * 0x8A / 255
     assert values.max() > 1.4 * 0x8A / 255
-    black = base_colors_near("#000000")(200, np.random.default_rng(0))
+    black = base_colors_near(srgb_of("#000000"))(200, np.random.default_rng(0))
     assert (black.amax(-1) <= 0.08).double().mean() > 0.7
     anything = any_base_color(2000, np.random.default_rng(0))
     assert anything.amin() < 0.05 < 0.95 < anything.amax()
     for wrong in ("red", "#12345", "#1122334"):
         with pytest.raises(UsageError, match="#8a6f4c"):
-            base_colors_near(wrong)
+            srgb_of(wrong)

@@ -1,6 +1,7 @@
 """Templates on frozen features: what needs no renderer."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,22 +10,25 @@ import pytest
 import torch
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.export.onnx import to_onnx
-from curio_train.networks.crop_camera import cut_crops
+from curio_train.geometry import random_rotations
+from curio_train.networks.crop_camera import about_axis, cut_crops
 from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, Bank
 from curio_train.networks.templates.bank import RANK as BANK_RANK
 from curio_train.networks.templates.descriptors import Descriptors
-from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, NUM_VIEWS, Geometry, viewpoints
+from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, QUARTER_TURNS, Geometry, num_views, viewpoints
 from curio_train.networks.templates.localiser import RANK, Localiser
 from curio_train.networks.templates.network import STEPS, TemplateNetwork
 from curio_train.networks.templates.rolls import ROLLS_DEG, upright_rolls
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
+from curio_train.scene_code import COLOR
 from curio_train.templates.build import template_network
 from curio_train.worlds import build
 from curio_train.worlds.options import CirclesOptions
 
 MATRIX = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
 GEOMETRY = Geometry(MATRIX, 640, 480, 0.2, 0.5, 1.5)
+FROM_ANY_SIDE = replace(GEOMETRY, any_side=True)
 
 
 def test_the_trunk_says_the_same_of_an_image_wherever_it_is_in_a_batch() -> None:
@@ -60,6 +64,19 @@ def test_viewpoints_are_rotations_of_the_upper_hemisphere() -> None:
     assert (torch.linalg.det(found) > 0).all()
     camera_height = -(found[:, 2, 2])  # the camera looks along the third row, from above downwards
     assert (camera_height > 0).all()
+
+
+def test_any_rotation_is_near_a_template_in_one_of_the_quarter_turns() -> None:
+    random = random_rotations(300, np.random.default_rng(0))
+    quarters = [about_axis(torch.tensor(turn)) for turn in ([1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0])]
+    assert len(quarters) == QUARTER_TURNS
+    templates = FROM_ANY_SIDE.rotations.flatten(1)
+    angles = [((turn @ random).flatten(1) @ templates.T).amax(dim=1) for turn in quarters]
+    nearest = ((torch.stack(angles).amax(dim=0) - 1) / 2).clamp(-1, 1).acos().rad2deg()
+    assert nearest.max() < 16
+    upright = viewpoints(220, NUM_ROLLS).flatten(1)
+    below = ((random[random[:, 2, 2] > 0.5].flatten(1) @ upright.T).amax(dim=1) - 1) / 2
+    assert below.acos().rad2deg().min() > 16  # which those of the upper hemisphere are not for what is seen from below
 
 
 def test_crops_are_rolled_until_objects_stand_as_in_templates() -> None:
@@ -127,18 +144,19 @@ def test_the_localiser_finds_the_template_it_holds() -> None:
     assert float(found.score[0, 0]) > 0.9
 
 
-def _random_network(steps: tuple[int, int, int] = STEPS) -> TemplateNetwork:
-    network, random = TemplateNetwork(GEOMETRY, steps), torch.Generator().manual_seed(0)
+def _random_network(steps: tuple[int, int, int] = STEPS, geometry: Geometry = GEOMETRY) -> TemplateNetwork:
+    random = torch.Generator().manual_seed(0)
+    network = TemplateNetwork(geometry, steps, has_color=geometry.any_side)
     network.trunk.load_state_dict(Trunk.pretrained().state_dict())
     for name, buffer in (*network.localiser.named_buffers(), *network.reader.banks.named_buffers()):
         if buffer.is_floating_point() and name.startswith(("filters", "weights")):
             buffer.copy_(torch.randn(buffer.shape, generator=random) * 0.05)
-    network.reader.banks.put(0, _random_bank(random))
+    network.reader.banks.put(0, _random_bank(random, num_views(geometry.any_side)))
     return network
 
 
-def _random_bank(random: torch.Generator) -> Bank:
-    coarse, num, cells = Descriptors(COARSE_WIDTH, COARSE_SIZE), NUM_VIEWS * NUM_ROLLS, CROP_PX // COARSE_STRIDE
+def _random_bank(random: torch.Generator, views: int) -> Bank:
+    coarse, num, cells = Descriptors(COARSE_WIDTH, COARSE_SIZE), views * NUM_ROLLS, CROP_PX // COARSE_STRIDE
     return Bank(
         coarse,
         Descriptors(FINE_WIDTH, FINE_WIDTH),
@@ -146,18 +164,23 @@ def _random_bank(random: torch.Generator) -> Bank:
         torch.randn(num, BANK_RANK, generator=random) * 0.05,
         torch.randn(num, NUM_POINTS, 3, generator=random) * 0.2,
         torch.randn(num, NUM_POINTS, FINE_WIDTH, generator=random) * 0.2,
-        torch.randn(NUM_VIEWS, NUM_OUTLINE_POINTS, 3, generator=random) * 0.3,
-        torch.nn.functional.normalize(torch.randn(NUM_VIEWS, NUM_OUTLINE_POINTS, 3, generator=random), dim=2),
+        torch.randn(views, NUM_OUTLINE_POINTS, 3, generator=random) * 0.3,
+        torch.nn.functional.normalize(torch.randn(views, NUM_OUTLINE_POINTS, 3, generator=random), dim=2),
     )
 
 
-def test_a_frame_is_read_the_same_alone_and_among_others() -> None:
-    network = _random_network()
+@pytest.mark.parametrize("geometry", [GEOMETRY, FROM_ANY_SIDE])
+def test_a_frame_is_read_the_same_alone_and_among_others(geometry: Geometry) -> None:
+    network = _random_network(geometry=geometry)
+    assert len(network.color) == 3 * geometry.any_side
+    network.color.fill_(0.25)
     images = torch.rand(2, 3, 480, 640, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         both, alone = network(images), network(images[1:])
+    assert (COLOR in both) == geometry.any_side
     for name, values in both.items():
         assert values.isfinite().all()
+        assert name != COLOR or torch.equal(values, torch.full((2, 1, 3), 0.25))
         torch.testing.assert_close(values[1:], alone[name], atol=1e-3, rtol=1e-3)
 
 

@@ -1,7 +1,9 @@
 """A template network made from a mesh: templates drawn, described and compressed; nothing is trained."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -15,12 +17,8 @@ from curio_train.networks.templates.geometry import (
     CROP_PX,
     FILL,
     FRAME_STRIDE,
-    LOCALISING_ROLLS,
-    LOCALISING_VIEWS,
     Geometry,
-    viewpoints,
 )
-from curio_train.networks.templates.localiser import RANK as LOCALISING_RANK
 from curio_train.networks.templates.localiser import Localiser
 from curio_train.networks.templates.network import TemplateNetwork
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
@@ -46,7 +44,7 @@ def template_network(world: World) -> TemplateNetwork:
     """A network for a world's frames and object, empty until :func:`fill` or a checkpoint fills it.
 
     Raises:
-        UsageError: The world is not of one object that is read in two stages, or templates cannot show the object.
+        UsageError: The world is not of one object that is read in two stages.
     """
     if not isinstance(world, TwoStageWorld):
         raise UsageError(
@@ -55,21 +53,16 @@ def template_network(world: World) -> TemplateNetwork:
         )
     assert world.camera.matrix is not None
     one = world.object
-    if one.unpainted or one.rotations is not upper_hemisphere_rotations:
-        raise UsageError(
-            f"--method templates: templates show {one.kind.name} from above and in the colours of its mesh; capture "
-            "needs a mesh with colours, and --upright"
-        )
-    return TemplateNetwork(
-        Geometry(
-            world.camera.matrix,
-            world.camera.width,
-            world.camera.height,
-            one.kind.diameter_m,
-            one.near_m,
-            one.far_m,
-        )
+    geometry = Geometry(
+        world.camera.matrix,
+        world.camera.width,
+        world.camera.height,
+        one.kind.diameter_m,
+        one.near_m,
+        one.far_m,
+        any_side=one.rotations is not upper_hemisphere_rotations,
     )
+    return TemplateNetwork(geometry, has_color=one.unpainted)
 
 
 def without_scan_excess(world: TwoStageWorld) -> TwoStageWorld:
@@ -90,7 +83,10 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> Non
     geometry = network.geometry
     backgrounds = world.backgrounds(cache).split(True)
     frames = backgrounds.draw(_NUM_FRAMES, geometry.width, geometry.height, (_SEED, 0))
-    mesh = world.object.mesh
+    mesh, color = world.object.mesh, world.object.typical_color
+    if world.object.unpainted:
+        mesh = replace(mesh, vertex_colors_srgb=np.broadcast_to(color, mesh.vertices_m.shape))
+        network.color.copy_(torch.tensor(color))
     _fill_localiser(network.localiser, network.trunk, geometry, mesh, frames)
     network.reader.banks.put(0, filled_bank(network.trunk, geometry, mesh, _crops(backgrounds, geometry)))
 
@@ -122,7 +118,7 @@ def _fill_localiser(localiser: Localiser, trunk: Trunk, geometry: Geometry, mesh
     """Templates over grey at every distance, whitened by the backgrounds, then their scores there."""
     background = torch.cat([trunk(F.avg_pool2d(frame[None], FRAME_STRIDE))[1] for frame in frames])
     whitening = localiser.descriptors.whiten(background)
-    rotations = viewpoints(LOCALISING_VIEWS, LOCALISING_ROLLS)
+    rotations = geometry.localising_rotations
     features, masks = [], []
     for depth in geometry.depths_m:
         cells = geometry.kernel_cells(depth)
@@ -139,7 +135,7 @@ def _fill_localiser(localiser: Localiser, trunk: Trunk, geometry: Geometry, mesh
     localiser.descriptors.compress(whitening, flat, mask)
     for number, (of_depth, covered) in enumerate(zip(features, masks, strict=True)):
         templates = mean_cosine(localiser.descriptors(of_depth), covered)
-        filters, weights = low_rank(templates, LOCALISING_RANK)
+        filters, weights = low_rank(templates, localiser.weights.shape[2])
         localiser.filters(number).copy_(filters)
         localiser.weights[number].copy_(weights)
     _standardise(localiser, localiser.descriptors(background))

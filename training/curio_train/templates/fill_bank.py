@@ -5,13 +5,13 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from curio_train.meshes.meshes import Mesh
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import Descriptors
-from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS, NUM_VIEWS, Geometry, viewpoints
+from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_STRIDE, FINE_WIDTH, Trunk
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.templates.describe import features, low_rank, mean_cosine
@@ -36,29 +36,30 @@ def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> 
         RendererError: The mesh cannot be rendered.
     """
     of_crop, of_surface = Descriptors(COARSE_WIDTH, COARSE_SIZE), Descriptors(FINE_WIDTH, FINE_WIDTH)
-    views = viewpoints(NUM_VIEWS, NUM_ROLLS)
+    views = geometry.rotations
     depth, random = geometry.typical_m, np.random.default_rng(_SEED)
     focal_px = FILL * CROP_PX * depth / geometry.diameter_m
     renderer = CropTemplateRenderer(mesh, depth, geometry.focal_px, focal_px, CROP_PX)
-    fine, coarse, alphas = [], [], []  # features of every look, batch after batch
+    choice = _PointChoice()
+    fine, coarse, covers, chosen, of_object = [], [], [], [], []  # of every look, batch after batch
     for rotations in views.split(_BATCH):
         drawn = renderer.draw(rotations)
         behind = [crops[torch.from_numpy(random.integers(0, len(crops), len(rotations)))] for _ in APPEARANCES]
         seen = [features(trunk, drawn.over(n, behind[n], exposure)) for n, (_, exposure) in enumerate(APPEARANCES)]
-        fine.append(torch.stack([one for one, _ in seen]))
+        inside = _inside(drawn.alpha)
+        chosen.append(choice(inside))
+        of_object.append(seen[0][0].movedim(1, 0)[:, inside])
+        fine.append(torch.stack([_at(one, chosen[-1]) for one, _ in seen]))
         coarse.append(torch.stack([one for _, one in seen]))
-        alphas.append(drawn.alpha)
+        covers.append(drawn.alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE])
     fine_background, coarse_background = features(trunk, crops)
-    alpha, of_coarse = torch.cat(alphas), torch.cat(coarse, dim=1)
-    covered = alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE]
+    covered, of_coarse = torch.cat(covers), torch.cat(coarse, dim=1)
     of_crop.compress(of_crop.whiten(coarse_background), of_coarse[0], covered)
     filters, weights = low_rank(mean_cosine(_sum(of_crop(seen) for seen in of_coarse), covered), RANK)
-    inside = _inside(alpha)
-    of_object = torch.cat([some[0] for some in fine]).movedim(1, 0)[:, inside].mean(dim=1)
-    of_surface.mean.copy_((fine_background.mean(dim=(0, 2, 3)) + of_object) / 2)
+    of_surface.mean.copy_((fine_background.mean(dim=(0, 2, 3)) + torch.cat(of_object, dim=1).mean(dim=1)) / 2)
     described = torch.cat([F.normalize(_sum(of_surface(seen) for seen in some), dim=1) for some in fine])
-    points = _surface_points(mesh, views, depth, focal_px)
-    on_points, of_points = _chosen(inside, points / geometry.diameter_m, described)
+    points = _at(_surface_points(mesh, views, depth, focal_px), torch.cat(chosen)) / geometry.diameter_m
+    of_points, on_points = described[..., 0].transpose(1, 2), points[..., 0].transpose(1, 2)
     return Bank(of_crop, of_surface, filters, weights, on_points, of_points, *outlines(mesh, geometry))
 
 
@@ -89,13 +90,23 @@ def _surface_points(
     return torch.cat(found) * surface.half_extent_m + torch.from_numpy(surface.center_m).float()[:, None, None]
 
 
-def _chosen(
-    inside: Bool[Tensor, "templates cells cells"], *of_cells: Float[Tensor, "templates size cells cells"]
-) -> list[Float[Tensor, "templates points size"]]:
-    """Values at a random choice of each template's cells, all of them and some twice where they are few."""
-    random, chosen = np.random.default_rng(_SEED), []
-    for mask in inside.flatten(1).numpy():
-        cells = random.permutation(np.flatnonzero(mask))
-        chosen.append(np.resize(cells, NUM_POINTS))
-    index = torch.from_numpy(np.stack(chosen))[:, None]
-    return [values.flatten(2).gather(2, index.expand(-1, values.shape[1], -1)).transpose(1, 2) for values in of_cells]
+def _at(
+    values: Float[Tensor, "templates size cells cells"], chosen: Int[Tensor, "templates points"]
+) -> Float[Tensor, "templates size points 1"]:
+    """Values at chosen cells, as a picture of one column."""
+    index = chosen[:, None].expand(-1, values.shape[1], -1)
+    return values.flatten(2).gather(2, index)[..., None]
+
+
+class _PointChoice:
+    """Chooses cells of templates at random, all of them and some twice where they are few."""
+
+    def __init__(self) -> None:
+        self._random = np.random.default_rng(_SEED)
+
+    def __call__(self, inside: Bool[Tensor, "templates cells cells"]) -> Int[Tensor, "templates points"]:
+        """Numbers of cells that lie inside, of the next templates."""
+        chosen = [
+            np.resize(self._random.permutation(np.flatnonzero(mask)), NUM_POINTS) for mask in inside.flatten(1).numpy()
+        ]
+        return torch.from_numpy(np.stack(chosen))

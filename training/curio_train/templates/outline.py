@@ -10,7 +10,7 @@ from torch import Tensor
 
 from curio_train.meshes.meshes import Mesh
 from curio_train.networks.templates.bank import NUM_OUTLINE_POINTS
-from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_VIEWS, Geometry, viewpoints
+from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.templates.drawing import TemplateRenderer
 
@@ -43,7 +43,7 @@ def outlines(mesh: Mesh, geometry: Geometry) -> Outlines:
     matrix = np.array([[focal_px, 0, middle], [0, focal_px, middle], [0, 0, 1]])
     centre = torch.tensor([0.0, 0.0, depth])
     points, outward = [], []
-    for rotations in viewpoints(NUM_VIEWS, 1).split(_BATCH):
+    for rotations in geometry.outline_rotations.split(_BATCH):
         count = len(rotations)
         matrices = np.broadcast_to(matrix, (count, 3, 3))
         coordinates, _ = surface(rotations, centre.expand(count, 3), matrices)

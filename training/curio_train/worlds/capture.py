@@ -39,7 +39,7 @@ from curio_train.meshes.meshes import Mesh, load_mesh
 from curio_train.meshes.symmetries import find_symmetries
 from curio_train.worlds.base import Camera, ObjectKind, World
 from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object.base_colors import any_base_color, base_colors_near
+from curio_train.worlds.single_object.base_colors import MIDDLE_GREY, any_base_color, base_colors_near, srgb_of
 from curio_train.worlds.single_object.crop_pose_stage import MAX_LOG_SCALE
 from curio_train.worlds.single_object.two_stage import TwoStageWorld, frame_camera
 from curio_train.worlds.single_object.viewpoints import upper_hemisphere_rotations
@@ -116,6 +116,7 @@ def build(options: CaptureOptions) -> World:
     _refuse_collision(options, mesh)
     if options.paint is not None and not is_unpainted(mesh):
         raise UsageError(f"--paint {options.paint}: {file} has colours of its own; leave it out")
+    paint = None if options.paint is None else srgb_of(options.paint)
     found = find_symmetries(mesh)
     kind = ObjectKind(
         file.stem, (0,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous
@@ -129,7 +130,8 @@ def build(options: CaptureOptions) -> World:
         partial(_backgrounds, options, camera),
         upper_hemisphere_rotations if options.upright else random_rotations,
         unpainted=is_unpainted(mesh),
-        base_colors=any_base_color if options.paint is None else base_colors_near(options.paint),
+        base_colors=any_base_color if paint is None else base_colors_near(paint),
+        typical_color=paint or MIDDLE_GREY,
         known_scene=options.background is not None,
     )
     photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera))

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import normalised
-from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, NUM_VIEWS, viewpoints
+from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, num_views, viewpoints
 from curio_train.networks.templates.quantisation import CODEWORDS, LARGEST_BYTE, to_bytes, to_codes
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH
 
@@ -47,9 +47,10 @@ class Banks(nn.Module):
     rotations: Tensor
     """cam_from_obj of an object on the optical axis, [templates, 3, 3]; the same for every object."""
 
-    def __init__(self, num_objects: int) -> None:
+    def __init__(self, num_objects: int, any_side: bool = False) -> None:
         super().__init__()
-        num, side = NUM_VIEWS * NUM_ROLLS, CROP_PX // COARSE_STRIDE
+        views, side = num_views(any_side), CROP_PX // COARSE_STRIDE
+        num = views * NUM_ROLLS
         self.num_objects = num_objects
         for name, shape, dtype in (
             ("coarse_mean", (COARSE_WIDTH,), torch.float32),
@@ -62,12 +63,12 @@ class Banks(nn.Module):
             ("points_scale", (), torch.float32),
             ("codes", (num, NUM_POINTS, _PARTS), torch.uint8),
             ("codewords", (_PARTS, CODEWORDS, FINE_WIDTH // _PARTS), torch.float16),
-            ("outline", (NUM_VIEWS, NUM_OUTLINE_POINTS, 3), torch.int8),
+            ("outline", (views, NUM_OUTLINE_POINTS, 3), torch.int8),
             ("outline_scale", (), torch.float32),
-            ("outward", (NUM_VIEWS, NUM_OUTLINE_POINTS, 3), torch.int8),
+            ("outward", (views, NUM_OUTLINE_POINTS, 3), torch.int8),
         ):
             self.register_buffer(name, torch.zeros(num_objects, *shape, dtype=dtype))
-        self.register_buffer("rotations", viewpoints(NUM_VIEWS, NUM_ROLLS), persistent=False)
+        self.register_buffer("rotations", viewpoints(views, NUM_ROLLS, any_side), persistent=False)
 
     def put(self, number: int, bank: Bank) -> None:
         """Compress and keep the templates of one object."""
@@ -129,6 +130,6 @@ class Banks(nn.Module):
     ) -> tuple[Float[Tensor, "batch*objects points 3"], Float[Tensor, "batch*objects points 3"]]:
         """Points on the outlines of templates, diameters, and vectors out of them; a template an object."""
         number = torch.arange(self.num_objects, device=templates.device).repeat(templates.shape[0] // self.num_objects)
-        row = number * NUM_VIEWS + torch.div(templates, NUM_ROLLS, rounding_mode="floor")
+        row = number * self.outline.shape[1] + torch.div(templates, NUM_ROLLS, rounding_mode="floor")
         points = self.outline.flatten(0, 1)[row].float() * self.outline_scale[number][:, None, None]
         return points, self.outward.flatten(0, 1)[row].float()

@@ -18,6 +18,9 @@ NUM_VIEWS, NUM_ROLLS = 220, 7
 LOCALISING_VIEWS, LOCALISING_ROLLS = 32, 4
 """A place is found with fewer."""
 
+QUARTER_TURNS = 4
+"""Rolls of an object that may stand in any way beyond :data:`MAX_ROLL_DEG`: by as many equal parts of a turn."""
+
 CROP_PX, FILL = 128, 0.7
 """Side of a crop, and the fraction of it that the diameter spans."""
 
@@ -44,11 +47,30 @@ class Geometry:
     """Nearest distance of the object."""
     far_m: float
     """Farthest."""
+    any_side: bool = False
+    """Whether the object is seen from all sides and rolled in any way, instead of from above and nearly upright."""
 
     @property
     def typical_m(self) -> float:
         """The distance that crop templates are drawn at: the middle of the range's logarithm."""
         return float(np.sqrt(self.near_m * self.far_m))
+
+    @property
+    def rotations(self) -> Float[Tensor, "templates 3 3"]:
+        """What templates show; of an object that may be rolled in any way, crops are rolled to where it is upright."""
+        return viewpoints(num_views(self.any_side), NUM_ROLLS, self.any_side)
+
+    @property
+    def outline_rotations(self) -> Float[Tensor, "views 3 3"]:
+        """One a direction, which rolls of the camera do not change."""
+        return viewpoints(num_views(self.any_side), 1, self.any_side)
+
+    @property
+    def localising_rotations(self) -> Float[Tensor, "templates 3 3"]:
+        """What templates of whole frames show."""
+        if not self.any_side:
+            return viewpoints(LOCALISING_VIEWS, LOCALISING_ROLLS)
+        return viewpoints(2 * LOCALISING_VIEWS, QUARTER_TURNS * LOCALISING_ROLLS, True, QUARTER_TURNS * MAX_ROLL_DEG)
 
     @property
     def focal_px(self) -> float:
@@ -74,18 +96,27 @@ class Geometry:
         return -(-self.height // stride), -(-self.width // stride)
 
 
-def viewpoints(num_views: int, num_rolls: int) -> Float[Tensor, "views*rolls 3 3"]:
+def num_views(any_side: bool) -> int:
+    """Directions of a bank of templates."""
+    return 2 * NUM_VIEWS if any_side else NUM_VIEWS
+
+
+def viewpoints(
+    num_views: int, num_rolls: int, any_side: bool = False, max_roll_deg: float = MAX_ROLL_DEG
+) -> Float[Tensor, "views*rolls 3 3"]:
     """Rotations cam_from_obj of cameras evenly spread over the upper hemisphere (object z up), each rolled.
 
-    The directions are a Fibonacci lattice; rolls divide the range of the training views evenly.
+    The directions are a Fibonacci lattice, over the whole sphere for an object that is seen from any side; rolls divide
+    their range evenly.
     """
     number = np.arange(num_views) + 0.5
     height, azimuth = number / num_views, _GOLDEN_ANGLE * number
+    height = 2 * height - 1 if any_side else height
     level = np.sqrt(1 - height**2)
     forward = -np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], axis=1)
     right = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(num_views)], axis=1)
     down = np.cross(forward, right)
-    rolls = np.radians(MAX_ROLL_DEG) * (2 * (np.arange(num_rolls) + 0.5) / num_rolls - 1)
+    rolls = np.radians(max_roll_deg) * (2 * (np.arange(num_rolls) + 0.5) / num_rolls - 1)
     rotations = [
         np.stack(
             [np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right, forward], axis=1

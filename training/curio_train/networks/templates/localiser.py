@@ -9,13 +9,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from curio_train.networks.templates.descriptors import Descriptors
-from curio_train.networks.templates.geometry import FRAME_STRIDE, LOCALISING_ROLLS, LOCALISING_VIEWS, Geometry
+from curio_train.networks.templates.geometry import FRAME_STRIDE, Geometry
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH
 
 NUM_CANDIDATES = 6
 DESCRIPTOR_SIZE = 24
-RANK = 16
-"""Filters that the templates of one distance are sums of."""
+RANK, ANY_SIDE_RANK = 16, 32
+"""Filters that the templates of one distance are sums of; more for an object that is seen from any side."""
 
 _APART = 0.35  # diameters between candidates, at least
 _APART_CELLS = 1.5
@@ -50,11 +50,12 @@ class Localiser(nn.Module):
     def __init__(self, geometry: Geometry) -> None:
         super().__init__()
         self.descriptors = Descriptors(COARSE_WIDTH, DESCRIPTOR_SIZE)
-        depths, num = geometry.depths_m, LOCALISING_VIEWS * LOCALISING_ROLLS
+        depths, num = geometry.depths_m, len(geometry.localising_rotations)
+        rank = ANY_SIDE_RANK if geometry.any_side else RANK
         for number, depth in enumerate(depths):
             side = geometry.kernel_cells(depth)
-            self.register_buffer(f"filters_{number}", torch.zeros(RANK, DESCRIPTOR_SIZE, side, side).half())
-        self.register_buffer("weights", torch.zeros(len(depths), num, RANK))
+            self.register_buffer(f"filters_{number}", torch.zeros(rank, DESCRIPTOR_SIZE, side, side).half())
+        self.register_buffer("weights", torch.zeros(len(depths), num, rank))
         self.register_buffer("offsets", torch.zeros(len(depths), num))
         self._num = len(depths)
         rows, columns = geometry.frame_cells
@@ -96,6 +97,6 @@ class Localiser(nn.Module):
         return found
 
     def filters(self, number: int) -> Tensor:
-        """Filters of one distance, [RANK, DESCRIPTOR_SIZE, side, side]."""
+        """Filters of one distance, [rank, DESCRIPTOR_SIZE, side, side]."""
         filters: Tensor = getattr(self, f"filters_{number}")
         return filters

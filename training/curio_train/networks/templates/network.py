@@ -1,5 +1,6 @@
 """Whole frame to pose by templates alone, in one graph: nothing in it was trained but the frozen trunk."""
 
+import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -8,6 +9,7 @@ from curio_train.networks.templates.geometry import FRAME_STRIDE, Geometry
 from curio_train.networks.templates.localiser import Localiser
 from curio_train.networks.templates.reader import STEPS, CalibrationFeatures, Places, PoseReader
 from curio_train.networks.templates.trunk import Trunk
+from curio_train.scene_code import COLOR, TRANSLATION
 
 
 class TemplateNetwork(nn.Module):
@@ -22,27 +24,38 @@ class TemplateNetwork(nn.Module):
     geometry: Geometry
     """Of frames and object."""
 
-    def __init__(self, geometry: Geometry, steps: tuple[int, int, int] = STEPS) -> None:
+    color: Tensor
+    """Of an object whose mesh has no colours: what its templates show and codes answer, sRGB [3]; else empty."""
+
+    def __init__(self, geometry: Geometry, steps: tuple[int, int, int] = STEPS, *, has_color: bool = False) -> None:
         """Build for frames and an object; all templates are still empty.
 
         Args:
             geometry: Of frames and object.
             steps: See :data:`STEPS`.
+            has_color: Whether codes have a colour.
         """
         super().__init__()
         self.trunk, self.localiser, self.reader = Trunk(), Localiser(geometry), PoseReader([geometry], steps)
         self.geometry = geometry
+        self.register_buffer("color", torch.zeros(3 if has_color else 0))
         self.requires_grad_(False)
         self.eval()
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
         code: dict[str, Tensor] = self.reader(self.trunk, images, self._places(images))
-        return code
+        return self._colored(code)
 
     def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code without its confidence, and what that is made of."""
-        return self.reader.read(self.trunk, images, self._places(images))
+        code, features = self.reader.read(self.trunk, images, self._places(images))
+        return self._colored(code), features
+
+    def _colored(self, code: dict[str, Tensor]) -> dict[str, Tensor]:
+        if not len(self.color):
+            return code
+        return code | {COLOR: self.color.expand(*code[TRANSLATION].shape[:2], 3)}
 
     def _places(self, images: Tensor) -> Places:
         position_m, score = self.localiser(self.trunk(F.avg_pool2d(images, FRAME_STRIDE))[1])

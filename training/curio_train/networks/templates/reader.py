@@ -8,10 +8,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_between
-from curio_train.networks.crop_camera import cut_crops
+from curio_train.networks.crop_camera import about_axis, cut_crops
 from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.banks import Banks
-from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
+from curio_train.networks.templates.geometry import CROP_PX, FILL, QUARTER_TURNS, Geometry
 from curio_train.networks.templates.outline import outline_log_factor
 from curio_train.networks.templates.rolls import ROLLS_DEG, upright_rolls
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
@@ -110,7 +110,8 @@ class PoseReader(nn.Module):
         """
         super().__init__()
         num = len(geometries)
-        self.banks, self._steps = Banks(num), steps
+        self._any_side = geometries[0].any_side
+        self.banks, self._steps = Banks(num, self._any_side), steps
         self.register_buffer("pose_correct", torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]).repeat(num, 1))
         for name, values in {
@@ -158,7 +159,8 @@ class PoseReader(nn.Module):
         Places are some per cent too near or too far, and objects lean to one side. Templates match better in crops at
         the distance that alignment finds, and where the object leans as it does in templates.
         """
-        crops = self._crops(trunk, images, places)
+        places, turn = self._turned(places)
+        crops = self._crops(trunk, images, places, turn)
         found = self._aligned(crops, self._hypotheses(crops, places), self._steps[0])
         score, position, place_score = (
             values.unflatten(0, (-1, NUM_HYPOTHESES))
@@ -174,6 +176,14 @@ class PoseReader(nn.Module):
         of_places = place_score.gather(1, best).unflatten(0, (-1, self.banks.num_objects))
         roll = upright_rolls(closer.flatten(0, 2), upward.gather(1, of_rows).flatten(0, 1))
         return Places(*(of_all.repeat_interleave(len(ROLLS_DEG), dim=2) for of_all in (closer, of_places))), roll
+
+    def _turned(self, places: Places) -> tuple[Places, Float[Tensor, "crops 3 3"] | None]:
+        """Places in all quarter turns where objects may be rolled in any way; else as they are."""
+        if not self._any_side:
+            return places, None
+        quarters = places.score.new_tensor([[1, 0], [0, 1], [-1, 0], [0, -1]])
+        turns = about_axis(quarters).expand(*places.score.shape, -1, -1, -1).flatten(0, 3)
+        return Places(*(of_all.repeat_interleave(QUARTER_TURNS, dim=2) for of_all in places)), turns
 
     def _crops(self, trunk: Trunk, images: Tensor, places: Places, roll: Tensor | None = None) -> _Crops:
         """Crops in which templates can be shifted."""

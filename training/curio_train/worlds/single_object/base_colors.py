@@ -14,6 +14,9 @@ from curio_train.worlds.placement import random_colors
 BaseColorPrior = Callable[[int, np.random.Generator], Float[Tensor, "count 1 3"]]
 """Draws sRGB base colours."""
 
+MIDDLE_GREY = (0.5, 0.5, 0.5)
+"""SRGB: stands for a colour that nobody knows."""
+
 MIN_BASE_VALUE = 0.1
 """HSV value of base colours; their saturation may be anything: black, white, grey or any colour between."""
 
@@ -30,8 +33,8 @@ def any_base_color(count: int, random: np.random.Generator) -> Float[Tensor, "co
     return random_colors(count, 1, random, 0.0, MIN_BASE_VALUE)
 
 
-def base_colors_near(color: str) -> BaseColorPrior:
-    """The prior around a colour given as #rrggbb, sRGB.
+def srgb_of(color: str) -> tuple[float, float, float]:
+    """A colour given as #rrggbb, in [0, 1].
 
     Raises:
         UsageError: It is not written so.
@@ -43,7 +46,13 @@ def base_colors_near(color: str) -> BaseColorPrior:
         channels = b""
     if len(channels) != 3 or len(digits) != 6:
         raise UsageError(f"--paint {color}: expected a colour in sRGB such as '#8a6f4c'")
-    return partial(_base_colors, np.frombuffer(channels, np.uint8) / 255)
+    red, green, blue = (channel / 255 for channel in channels)
+    return red, green, blue
+
+
+def base_colors_near(srgb: tuple[float, float, float]) -> BaseColorPrior:
+    """The prior around a colour in [0, 1]."""
+    return partial(_base_colors, np.array(srgb))
 
 
 def _base_colors(srgb: np.ndarray, count: int, random: np.random.Generator) -> Tensor:

@@ -21,7 +21,7 @@ from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSL
 from curio_train.worlds.base import SPLITS, Camera, ObjectKind, Split, World, jitter_seed
 from curio_train.worlds.generated.fields import COLOR_FIELD, CONFIDENCE_FIELD
 from curio_train.worlds.rendered_stream import APPEARANCE, RenderedStream
-from curio_train.worlds.single_object.base_colors import BaseColorPrior, any_base_color
+from curio_train.worlds.single_object.base_colors import MIDDLE_GREY, BaseColorPrior, any_base_color
 from curio_train.worlds.single_object.viewpoints import (
     AMBIENT,
     ANY_EXPOSURE,
@@ -67,6 +67,8 @@ class Object:
     """The mesh has no colours: it has another base colour in each image, which is part of the scene code."""
     base_colors: BaseColorPrior = field(default=any_base_color)
     """Prior of these base colours."""
+    typical_color: tuple[float, float, float] = MIDDLE_GREY
+    """Of them, sRGB: what templates of an unpainted object show."""
     known_scene: bool = False
     """Its background and the light there are known."""
     scan_excess_m: float = 0.0
