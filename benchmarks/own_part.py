@@ -1,16 +1,18 @@
 """The README's section "Your own part" as a user would type it, timed and scored.
 
-    python benchmarks/own_part.py [--minutes 26.5] [--photos 200] [--tests 50] [--step] [--commands BIN] [--json]
+    python benchmarks/own_part.py [--method templates] [--minutes 26.5] [--photos 200] [--tests 50] [--step]
+                                  [--commands BIN] [--json]
 
 An unpainted STL, 200 path traced photographs of it on a table, a background image and a camera file, calibrated from
 photographs of a chessboard, are made first (see ``benchmarks/make_captures.py``); what is there already is kept. Then
 the installed commands look at the files, train and export, detect in 50 photographs that nothing has seen, and do that
-again through a server. With --step the mesh is a STEP file that OpenCASCADE has drawn. The last line is the result,
-also in OUT/own_part.json:
+again through a server. With --step the mesh is a STEP file that OpenCASCADE has drawn, with --method templates nothing
+is trained. The last line is the result, also in OUT/own_part.json:
 
 right       share of the unseen photographs in which ADD(-S) is below a tenth of the diameter
 add_median  of ADD(-S), in diameters
 served_as   largest difference between a served and a local position, metres
+reads_9     the same of curio-detect --reads 9
 seconds     of each command; of all of them as "total"
 """
 
@@ -39,6 +41,7 @@ _SAMPLES_PER_PIXEL = 16  # pixels are small here
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--method", choices=("sleep", "templates"), default="sleep", help="of curio-train capture")
     parser.add_argument("--minutes", type=float, default=26.5, help="of training")
     parser.add_argument("--photos", type=int, default=200, help="unlabelled")
     parser.add_argument("--tests", type=int, default=50, help="photographs that nothing has seen")
@@ -63,12 +66,17 @@ def main() -> None:
         given = ["--mesh", str(files / "meshes" / "bracket.step")]
         write_bracket(files / "meshes" / "bracket.step")
     commands = arguments.commands.absolute()
-    seconds = _as_typed(commands, given, files, out, arguments.minutes)
+    learning = ["--minutes", str(arguments.minutes)] if arguments.method == "sleep" else ["--method", "templates"]
+    seconds = _as_typed(commands, given, files, out, learning)
     seconds["serve"] = _served(commands, files, out)
     seconds["total"] = round(sum(seconds.values()), 1)
     scored = _score(files, out / "poses.jsonl") | {"served_as": _difference(out)}
+    scored["reads_9"] = _score(files, out / "poses-9.jsonl")
     machine = json.loads((out / "run" / "sittings.jsonl").read_text(encoding="utf-8").splitlines()[0])["machine"]
-    result = scored | {"seconds": seconds, "machine": machine, "minutes": arguments.minutes, "photos": arguments.photos}
+    budget = {"method": arguments.method, "photos": arguments.photos}
+    if arguments.method == "sleep":
+        budget["minutes"] = arguments.minutes
+    result = scored | {"seconds": seconds, "machine": machine} | budget
     (out / "own_part.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     print(json.dumps(result) if arguments.json else result)
 
@@ -77,19 +85,21 @@ def _show(text: str) -> None:
     print(f"\r{text}", end="", file=sys.stderr)
 
 
-def _as_typed(commands: Path, mesh: list[str], files: Path, out: Path, minutes: float) -> dict[str, float]:
+def _as_typed(commands: Path, mesh: list[str], files: Path, out: Path, learning: list[str]) -> dict[str, float]:
     """The commands that need no server, and how long each took."""
     camera = str(files / "camera.json")
     given = [*mesh, "--camera", camera, "--photos", str(files / "photos")]
     given += ["--background", str(files / "plates" / "a-0.png")]
     distances = ["--near-m", str(_NEAR_M), "--far-m", str(_FAR_M)]
-    run, poses = out / "run", out / "poses.jsonl"
-    poses.unlink(missing_ok=True)
+    run, poses, often = out / "run", out / "poses.jsonl", out / "poses-9.jsonl"
+    for earlier in (poses, often):
+        earlier.unlink(missing_ok=True)
     typed = {
         "look": ["curio-doctor", *given],
-        "train": ["curio-train", "capture", *given, *distances, "--minutes", str(minutes), "--out", str(run)],
+        "train": ["curio-train", "capture", *given, *distances, *learning, "--out", str(run)],
         "detect": ["curio-detect", str(run / "models" / "bracket"), str(files / "test" / "a"), "--camera", camera],
     }
+    typed["detect_9"] = [*typed["detect"], "--out", str(often), "--reads", "9"]
     typed["detect"] += ["--out", str(poses), "--overlays", str(out / "overlays")]
     return {name: _call(commands, *call) for name, call in typed.items()}
 
