@@ -215,7 +215,9 @@ def _verdict_in_space(fraction: float, num: int, has_background_image: bool, num
     limits = "a tenth of a diameter cannot be told from a fifth"
     if not has_background_image:
         limits += "; --background tells right from wrong better"
-    advice = "train longer (--method sleep, --images), or tell the network more (--upright, narrower --near-m and --far-m)"
+    advice = (
+        "train longer (--method sleep, --images), or tell the network more (--upright, narrower --near-m and --far-m)"
+    )
     if fraction >= _TRUSTED:
         text = f"Trust it: {found}; {limits}."
     elif fraction >= _DOUBTFUL:
