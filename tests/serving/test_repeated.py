@@ -1,19 +1,25 @@
 """Several reads of an image: looks show what such cameras see, reads that agree are averaged, others are outvoted."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from curio_proto.v1.detector_pb2 import Tracking
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, Field, ModelSpec, ObjectModel, Symmetry
 from curio_serve.batch.arguments import DetectArguments
 from curio_serve.batch.detect_cli import run
-from curio_serve.errors import UsageError
+from curio_serve.client import PoseClient, detect_request, error_from_answer
+from curio_serve.client.request import views_request
+from curio_serve.errors import ArgumentError, UsageError
+from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.looks import LOOKS, Look
 from curio_serve.imaging.rotation import from_rotation_vector
+from curio_serve.models.detector import Detector
+from curio_serve.models.model_folder import open_model
 from curio_serve.models.repeated import RepeatedReader
 
 K = np.array([[110.0, 0, 50.0], [0, 112.0, 30.0], [0, 0, 1]])
@@ -115,7 +121,7 @@ def test_symmetric_poses_agree() -> None:
 
 @pytest.mark.parametrize(("num_reads", "kind"), [(0, spec()), (10, spec()), (3, spec(slots=(0, 1))), (3, ModelSpec())])
 def test_what_cannot_be_read_again_is_refused(num_reads: int, kind: ModelSpec) -> None:
-    with pytest.raises(UsageError, match=r"expected 1 to 9|leave out --reads"):
+    with pytest.raises(ArgumentError, match=r"expected 1 to 9|reads an image once"):
         RepeatedReader(kind, lambda images: {}, num_reads)
 
 
@@ -143,10 +149,10 @@ def test_the_command_reads_an_image_as_often_as_it_is_told(spot: Path, models_di
 @pytest.mark.parametrize(
     ("model", "flags", "told"),
     [
-        ("pinhole", {"reads": 0}, "0 reads of an image: expected 1 to 9"),
-        ("pinhole", {"reads": 10}, "10 reads"),
+        ("pinhole", {"reads": 0}, "--reads 0: expected 1 to 9"),
+        ("pinhole", {"reads": 10}, "--reads 10"),
         ("pinhole", {"reads": 3, "track": True}, "and --reads"),
-        ("flat", {"reads": 3}, "leave out --reads"),
+        ("flat", {"reads": 3}, "--reads: reads is 3, and model flat reads an image once"),
     ],
 )
 def test_wrong_calls_say_what_to_leave_out(
@@ -154,3 +160,41 @@ def test_wrong_calls_say_what_to_leave_out(
 ) -> None:
     with pytest.raises(UsageError, match=told):
         run(DetectArguments(str(models_dir / model), (str(spot),), **flags))
+
+
+@pytest.fixture(scope="module")
+def client(models_dir: Path, start_server: Callable[..., Any]) -> Iterator[PoseClient]:
+    with PoseClient(start_server(models_dir).address) as client:
+        yield client
+
+
+def test_the_server_answers_as_the_command_does(client: PoseClient, models_dir: Path, spot: Path) -> None:
+    pixels = np.ascontiguousarray(cv2.imread(str(spot))[..., ::-1])
+    (here,) = Detector(open_model(models_dir / "pinhole"), 9).detect(pixels, PinholeCamera(K))
+    (there,) = client.detect("pinhole", pixels, K, reads=9).results
+    np.testing.assert_allclose(there.detections[0].translation_m, here.detections[0].translation_m, rtol=1e-6)
+    (once,) = client.detect("pinhole", pixels, K).results
+    assert list(once.detections[0].translation_m) != list(there.detections[0].translation_m)
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "told"),
+    [
+        ("pinhole", {"reads": 0}, "reads is 0; expected 1 to 9"),
+        ("pinhole", {"reads": 10}, "reads is 10; expected 1 to 9"),
+        ("pinhole", {"reads": 8, "regions": [(0, 0, 96, 64)] * 9}, "times 9 regions times 8 reads are 72 runs"),
+        ("flat", {"reads": 2}, "model flat reads an image once"),
+    ],
+)
+def test_the_server_refuses(client: PoseClient, model: str, options: dict[str, Any], told: str) -> None:
+    with pytest.raises(ArgumentError, match=told):
+        client.detect(model, IMAGE[0], K if model == "pinhole" else None, **options)
+
+
+def test_following_and_rigs_read_once(client: PoseClient) -> None:
+    following = detect_request("pinhole", IMAGE[0], K, reads=2, track=Tracking(num_objects=1))
+    views = views_request("pinhole", [(IMAGE[0], K, np.eye(4)), (IMAGE[0], K, np.eye(4))])
+    views.reads = 2
+    told = [str(error_from_answer(answer)) for answer in client.detect_stream([following, views], timeout_s=30)]
+    assert "reads are not for following" in told[0]
+    assert "the request has views and reads" in told[1]

@@ -187,7 +187,7 @@ def test_what_agrees_in_several_reads_is_scored(data: Path) -> None:
     code = subject.predict(images)
     assert code[TRANSLATION].shape == (2, 1, 3)
     np.testing.assert_allclose(code[TRANSLATION][0, 0], [0, 0, 0.8], atol=0.01)
-    with pytest.raises(UsageError, match="--reads: 10 reads of an image: expected 1 to 9"):
+    with pytest.raises(UsageError, match="--reads: reads is 10; expected 1 to 9"):
         reading_repeatedly(subject, 10)
 
 

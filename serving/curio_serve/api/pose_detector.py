@@ -28,6 +28,7 @@ from curio_serve.tracking.stream import FollowingStream
 
 Context = grpc.ServicerContext
 _MAX_ID_LENGTH = 128
+_NOT_WITH_TRACK = ("max_detections", "max_instances", "reads")
 _ID_PREFIX, _ID_NUMBERS = secrets.token_hex(8), itertools.count()
 
 
@@ -220,8 +221,10 @@ class PoseService(PoseDetectorServicer):
         if request.HasField("max_detections") and not request.max_detections:
             raise ArgumentError("max_detections is 0; leave it out for no limit, or give at least 1")
         most_runs, num_instances = max(limits.max_models, limits.max_regions), request.max_instances or 1
-        if (num_runs := len(models) * max(num_regions, 1) * num_instances) > most_runs:
+        num_reads = request.reads if request.HasField("reads") else 1
+        if (num_runs := len(models) * max(num_regions, 1) * num_instances * num_reads) > most_runs:
             times = f" times {num_instances} instances" if num_instances > 1 else ""
+            times += f" times {num_reads} reads" if num_reads > 1 else ""
             raise ArgumentError(
                 f"{len(models)} models times {max(num_regions, 1)} regions{times} are {num_runs} runs of a network; "
                 f"at most {most_runs} are accepted (the larger of --max-models and --max-regions)"
@@ -229,7 +232,7 @@ class PoseService(PoseDetectorServicer):
         found = [self._repository.get(model.name, model.version) for model in models]
         if len(set(found)) < len(found):
             raise ArgumentError("models names a model more than once; expected each once")
-        return list(map(Detector, found))
+        return [Detector(model, num_reads) for model in found]
 
 
 def _check_following(request: messages.DetectRequest, following: FollowingStream | None) -> FollowingStream:
@@ -240,9 +243,9 @@ def _check_following(request: messages.DetectRequest, following: FollowingStream
     """
     if following is None:
         raise ArgumentError("track is set in a single call; objects are followed in DetectStream")
-    if request.regions or request.HasField("max_detections") or request.HasField("max_instances"):
+    if request.regions or any(map(request.HasField, _NOT_WITH_TRACK)):
         raise ArgumentError(
-            "regions, max_detections and max_instances are not for following; leave them out, or leave out track"
+            "regions, max_detections, max_instances and reads are not for following; leave them out, or leave out track"
         )
     return following
 

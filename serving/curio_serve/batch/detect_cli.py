@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from curio_serve.batch.arguments import DetectArguments
 from curio_serve.command_line import parsed
-from curio_serve.errors import CameraError, CurioError, UsageError
+from curio_serve.errors import ArgumentError, CameraError, CurioError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -146,6 +146,8 @@ def _live(arguments: DetectArguments, estimators: "Sequence[Estimator]") -> int:
 
 
 def _check_numbers(arguments: DetectArguments) -> None:
+    from curio_serve.models.repeated import MAX_READS
+
     if arguments.video is not None and (arguments.images or arguments.out or arguments.overlays or arguments.ray):
         raise UsageError("--video shows a video and writes nothing: leave out IMAGES, --out, --overlays and --ray")
     if arguments.jobs < 1:
@@ -156,6 +158,8 @@ def _check_numbers(arguments: DetectArguments) -> None:
         raise UsageError(f"--max-detections {arguments.max_detections}: expected at least 1")
     if arguments.max_instances is not None and not 1 <= arguments.max_instances <= 16:
         raise UsageError(f"--max-instances {arguments.max_instances}: expected 1 to 16")
+    if not 1 <= arguments.reads <= MAX_READS:
+        raise UsageError(f"--reads {arguments.reads}: expected 1 to {MAX_READS}")
     if arguments.obj_id is not None and (arguments.format != "bop" or arguments.obj_id < 1):
         raise UsageError(f"--obj-id {arguments.obj_id}: expected a number from 1, together with --format bop")
 
@@ -214,7 +218,10 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
     for model in models:
         if os.path.exists(model):
             runtime = Runtime(read_providers(arguments.provider))
-            found.append(LocalEstimator(open_model(model, runtime), settings))
+            try:
+                found.append(LocalEstimator(open_model(model, runtime), settings))
+            except ArgumentError as exc:
+                raise UsageError(f"--reads: {exc}") from exc
             continue
         served = SERVED_MODEL.fullmatch(model)
         if served is None:
@@ -224,8 +231,6 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
             )
         if arguments.provider != DetectArguments.provider:
             raise UsageError(f"--provider {arguments.provider}: found a model on a server, which chooses its own")
-        if arguments.reads != 1:
-            raise UsageError(f"--reads {arguments.reads}: found a model on a server, which reads an image once")
         found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
     return found
 

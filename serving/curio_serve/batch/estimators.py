@@ -61,7 +61,7 @@ class Settings:
     max_instances: int | None = None
     """Largest number of instances of each kind of object; None: as many as one run of the network gives."""
     num_reads: int = 1
-    """How often each image is read, by models on this machine."""
+    """How often each image is read."""
 
 
 @dataclass(frozen=True)
@@ -319,6 +319,7 @@ class RemoteEstimator(Estimator):
             min_confidence=self.settings.min_confidence,
             max_detections=self.settings.max_detections,
             max_instances=self.settings.max_instances,
+            reads=self.settings.num_reads if self.settings.num_reads > 1 else None,
         )
         camera = camera or self.canonical.for_frame(answer.width, answer.height)
         spent = answer.milliseconds

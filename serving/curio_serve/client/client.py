@@ -110,6 +110,7 @@ class PoseClient(_Client):
         min_confidence: float | None = None,
         max_detections: int | None = None,
         max_instances: int | None = None,
+        reads: int | None = None,
         apply_exif_rotation: bool = False,
         color: Literal["rgb", "bgr"] = "rgb",
         request_id: str = "",
@@ -128,6 +129,7 @@ class PoseClient(_Client):
             max_detections: Largest number a region and model, the most confident; None: no limit.
             max_instances: Most of each kind of object and region, 1 to 16, by further runs of a network that reads one
                 pose; None: what one run gives.
+            reads: How often the image is read, 1 to 9, by as many runs of the network; None: once.
             apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
             color: Order of the channels of pixels; OpenCV reads images as ``bgr``.
             request_id: Comes back with the answer; empty: the server makes one up.
@@ -144,6 +146,7 @@ class PoseClient(_Client):
             min_confidence=min_confidence,
             max_detections=max_detections,
             max_instances=max_instances,
+            reads=reads,
             apply_exif_rotation=apply_exif_rotation,
             color=color,
             request_id=request_id,

@@ -32,6 +32,7 @@ def detect_request(
     min_confidence: float | None = None,
     max_detections: int | None = None,
     max_instances: int | None = None,
+    reads: int | None = None,
     apply_exif_rotation: bool = False,
     color: Literal["rgb", "bgr"] = "rgb",
     request_id: str = "",
@@ -47,6 +48,7 @@ def detect_request(
         min_confidence: None: the server's own threshold.
         max_detections: None: no limit.
         max_instances: Most of each kind of object and region, 1 to 16; None: what one run of the network gives.
+        reads: How often the image is read, 1 to 9; None: once.
         apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
         color: Order of the channels of pixels; OpenCV reads images as ``bgr``.
         request_id: Comes back with the answer; empty: the server makes one up.
@@ -64,6 +66,7 @@ def detect_request(
         min_confidence=min_confidence,
         max_detections=max_detections,
         max_instances=max_instances,
+        reads=reads,
         apply_exif_rotation=apply_exif_rotation,
         track=track,
     )

@@ -20,7 +20,7 @@ from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
 from curio_serve.models.crop_stage import CropPose
 from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Values
-from curio_serve.models.model import Model, Slot
+from curio_serve.models.model import Model, Outputs, Slot
 from curio_serve.models.reliability import add_interval, calibrated, region_status, status_of
 from curio_serve.models.repeated import RepeatedReader
 
@@ -58,10 +58,10 @@ class Detector:
             num_reads: How often each image is read, see :mod:`curio_serve.models.repeated`.
 
         Raises:
-            UsageError: The model cannot read an image more than once, or not that often.
+            ArgumentError: The model cannot read an image more than once, or not that often.
         """
         self.model = model
-        self._run = model.run if num_reads == 1 else RepeatedReader(model.spec, model.run, num_reads)
+        self._repeated = None if num_reads == 1 else RepeatedReader(model.spec, model.run, num_reads)
         self.depths_m = trained_depths_m(model.spec)
         self._calibration = tuple(model.spec.reliability.calibration)
 
@@ -151,12 +151,17 @@ class Detector:
         """The network's outputs for each image, computed a few at a time: memory stays flat however many there are."""
         outputs: list[Values] = []
         for start in range(0, len(images), _MAX_BATCH):
-            before_run()
             batch = images[start : start + _MAX_BATCH]
-            found = self._run(batch[0][None] if len(batch) == 1 else np.stack(batch))
+            found = self._read(batch[0][None] if len(batch) == 1 else np.stack(batch), before_run)
             rows = zip(*[value.tolist() for value in found.values()], strict=True)
             outputs += [dict(zip(found, row, strict=True)) for row in rows]
         return [self._calibrated(values) for values in outputs]
+
+    def _read(self, images: Array, before_run: Callable[[], None]) -> Outputs:
+        if self._repeated is not None:
+            return self._repeated(images, before_run)
+        before_run()
+        return self.model.run(images)
 
     def _calibrated(self, values: Values) -> Values:
         if "confidence" not in values:

@@ -10,7 +10,7 @@ import numpy as np
 from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_serve.consensus.poses import angles_deg, mean_rotation
-from curio_serve.errors import UsageError
+from curio_serve.errors import ArgumentError
 from curio_serve.imaging.looks import LOOKS
 from curio_serve.models.symmetries import symmetry_rotations
 
@@ -33,16 +33,16 @@ class RepeatedReader:
             num_reads: 2 to :data:`MAX_READS`.
 
         Raises:
-            UsageError: The number is out of range, or the model is of a flat world, without rotations, or with several
-                slots an object, whose reads cannot be told apart.
+            ArgumentError: The number is out of range, or the model is of a flat world, without rotations, or with
+                several slots an object, whose reads cannot be told apart.
         """
         if not 2 <= num_reads <= MAX_READS:
-            raise UsageError(f"{num_reads} reads of an image: expected 1 to {MAX_READS}")
+            raise ArgumentError(f"reads is {num_reads}; expected 1 to {MAX_READS}")
         has_rotation = any(field.name in ("rotation", "rotation_6d") for field in spec.fields)
         if not spec.camera.camera_matrix or not has_rotation or any(len(kind.slots) != 1 for kind in spec.objects):
-            raise UsageError(
-                f"model {spec.name} cannot read an image more than once: that needs a camera in space, rotations, and "
-                "one answer an object; leave out --reads"
+            raise ArgumentError(
+                f"reads is {num_reads}, and model {spec.name} reads an image once: more needs a camera in space, "
+                "rotations, and one answer an object"
             )
         self._run, self._looks = run, LOOKS[:num_reads]
         self._matrix = np.reshape(list(spec.camera.camera_matrix), (3, 3))
@@ -50,10 +50,16 @@ class RepeatedReader:
         self._symmetries = [symmetry_rotations(kind) for kind in kinds]
         self._diameters_m = [kind.diameter_m for kind in kinds]
 
-    def __call__(self, images: Array) -> Outputs:
-        """Outputs of the network's names for uint8 RGB images [batch, height, width, 3], float32 [batch, ...]."""
+    def __call__(self, images: Array, before_run: Callable[[], None] = lambda: None) -> Outputs:
+        """Outputs of the network's names, float32 [batch, ...].
+
+        Args:
+            images: uint8 RGB [batch, height, width, 3].
+            before_run: Called before each run of the network; what it raises ends the reading.
+        """
         reads = []
         for look in self._looks:
+            before_run()
             seen = np.stack([look.image(pixels, self._matrix) for pixels in images])
             reads.append({name: np.array(values, float) for name, values in self._run(seen).items()})
             self._bring_back(reads[-1], len(reads) - 1)

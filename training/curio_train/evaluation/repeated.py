@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from curio_serve.errors import UsageError as ServingUsageError
+from curio_serve.errors import ArgumentError
 from curio_serve.models.repeated import RepeatedReader
 from torch import Tensor
 
@@ -27,7 +27,7 @@ def reading_repeatedly(subject: Subject, num_reads: int) -> Subject:
 
     try:
         reader = RepeatedReader(model_spec(subject.world, subject.world.name), run, num_reads)
-    except ServingUsageError as exc:
+    except ArgumentError as exc:
         raise UsageError(f"--reads: {exc}") from exc
 
     def predict(images: Tensor) -> dict[str, Tensor]:
