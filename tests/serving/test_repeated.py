@@ -1,4 +1,4 @@
-"""Several reads of an image: looks show what such cameras see, reads that agree are averaged, others are outvoted."""
+"""Several reads of an image through virtual cameras: those that agree are averaged, others are outvoted."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -16,8 +16,8 @@ from curio_serve.client import PoseClient, detect_request, error_from_answer
 from curio_serve.client.request import views_request
 from curio_serve.errors import ArgumentError, UsageError
 from curio_serve.imaging.camera import PinholeCamera
-from curio_serve.imaging.looks import LOOKS, Look
 from curio_serve.imaging.rotation import from_rotation_vector
+from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS, VirtualCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
 from curio_serve.models.repeated import RepeatedReader
@@ -34,49 +34,49 @@ def spec(*symmetries: Symmetry, slots: tuple[int, ...] = (0,)) -> ModelSpec:
     return ModelSpec(name="thing", num_slots=len(slots), fields=fields, objects=[kind], camera=camera)
 
 
-def seen_by(look: Look, rotation: np.ndarray, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A pose as a network that knows K alone reads it from the image of a look: nearer by the zoom."""
-    position_m = look.look_from_cam @ position_m
-    return look.look_from_cam @ rotation, position_m / [1, 1, look.zoom]
+def seen_by(virtual: VirtualCamera, rotation: np.ndarray, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A pose as a network that knows K alone reads it through a virtual camera: nearer by the zoom."""
+    position_m = virtual.virtual_from_cam @ position_m
+    return virtual.virtual_from_cam @ rotation, position_m / [1, 1, virtual.zoom]
 
 
-@pytest.mark.parametrize("look", LOOKS)
-def test_a_look_shows_what_its_camera_sees(look: Look) -> None:
+@pytest.mark.parametrize("virtual", VIRTUAL_CAMERAS)
+def test_an_image_is_what_its_virtual_camera_sees(virtual: VirtualCamera) -> None:
     u, v, w = K @ POSITION_M
     pixels = np.zeros((64, 96, 3), np.uint8)
     x, y = round(u / w), round(v / w)
     pixels[y - 1 : y + 2, x - 1 : x + 2] = 255
     ray = np.linalg.inv(K) @ [x, y, 1.0]
-    expected = K @ np.diag([look.zoom, look.zoom, 1]) @ look.look_from_cam @ ray
-    weight = look.image(pixels, K)[..., 0].astype(float)
+    expected = K @ np.diag([virtual.zoom, virtual.zoom, 1]) @ virtual.virtual_from_cam @ ray
+    weight = virtual.image(pixels, K)[..., 0].astype(float)
     rows, columns = np.mgrid[:64, :96]
     center = (weight * columns).sum() / weight.sum(), (weight * rows).sum() / weight.sum()
     assert center == pytest.approx(expected[:2] / expected[2], abs=0.1)
 
 
-@pytest.mark.parametrize("look", LOOKS)
-def test_a_pose_of_a_look_is_brought_back(look: Look) -> None:
-    rotation, position_m = look.back(*seen_by(look, ROTATION, POSITION_M))
+@pytest.mark.parametrize("virtual", VIRTUAL_CAMERAS)
+def test_a_pose_of_a_virtual_camera_is_brought_back(virtual: VirtualCamera) -> None:
+    rotation, position_m = virtual.back(*seen_by(virtual, ROTATION, POSITION_M))
     np.testing.assert_allclose(position_m, POSITION_M, atol=1e-9)
-    tolerance = 1e-9 if look.zoom == 1 else 0.01  # the ray that a zoomed image shows the object on is another
+    tolerance = 1e-9 if virtual.zoom == 1 else 0.01  # the ray that a zoomed image shows the object on is another
     np.testing.assert_allclose(rotation, ROTATION, atol=tolerance)
 
 
 def reader(num_reads: int, *wrong: tuple[int, np.ndarray, float], kind: ModelSpec | None = None) -> RepeatedReader:
-    """Of a network that reads one pose, but others at some looks: (number of the look, turn, confidence)."""
+    """Of a network that reads one pose, but others through some cameras: (its number, turn, confidence)."""
     count, by_number = iter(range(num_reads)), {number: (turn, sure) for number, turn, sure in wrong}
 
     def read(images: np.ndarray) -> dict[str, np.ndarray]:
         number = next(count)
         turn, confidence = by_number.get(number, (np.eye(3), 0.6))
-        rotation, position_m = seen_by(LOOKS[number], ROTATION @ turn, POSITION_M)
+        rotation, position_m = seen_by(VIRTUAL_CAMERAS[number], ROTATION @ turn, POSITION_M)
         values = {
             "translation_m": position_m,
             "rotation": rotation,
             "rotation_6d": rotation.T[:2].ravel(),
             "confidence": confidence,
         }
-        light = LOOKS[number].look_from_cam @ [0.0, -1.0, 0.0]
+        light = VIRTUAL_CAMERAS[number].virtual_from_cam @ [0.0, -1.0, 0.0]
         found = {name: np.array(value, np.float32)[None, None] for name, value in values.items()}
         return {**found, "light": np.array([light], np.float32)}
 

@@ -180,7 +180,7 @@ def test_real_frames_are_scored_where_bop_asks(data: Path, tmp_path: Path) -> No
 
 
 def test_what_agrees_in_several_reads_is_scored(data: Path) -> None:
-    """Whatever the camera: an object that is always read there is where the mean of the looks is."""
+    """Whatever the camera: an object that is always read there is where the mean of the reads is."""
     world = build(LinemodOptions("ape", data, gaze=False))
     subject = reading_repeatedly(always_at(world, [0.0, 0.0, 0.8]), 5)
     images = torch.zeros(2, 3, world.camera.height, world.camera.width, dtype=torch.uint8)

@@ -11,21 +11,21 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_serve.consensus.poses import angles_deg, mean_rotation
 from curio_serve.errors import ArgumentError
-from curio_serve.imaging.looks import LOOKS
+from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS, VirtualCamera
 from curio_serve.models.symmetries import symmetry_rotations
 
 Array = np.ndarray
 Outputs = Mapping[str, Array]
-MAX_READS = len(LOOKS)
+MAX_READS = len(VIRTUAL_CAMERAS)
 _SAME_ROTATION_DEG = 25.0
 _SAME_PLACE = 0.5  # diameters
 
 
 class RepeatedReader:
-    """Runs a network once for each look; safe to share between threads as the network is."""
+    """Runs a network once for each virtual camera; safe to share between threads as the network is."""
 
     def __init__(self, spec: ModelSpec, run: Callable[[Array], Outputs], num_reads: int) -> None:
-        """Choose the looks.
+        """Choose the virtual cameras.
 
         Args:
             spec: Of the model: K*, and one slot an object.
@@ -44,7 +44,7 @@ class RepeatedReader:
                 f"reads is {num_reads}, and model {spec.name} reads an image once: more needs a camera in space, "
                 "rotations, and one answer an object"
             )
-        self._run, self._looks = run, LOOKS[:num_reads]
+        self._run, self._cameras = run, VIRTUAL_CAMERAS[:num_reads]
         self._matrix = np.reshape(list(spec.camera.camera_matrix), (3, 3))
         kinds = sorted(spec.objects, key=lambda kind: kind.slots[0])
         self._symmetries = [symmetry_rotations(kind) for kind in kinds]
@@ -58,24 +58,14 @@ class RepeatedReader:
             before_run: Called before each run of the network; what it raises ends the reading.
         """
         reads = []
-        for look in self._looks:
+        for camera in self._cameras:
             before_run()
-            seen = np.stack([look.image(pixels, self._matrix) for pixels in images])
+            seen = np.stack([camera.image(pixels, self._matrix) for pixels in images])
             reads.append({name: np.array(values, float) for name, values in self._run(seen).items()})
-            self._bring_back(reads[-1], len(reads) - 1)
+            _bring_back(reads[-1], camera)
         rows = [[{name: values[row] for name, values in read.items()} for read in reads] for row in range(len(images))]
         agreed = [self._agreed(of_image) for of_image in rows]
         return {name: np.stack([one[name] for one in agreed]).astype(np.float32) for name in agreed[0]}
-
-    def _bring_back(self, read: dict[str, Array], number: int) -> None:
-        """Put the poses and the light of a look into the camera's frame."""
-        look = self._looks[number]
-        for row, positions in enumerate(read["translation_m"]):
-            for slot, position in enumerate(positions):
-                found = look.back(read["rotation"][row, slot], position)
-                read["rotation"][row, slot], positions[slot] = found
-        if "light" in read:
-            read["light"] = read["light"] @ look.look_from_cam
 
     def _agreed(self, reads: list[dict[str, Array]]) -> dict[str, Array]:
         """The outputs of one image."""
@@ -85,7 +75,7 @@ class RepeatedReader:
         for slot, symmetries in enumerate(self._symmetries):
             angle, turned = angles_deg(rotation[:, None, slot], rotation[:, slot], symmetries)
             apart = np.linalg.norm(position[:, None, slot] - position[:, slot], axis=-1) / self._diameters_m[slot]
-            agree = (angle < _SAME_ROTATION_DEG) & (apart < _SAME_PLACE)
+            agree = (angle < _SAME_ROTATION_DEG) & (apart < _SAME_PLACE) | np.eye(len(reads), dtype=bool)
             best = int((confidence[:, slot] @ agree).argmax())
             members = np.flatnonzero(agree[:, best])
             alike = rotation[members, slot] @ symmetries[turned[members, best]]
@@ -98,3 +88,12 @@ class RepeatedReader:
         if "rotation_6d" in found:
             found["rotation_6d"] = np.concatenate([found["rotation"][..., 0], found["rotation"][..., 1]], axis=-1)
         return found
+
+
+def _bring_back(read: dict[str, Array], camera: VirtualCamera) -> None:
+    """Put the poses and the light that a virtual camera sees into the real one's frame."""
+    for row, positions in enumerate(read["translation_m"]):
+        for slot, position in enumerate(positions):
+            read["rotation"][row, slot], positions[slot] = camera.back(read["rotation"][row, slot], position)
+    if "light" in read:
+        read["light"] = read["light"] @ camera.virtual_from_cam

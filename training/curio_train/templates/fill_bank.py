@@ -41,7 +41,7 @@ def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> 
     focal_px = FILL * CROP_PX * depth / geometry.diameter_m
     renderer = CropTemplateRenderer(mesh, depth, geometry.focal_px, focal_px, CROP_PX)
     choice = _PointChoice()
-    fine, coarse, covers, chosen, of_object = [], [], [], [], []  # of every look, batch after batch
+    fine, coarse, covers, chosen, of_object = [], [], [], [], []  # of all templates, batch after batch
     for rotations in views.split(_BATCH):
         drawn = renderer.draw(rotations)
         behind = [crops[torch.from_numpy(random.integers(0, len(crops), len(rotations)))] for _ in APPEARANCES]

@@ -22,10 +22,10 @@ NUM_NEIGHBOURS = 4
 """Templates around the best hypothesis whose answers are averaged, in each crop of its place."""
 
 NUM_CLOSER = 2
-"""Hypotheses of the first look around which crops are cut again, at their own distance."""
+"""Hypotheses of the first pass around which crops are cut again, at their own distance."""
 
 STEPS = (3, 5, 4)
-"""Of the alignment: of every hypothesis of the first look and of the second, then of the best with its neighbours."""
+"""Of the alignment: of every hypothesis of the first pass and of the second, then of the best with its neighbours."""
 
 LAMP = (0.0, -0.7, -0.7)
 """The light that templates are drawn under and that is answered: it is not read from images."""
@@ -300,7 +300,7 @@ def _best(found: _Hypotheses) -> _Hypotheses:
     return _Hypotheses(Aligned(*(of_all[row] for of_all in found.pose)), found.crop[row], found.place_score[row])
 
 
-def _in_all_rolls(crops: _Crops, crop: Int[Tensor, " rows"], pose: Aligned) -> tuple[Int[Tensor, " looks"], Aligned]:
+def _in_all_rolls(crops: _Crops, crop: Int[Tensor, " rows"], pose: Aligned) -> tuple[Int[Tensor, " rolled"], Aligned]:
     """The crops of the same place in all rolls, and poses in their cameras, one after the other."""
     num = len(ROLLS_DEG)
     rolled = (crop - crop % num)[:, None] + torch.arange(num, device=crop.device)

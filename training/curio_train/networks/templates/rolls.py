@@ -17,8 +17,8 @@ ROLLS_DEG = (-2 * MAX_ROLL_DEG / NUM_ROLLS, 0.0, 2 * MAX_ROLL_DEG / NUM_ROLLS)
 
 
 def upright_rolls(
-    position: Float[Tensor, "looks 3"], upward: Float[Tensor, "looks 3"]
-) -> Float[Tensor, "looks*rolls 3 3"]:
+    position: Float[Tensor, "places 3"], upward: Float[Tensor, "places 3"]
+) -> Float[Tensor, "places*rolls 3 3"]:
     """What cameras that look at objects turn what they see by: :data:`ROLLS_DEG`, one after the other.
 
     Args:

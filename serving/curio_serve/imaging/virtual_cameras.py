@@ -1,8 +1,8 @@
 """Virtual cameras that are turned and zoomed a little, so that a network reads one image several times.
 
-A network's errors on photographs change with each pixel that an object moves: half of them are gone with another look
-at the same frame. Turning a camera about its centre changes its image by a homography alone, and so does another focal
-length, so each look is the image that such a camera would have taken, and its poses are brought back exactly.
+This is test-time augmentation: a network's errors on photographs change with each pixel that an object moves. Turning a
+camera about its centre changes its image by a homography alone, and so does another focal length, so each warped image
+is the one that such a camera would have taken, and its poses are brought back exactly.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ _AXES = np.array([[0.0, 0, 1], [0, 1, 0], [1, 0, 0]])  # of roll, pan and tilt
 
 
 @dataclass(frozen=True)
-class Look:
-    """A camera at the place of another."""
+class VirtualCamera:
+    """A camera at the place of the real one."""
 
     roll_deg: float = 0.0
     """Turn about the optical axis."""
@@ -30,7 +30,7 @@ class Look:
     """Turn about its x axis."""
 
     @property
-    def look_from_cam(self) -> Array:
+    def virtual_from_cam(self) -> Array:
         """Rotation [3, 3]."""
         angles = np.radians([self.roll_deg, self.pan_deg, self.tilt_deg])
         roll, pan, tilt = from_rotation_vector(angles[:, None] * _AXES)
@@ -44,26 +44,26 @@ class Look:
             pixels: uint8 RGB [height, width, 3].
             matrix: K [3, 3] of them.
         """
-        if self == Look():
+        if self == VirtualCamera():
             return pixels
-        homography = matrix @ np.diag([self.zoom, self.zoom, 1.0]) @ self.look_from_cam @ np.linalg.inv(matrix)
+        homography = matrix @ np.diag([self.zoom, self.zoom, 1.0]) @ self.virtual_from_cam @ np.linalg.inv(matrix)
         size = pixels.shape[1], pixels.shape[0]
         return cv2.warpPerspective(pixels, homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def back(self, rotation: Array, translation_m: Array) -> tuple[Array, Array]:
-        """A pose read from the image of this look as if its camera had K, in the camera's frame.
+        """A pose read from this camera's image as if it had K, in the real camera's frame.
 
-        Where the look is zoomed, an object appears in another direction than it has: the rotation that it appears with
-        is kept along its ray.
+        Where the camera is zoomed, an object appears in another direction than it has: the rotation that it appears
+        with is kept along its ray.
 
         Args:
             rotation: cam_from_obj [3, 3].
             translation_m: [3], in front of the camera.
         """
-        cam_from_look = self.look_from_cam.T
+        cam_from_virtual = self.virtual_from_cam.T
         true_m = translation_m * np.array([1.0, 1.0, self.zoom])
         turned = smallest_rotation(_unit(translation_m), _unit(true_m))
-        return cam_from_look @ turned @ rotation, cam_from_look @ true_m
+        return cam_from_virtual @ turned @ rotation, cam_from_virtual @ true_m
 
 
 def _unit(vector: Array) -> Array:
@@ -71,15 +71,15 @@ def _unit(vector: Array) -> Array:
     return result
 
 
-LOOKS = (
-    Look(),
-    Look(roll_deg=8),
-    Look(roll_deg=-8),
-    Look(zoom=1.06),
-    Look(zoom=0.94),
-    Look(pan_deg=2),
-    Look(roll_deg=8, zoom=1.06),
-    Look(roll_deg=-8, zoom=1.06),
-    Look(pan_deg=-2, tilt_deg=1),
+VIRTUAL_CAMERAS = (
+    VirtualCamera(),
+    VirtualCamera(roll_deg=8),
+    VirtualCamera(roll_deg=-8),
+    VirtualCamera(zoom=1.06),
+    VirtualCamera(zoom=0.94),
+    VirtualCamera(pan_deg=2),
+    VirtualCamera(roll_deg=8, zoom=1.06),
+    VirtualCamera(roll_deg=-8, zoom=1.06),
+    VirtualCamera(pan_deg=-2, tilt_deg=1),
 )
-"""The image as it is, and looks in the order in which they are taken."""
+"""The real camera itself, and others in the order in which images are read through them."""
