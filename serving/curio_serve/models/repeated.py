@@ -4,7 +4,7 @@ As many runs of the network as reads. The mean of reads that agree is nearer to 
 each is misled by other pixels; and how many agree says more about a pose than the network's confidence does.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ModelSpec
@@ -12,10 +12,10 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve.consensus.poses import angles_deg, mean_rotation
 from curio_serve.errors import ArgumentError
 from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS, VirtualCamera
+from curio_serve.models.model import Outputs
 from curio_serve.models.symmetries import symmetry_rotations
 
 Array = np.ndarray
-Outputs = Mapping[str, Array]
 MAX_READS = len(VIRTUAL_CAMERAS)
 _SAME_ROTATION_DEG = 25.0
 _SAME_PLACE = 0.5  # diameters

@@ -82,7 +82,8 @@ def evaluate(
         What was evaluated, ``metrics`` by name, the same of the network before its first step as ``untrained``,
         ``reliability`` of the confidence where one object has one, and
         ``real`` where real frames were scored, ``photographs`` where there are some to judge by, and
-        ``refined`` with ``metrics`` and ``real`` of refined poses. A run folder gets it as well, and a report.
+        ``refined`` with ``metrics`` and ``real`` of refined poses. A run folder gets it as well, and a report, unless
+        images were read more than once.
 
     Raises:
         CurioError: Any of this package's errors.
@@ -117,7 +118,7 @@ def evaluate(
             result["refined"]["real"] = evaluate_real_frames(better, data, bop_results, "-refined")
     if (judgement := _judged(subject, warn)) is not None:
         result["photographs"] = judgement.summary
-    if (path / CONFIG_FILE).exists():
+    if reads == 1 and (path / CONFIG_FILE).exists():  # cards and reports are of the model as it answers by itself
         keep(path / EVALUATION_FILE, result)
         progress("the report")
         errors = scene_errors(subject.world, predicted, held_out.code)

@@ -35,9 +35,7 @@ from curio_train.worlds.single_object.world import SingleObjectWorld
 _NUM_FRAMES, _NUM_CROPS = 24, 256  # of backgrounds
 _SEED = 20_211
 _BATCH = 64  # of drawings
-_FEATURES_BATCH = 8  # of pictures: larger feature maps are allocated anew each time, which takes five times as long
 _PAD_CELLS = 2  # around localising templates, so that no kernel sees the picture's border
-_INSIDE = 0.98  # of the pixels around a surface point show the object
 
 
 def template_network(world: World) -> TemplateNetwork:
