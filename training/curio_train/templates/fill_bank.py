@@ -51,7 +51,7 @@ def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> 
         of_object.append(seen[0][0].movedim(1, 0)[:, inside])
         fine.append(torch.stack([_at(one, chosen[-1]) for one, _ in seen]))
         coarse.append(torch.stack([one for _, one in seen]))
-        covers.append(drawn.alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE])
+        covers.append(drawn.alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE].clone())
     fine_background, coarse_background = features(trunk, crops)
     covered, of_coarse = torch.cat(covers), torch.cat(coarse, dim=1)
     of_crop.compress(of_crop.whiten(coarse_background), of_coarse[0], covered)

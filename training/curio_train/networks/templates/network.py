@@ -38,7 +38,7 @@ class TemplateNetwork(nn.Module):
         super().__init__()
         self.trunk, self.localiser, self.reader = Trunk(), Localiser(geometry), PoseReader([geometry], steps)
         self.geometry = geometry
-        self.register_buffer("color", torch.zeros(3 if has_color else 0))
+        self.register_buffer("color", torch.zeros(3 if has_color else 0), persistent=has_color)
         self.requires_grad_(False)
         self.eval()
 
