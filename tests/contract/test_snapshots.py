@@ -45,7 +45,6 @@ ERRORS = {
     "train-mistyped-class": "curio-train linemod --class aple --data lmo",
     "train-mistyped-flag": "curio-train linemod --class ape --minuts 3",
     "train-pseudo-labels-without-photos": "curio-train linemod --class ape --data lmo --self-training 0.5",
-    "train-photos-of-several": "curio-train linemod --class ape,can --data lmo --photos .",
     "train-poses-without-photos": "curio-train linemod --class ape --data lmo --views views.json",
     "train-photos-of-the-paper-network": "curio-train linemod --class ape --data lmo --photos . --one-stage",
     "train-capture-no-mesh": "curio-train capture --mesh gone.stl --camera camera.json --photos .",

@@ -147,6 +147,11 @@ def index(code: SceneCode, rows: Tensor | slice) -> dict[str, Tensor]:
     return {name: value[rows] for name, value in code.items()}
 
 
+def of_slot(code: SceneCode, slot: int) -> dict[str, Tensor]:
+    """Codes of one object alone: per-object fields [batch, 1, size], and what the whole scene has in common."""
+    return {name: value[:, slot : slot + 1] if value.ndim == 3 else value for name, value in code.items()}
+
+
 def joined(codes: Sequence[SceneCode]) -> dict[str, Tensor]:
     """The code of all images of several batches, at least one."""
     return {name: torch.cat([code[name] for code in codes]) for name in codes[0]}

@@ -1,14 +1,20 @@
 """Self-training: when photographs get pseudo-labels, and how they are mixed into the synthetic batches.
 
-``refinement.pseudo_labels`` says how the labels are made.
+``refinement.pseudo_labels`` and, for several objects, ``refinement.scene_labels`` say how the labels are made.
 """
+
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from curio_train.networks.several_objects.network import ObjectsNetwork
+from curio_train.refinement.photographed_objects import learn_from_photographs
 from curio_train.refinement.pseudo_labels import PseudoLabels
+from curio_train.refinement.scene_labels import SceneLabels
 from curio_train.scene_code import SceneCode
-from curio_train.worlds.base import World
+from curio_train.worlds.base import StagedWorld, World
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
 ROUNDS, ROUNDS_OF_PRETRAINED = (0.6, 0.8), (0.2, 0.5, 0.8)
 """Fractions of the budget after which a pseudo-labelling round is due: late, when the network's poses are good enough;
@@ -44,7 +50,7 @@ class SelfTraining:
         self._world, self._network, self._fraction, self._device = world, network, fraction, device
         self._rounds = ROUNDS_OF_PRETRAINED if pretrained else ROUNDS
         self._seconds = None if minutes is None else LARGEST_SHARE * 60 * minutes
-        self._labels: PseudoLabels | None = None
+        self._labels: PseudoLabels | SceneLabels | None = None
         self._num_rounds = 0
 
     def is_due(self, spent: float) -> bool:
@@ -59,11 +65,28 @@ class SelfTraining:
         """
         self._num_rounds = self._rounds_until(spent)
         self._network.eval()
-        self._labels = PseudoLabels.from_photographs(self._world, self._predict, self._seconds) or self._labels
+        self._labels = self._labels_of_photographs() or self._labels
         self._network.train()
 
+    def finish(self, cache: Path) -> None:
+        """Once the network is trained, calibrate its confidence, and let its templates learn from photographs.
+
+        Args:
+            cache: Folder of the image sets that worlds draw once.
+
+        Raises:
+            DataError: The backgrounds cannot be read.
+        """
+        world, network = self._world, self._network
+        if isinstance(self._labels, SceneLabels):
+            assert isinstance(world, SeveralObjectsWorld)
+            assert isinstance(network, ObjectsNetwork)
+            learn_from_photographs(network, world, self._labels, cache)
+        elif isinstance(world, StagedWorld):
+            world.calibrate_confidence(network, cache)
+
     def mix_in(self, code: SceneCode, images: Tensor, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:
-        """The last stage's codes and images with the first ones replaced by pseudo-labelled crops of photographs.
+        """The last stage's codes and images with the first ones replaced by pseudo-labelled photographs, or crops.
 
         Args:
             code: Of the renderings.
@@ -76,6 +99,11 @@ class SelfTraining:
         num = len(crops)
         mixed = {name: torch.cat([code[name][num:], value.to(images.device)]) for name, value in labels.items()}
         return mixed, torch.cat([images[num:], crops.to(images)])
+
+    def _labels_of_photographs(self) -> PseudoLabels | SceneLabels | None:
+        if isinstance(self._world, SeveralObjectsWorld):
+            return SceneLabels.from_photographs(self._world, self._predict, self._seconds)
+        return PseudoLabels.from_photographs(self._world, self._predict, self._seconds)
 
     def _rounds_until(self, spent: float) -> int:
         return sum(spent >= fraction for fraction in self._rounds)

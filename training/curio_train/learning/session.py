@@ -20,7 +20,7 @@ from curio_train.learning.trainer import Trainer
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.templates.build import fill_objects
 from curio_train.worlds import build
-from curio_train.worlds.base import HypothesisWorld, ImageSource, StagedWorld, World, stages_of
+from curio_train.worlds.base import HypothesisWorld, ImageSource, World, stages_of
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
 
@@ -97,10 +97,6 @@ def learn(
                 begin_with(trainer.state, config.init)
             _draw_templates(trainer, cache)
 
-        def finish() -> None:
-            if isinstance(world, StagedWorld):
-                world.calibrate_confidence(trainer.state.pose.network, cache)
-
         with reporting(path, trainer.state.progress) if here.leads else nullcontext() as reporter:
             outcome = train(
                 trainer,
@@ -108,6 +104,6 @@ def learn(
                 interruption,
                 reporter,
                 checkpoint_minutes,
-                finish=finish,
+                finish=lambda: trainer.self_training.finish(cache),
             )
         return outcome, trainer.state.progress

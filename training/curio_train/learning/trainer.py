@@ -76,10 +76,10 @@ class Trainer:
         self._micro_batches = ranks.micro_batches(self._num_micro)
         self._stages = [Stage(*parts) for parts in zip(stages_of(world), self.state.stages, sources, strict=True)]
         network, fraction = self.state.pose.network, config.recipe.self_training
-        self_training = SelfTraining(
+        self.self_training = SelfTraining(
             network, world, fraction, ranks.device, pretrained=config.init is not None, minutes=config.minutes
         )
-        self.synthetic = SyntheticBatches(config, world, sources, ranks, self_training)
+        self.synthetic = SyntheticBatches(config, world, sources, ranks, self.self_training)
 
     def step(self, rate: float) -> dict[str, float]:
         """One whole step: every micro-batch adds its gradients, then all networks move.

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.refinement.template_poses import uses_templates
-from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode
+from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode, of_slot
 from curio_train.worlds.base import World
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
@@ -35,11 +35,6 @@ def with_refinement(
         }
 
     return refined
-
-
-def of_slot(code: SceneCode, slot: int) -> dict[str, Tensor]:
-    """Codes of one object alone: per-object fields [batch, 1, size], and what the whole scene has in common."""
-    return {name: value[:, slot : slot + 1] if value.ndim == 3 else value for name, value in code.items()}
 
 
 def _refiners(world: World, method: str) -> list[RenderAndCompare]:

@@ -70,7 +70,7 @@ class LinemodPhotographs:
         try:
             structure = recover(paths, self._camera)
         except CurioError as exc:
-            _log.warning("photographs get pseudo-labels one by one, because no camera poses were recovered: %s", exc)
+            _log.warning("photographs do not correct each other, because no camera poses were recovered: %s", exc)
             return None
         matrices = np.full((len(paths), 4, 4), np.nan)
         matrices[[paths.index(path) for path in structure.photographs]] = structure.cam_from_world
@@ -127,15 +127,15 @@ def build(options: LinemodOptions) -> World:
         return ClutterBackgrounds.cached(cache, others)
 
     members = [_object(dataset, name, slot, backgrounds) for slot, name in enumerate(names)]
+    photographs = None
+    if options.photos is not None:
+        photographs = LinemodPhotographs(options.photos, dataset.camera, options.views)
     if len(members) > 1:
-        return SeveralObjectsWorld("linemod", [member.without_scan_excess() for member in members])
+        return SeveralObjectsWorld("linemod", [member.without_scan_excess() for member in members], photographs)
     (object_,) = members
     if not options.gaze:
         layout = pose_layout(position_field(object_), confidence=False)
         return SingleObjectWorld("linemod", object_, squeezed(dataset.camera, SIDE_PX), layout)
-    photographs = None
-    if options.photos is not None:
-        photographs = LinemodPhotographs(options.photos, dataset.camera, options.views)
     return TwoStageWorld("linemod", object_, photographs)
 
 

@@ -80,9 +80,10 @@ class LinemodOptions(WorldOptions):
     backgrounds: Path | None = None
     """Folder of photographs for backgrounds; without it clutter is rendered."""
     photos: Path | None = None
-    """Folder of unlabelled frames of the data set's camera. Towards the end of training the two-stage detector learns
-    from them, with the poses that it estimates there itself (--self-training, which is 0 without them). Frames of one
-    scene from several viewpoints, in the order of their names, correct each other."""
+    """Folder of unlabelled frames of the data set's camera. Towards the end of training the detector learns from them,
+    with the poses that it estimates there itself (--self-training, which is 0 without them). Frames of one scene from
+    several viewpoints, in the order of their names, correct each other; a detector for several objects learns from no
+    others."""
     views: Path | None = None
     """File with the camera poses of --photos, in metres, as capture --calibrate --views-out writes it. Without it they
     are recovered from the photographs, and their scale from the estimated object poses."""
@@ -103,11 +104,6 @@ class LinemodOptions(WorldOptions):
         if not self.gaze and self.photos is not None:
             raise UsageError(
                 f"--photos {self.photos}: only the two-stage detector learns from them; leave out --one-stage"
-            )
-        if self.photos is not None and (self.class_name == ALL_CLASSES or "," in self.class_name):
-            raise UsageError(
-                f"--photos {self.photos}: only a detector for one object learns from them, and --class "
-                f"{self.class_name} names several; leave out --photos"
             )
 
 

@@ -75,21 +75,58 @@ class Banks(nn.Module):
         self.coarse_mean[number] = bank.coarse.mean
         self.coarse_projection[number] = bank.coarse.projection
         self.fine_mean[number] = bank.fine.mean
-        filters, of_filters = to_bytes(bank.filters.flatten(1))
-        weights, of_weights = to_bytes(bank.weights.T)
+        self.put_filters(number, bank.filters, bank.weights)
         points, of_points = to_bytes(bank.points.flatten()[None])
-        self.filters[number] = filters.view_as(self.filters[number])
-        self.weights[number] = weights.T
-        self.match_scale[number] = of_filters * of_weights
         self.points[number] = points.view_as(self.points[number])
         self.points_scale[number] = of_points[0]
-        codes, codewords = to_codes(bank.described.flatten(0, 1), _PARTS)
-        self.codes[number] = codes.view_as(self.codes[number])
-        self.codewords[number] = codewords
+        self.put_described(number, bank.described)
         outline, of_outline = to_bytes(bank.outline.flatten()[None])
         self.outline[number] = outline.view_as(self.outline[number])
         self.outline_scale[number] = of_outline[0]
         self.outward[number] = (LARGEST_BYTE * bank.outward).round().to(torch.int8)
+
+    def put_filters(
+        self, number: int, filters: Float[Tensor, "rank size cells cells"], weights: Float[Tensor, "templates rank"]
+    ) -> None:
+        """Compress and keep whole templates of one object, weighted sums of few filters."""
+        in_bytes, of_filters = to_bytes(filters.flatten(1))
+        weights_in_bytes, of_weights = to_bytes(weights.T)
+        self.filters[number] = in_bytes.view_as(self.filters[number])
+        self.weights[number] = weights_in_bytes.T
+        self.match_scale[number] = of_filters * of_weights
+
+    def put_described(self, number: int, described: Float[Tensor, "templates points channels"]) -> None:
+        """Compress and keep the fine descriptors of one object's surface points."""
+        codes, codewords = to_codes(described.flatten(0, 1), _PARTS)
+        self.codes[number] = codes.view_as(self.codes[number])
+        self.codewords[number] = codewords
+
+    def templates(self, number: int) -> Float[Tensor, "templates size cells cells"]:
+        """Whole templates of one object, as :meth:`match` uses them."""
+        weights = self.weights[number].float() * self.match_scale[number]
+        return (weights @ self.filters[number].float().flatten(1)).unflatten(1, self.filters.shape[2:])
+
+    def points_of(self, number: int) -> Float[Tensor, "templates points 3"]:
+        """Surface points of one object, diameters."""
+        return self.points[number].float() * self.points_scale[number]
+
+    def described(self, number: int) -> Float[Tensor, "templates points channels"]:
+        """Fine descriptors of one object's surface points."""
+        parts = torch.arange(_PARTS, device=self.codes.device)
+        return self.codewords[number][parts, self.codes[number].long()].float().flatten(2)
+
+    def coarse_of(
+        self, number: int, features: Float[Tensor, "batch channels rows columns"]
+    ) -> Float[Tensor, "batch size rows columns"]:
+        """Descriptors at stride 8 as templates of one object have them."""
+        centred = features - self.coarse_mean[number][:, None, None]
+        return normalised(F.conv2d(centred, self.coarse_projection[number][..., None, None]), dim=1)
+
+    def fine_of(
+        self, number: int, features: Float[Tensor, "batch channels rows columns"]
+    ) -> Float[Tensor, "batch channels rows columns"]:
+        """Descriptors at stride 4 as surface points of one object have them."""
+        return normalised(features - self.fine_mean[number][:, None, None], dim=1)
 
     def match(
         self, features: Float[Tensor, "batch objects num channels rows columns"]

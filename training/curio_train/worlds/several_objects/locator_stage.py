@@ -47,10 +47,11 @@ class LocatorStage(ObjectScenes):
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
         """Cross entropy of the heat maps, and the errors of the proposals at the centres (after Zhou et al. 2019).
 
-        An image teaches nothing about an object that another one hides.
+        An image teaches nothing about an object that another one hides, or whose true confidence is NaN: nobody knows
+        whether it is there.
         """
         position, present = true[TRANSLATION], true[CONFIDENCE][..., 0] > 0.5
-        taught = ~self._hidden(position, present)
+        taught = ~self._hidden(position, present) & ~true[CONFIDENCE][..., 0].isnan()
         grid = camera_grid(self.camera, self.layout[TRANSLATION]).to(position.device)
         splat = grid.splat_weights(grid.project(position))  # [batch, objects, 4]
         rows = position.shape[0] * position.shape[1]

@@ -16,22 +16,27 @@ from curio_train.networks.templates.geometry import Geometry
 from curio_train.worlds.several_objects.confidence import calibrate
 from curio_train.worlds.several_objects.locator_stage import LocatorStage
 from curio_train.worlds.several_objects.scenes import ObjectScenes
-from curio_train.worlds.single_object.two_stage import frame_camera
+from curio_train.worlds.single_object.two_stage import TrainingPhotographs, frame_camera
 from curio_train.worlds.single_object.world import Object, pose_layout, position_field
 
 
 class SeveralObjectsWorld(ObjectScenes):
     """Several objects of one camera in six degrees of freedom, each at most once in a frame."""
 
-    def __init__(self, name: str, members: Sequence[Object]) -> None:
-        """Build the stage.
+    photographs: TrainingPhotographs | None
+    """Photographs of a scene with the objects; None: there are none."""
+
+    def __init__(self, name: str, members: Sequence[Object], photographs: TrainingPhotographs | None = None) -> None:
+        """Build the stage; photographs are not read before they are needed.
 
         Args:
             name: As on the command line.
             members: The objects, each with the slot of its place in this order.
+            photographs: Of a scene with the objects.
         """
         layout = pose_layout(position_field(members[0]), confidence=True, num_slots=len(members))
         super().__init__(name, members, frame_camera(members[0].camera), layout)
+        self.photographs = photographs
         self._stage = LocatorStage(members, self.camera)
 
     @property

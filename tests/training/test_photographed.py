@@ -1,0 +1,101 @@
+"""Templates learn how an object looks from photographs whose poses are known."""
+
+import numpy as np
+import pytest
+import torch
+from curio_train.camera import Intrinsics
+from curio_train.config import NetworkConfig
+from curio_train.data.backgrounds import ClutterBackgrounds
+from curio_train.geometry import Pose
+from curio_train.meshes.shapes import chair
+from curio_train.networks.crop_camera import cut_crops
+from curio_train.networks.several_objects.network import ObjectsNetwork
+from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
+from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, RANK, Bank
+from curio_train.networks.templates.descriptors import Descriptors
+from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS, NUM_VIEWS
+from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
+from curio_train.templates.photographed import learn_appearance
+from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+from curio_train.worlds.single_object.world import Object
+
+K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
+MESH = chair(0.2)
+VIEW, ROLL = 150, 2  # of the template that the photograph shows
+DISTANCE_M = 0.8
+
+
+@pytest.fixture(scope="module")
+def world() -> SeveralObjectsWorld:
+    kinds = [ObjectKind(f"chair-{n}", (n,), MESH.diameter_m, MESH.box_corners_m, MESH.sha256) for n in range(2)]
+    pool = np.full((2, 480, 640, 3), 128, np.uint8)
+    camera = Intrinsics(K, 640, 480)
+    members = [Object(kind, MESH, camera, 0.5, 1.5, lambda _: ClutterBackgrounds(pool)) for kind in kinds]
+    return SeveralObjectsWorld("linemod", members)
+
+
+def with_random_templates(world: SeveralObjectsWorld) -> ObjectsNetwork:
+    network = world.assemble([stage.network(NetworkConfig()) for stage in world.stages])
+    assert isinstance(network, ObjectsNetwork)
+    network.locator.trunk.load_state_dict(Trunk.pretrained().state_dict())
+    random, cells = torch.Generator().manual_seed(0), CROP_PX // COARSE_STRIDE
+    num = NUM_VIEWS * NUM_ROLLS
+    for slot in range(2):
+        network.reader.banks.put(
+            slot,
+            Bank(
+                Descriptors(COARSE_WIDTH, COARSE_SIZE),
+                Descriptors(FINE_WIDTH, FINE_WIDTH),
+                torch.randn(RANK, COARSE_SIZE, cells, cells, generator=random) * 0.05,
+                torch.randn(num, RANK, generator=random) * 0.05,
+                (torch.rand(num, NUM_POINTS, 3, generator=random) - 0.5) * 0.5,
+                torch.nn.functional.normalize(torch.randn(num, NUM_POINTS, FINE_WIDTH, generator=random), dim=2),
+                torch.randn(NUM_VIEWS, NUM_OUTLINE_POINTS, 3, generator=random) * 0.3,
+                torch.nn.functional.normalize(torch.randn(NUM_VIEWS, NUM_OUTLINE_POINTS, 3, generator=random), dim=2),
+            ),
+        )
+    return network.eval()
+
+
+@torch.no_grad()
+def agreement(network: ObjectsNetwork, frame: torch.Tensor, pose: Pose) -> tuple[float, float]:
+    """Mean cosine with what the photograph shows of its template's surface points, and of the whole template."""
+    number, position_m = VIEW * NUM_ROLLS + ROLL, torch.from_numpy(pose.translation_m[0]).float()
+    banks = network.reader.banks
+    focal_px = torch.tensor([FILL * CROP_PX * float(position_m.norm()) / MESH.diameter_m])
+    crop, _ = cut_crops(
+        frame[None].float() / 255, torch.from_numpy(K).float(), position_m[None, None], focal_px, CROP_PX, 1
+    )
+    fine, coarse = network.locator.trunk(crop)
+    start = Aligned(banks.rotations[number][None], position_m[None] / MESH.diameter_m, torch.zeros(1))
+    shown = banks.points_of(0)[number][None], banks.described(0)[number][None]
+    found = align(FeatureMaps.of(banks.fine_of(0, fine)), torch.tensor([0]), *shown, start, focal_px, 0)
+    both = coarse[:, None, None].expand(-1, 2, -1, -1, -1, -1)
+    return float(found.score), float(banks.match(both)[0, 0, 0, number, 0])
+
+
+def test_what_a_photograph_shows_is_learned_and_the_rest_stays(world: SeveralObjectsWorld) -> None:
+    network = with_random_templates(world)
+    banks = network.reader.banks
+    rough = torch.rand(1, 3, 60, 80, generator=torch.Generator().manual_seed(1))
+    smooth = torch.nn.functional.interpolate(rough, (480, 640), mode="bicubic").clamp(0, 1)
+    frames = (255 * smooth).byte().expand(2, -1, -1, -1)
+    shown = banks.rotations[VIEW * NUM_ROLLS + ROLL].double().numpy()
+    # One photograph shows it on the optical axis; where it is in the other nobody knows.
+    rotation, position_m = np.full((2, 3, 3), np.nan), np.full((2, 3), np.nan)
+    rotation[0], position_m[0] = shown, [0, 0, DISTANCE_M]
+    unknown = Pose(np.full((2, 3, 3), np.nan), np.full((2, 3), np.nan))
+    pose = Pose(rotation, position_m)
+
+    before, described, other = agreement(network, frames[0], pose), banks.described(0), banks.codes[1].clone()
+    learn_appearance(network, frames, [pose, unknown])
+    after = agreement(network, frames[0], pose)
+    assert after[0] > before[0] + 0.2
+    assert after[1] > before[1] + 0.1
+    assert torch.equal(banks.codes[1], other), "nothing is known of the other object"
+
+    directions = banks.rotations[:, 2]
+    far = directions @ directions[VIEW * NUM_ROLLS] < 0.9
+    kept = torch.nn.functional.cosine_similarity(banks.described(0)[far], described[far], dim=2)
+    assert float(kept.mean()) > 0.8, "codewords are chosen anew, which costs a little"

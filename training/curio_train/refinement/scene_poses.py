@@ -1,0 +1,121 @@
+"""Where each of several objects lay in photographs of one scene: consensus of what a network reads in each of them.
+
+The camera moves; objects lie still for a while, and may be moved between photographs. Given the camera's motion
+(structure from motion), every read becomes a pose in the scene, and reads of several photographs that agree there are
+right together (:mod:`curio_serve.consensus.poses`), also for the photographs between them that were misread. Several
+bearings tell a distance better than one photograph does. How large the scene is, which structure from motion leaves
+open, is what the objects tell on average. No label is used.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from curio_serve.consensus.poses import Consensus, Predictions, consensus, position_covariance_m2
+from jaxtyping import Bool, Int
+from scipy.stats import trim_mean
+
+from curio_train.data.photographs import CameraPoses
+from curio_train.geometry import Pose, matrix_from_rotation_6d
+from curio_train.metrics.poses import symmetry_poses
+from curio_train.refinement.multi_view import estimate_scale
+from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, SceneCode, of_slot
+from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
+
+_LEAST_CONFIDENCE = 0.1  # of reads that count
+_FEWEST_READS, _FEWEST_PHOTOGRAPHS = 4, 3  # in a consensus
+_ACROSS, _IN_DEPTH = 0.04, 0.03  # standard deviations of positions: diameters across the view, relative in depth
+_MOVED = 0.02  # standard deviation of what an object that lies still moves in the scene, diameters
+_OUTLYING = 0.2  # of the objects' scales that are left out, at either end
+_LARGEST_GAP = 5  # photographs without a member between two that show an object at one place
+
+
+class Reads(NamedTuple):
+    """Scene codes of photographs, each of which may have been read several times."""
+
+    code: SceneCode
+    """[reads, objects, …], in the photographs' camera, metres."""
+    photograph: Int[np.ndarray, " reads"]
+    """Number of the photograph that each is of."""
+
+
+def scene_poses(reads: Reads, cameras: CameraPoses, kinds: Sequence[ObjectKind]) -> list[Pose[np.ndarray]]:
+    """Poses cam_from_obj of each object in all photographs [photographs, …]; NaN where no consensus tells one.
+
+    Args:
+        reads: With confidences.
+        cameras: Of the photographs, in the order in which they were taken.
+        kinds: The objects, each with the slot of its place in this order.
+    """
+    known = cameras.known[reads.photograph]
+    reads = Reads({name: value[known] for name, value in reads.code.items()}, reads.photograph[known])
+    at = CameraPoses(cameras.cam_from_world[reads.photograph])
+    sure = reads.code[CONFIDENCE][..., 0] >= _LEAST_CONFIDENCE
+    scales = {
+        slot: scale
+        for slot, kind in enumerate(kinds)
+        if (scale := estimate_scale(at, of_slot(reads.code, slot), sure[:, slot], kind.diameter_m))
+    }
+    unknown = Pose(np.full((len(cameras.known), 3, 3), np.nan), np.full((len(cameras.known), 3), np.nan))
+    if not scales and not cameras.in_metres:
+        return [unknown] * len(kinds)
+    scale = 1.0 if cameras.in_metres else float(np.exp(trim_mean(np.log(list(scales.values())), _OUTLYING)))
+    cam_from_world = Pose.from_matrix(cameras.cam_from_world)
+    cam_from_world = Pose(cam_from_world.rotation, scale * cam_from_world.translation_m)
+    return [
+        # What an object errs by in all photographs alike is what its scale differs by from the scene's.
+        _of_object(reads, slot, sure[:, slot].numpy(), scale / scales.get(slot, scale), cam_from_world, kind)
+        for slot, kind in enumerate(kinds)
+    ]
+
+
+def _of_object(
+    reads: Reads,
+    slot: int,
+    chosen: Bool[np.ndarray, " reads"],
+    correction: float,
+    cam_from_world: Pose[np.ndarray],
+    kind: ObjectKind,
+) -> Pose[np.ndarray]:
+    """Its poses in the photographs."""
+    photograph = reads.photograph[chosen]
+    rotation = matrix_from_rotation_6d(reads.code[ROTATION_6D][:, slot]).double().numpy()[chosen]
+    position_m = correction * reads.code[TRANSLATION][:, slot].double().numpy()[chosen]
+    world_from_cam = Pose(cam_from_world.rotation[photograph], cam_from_world.translation_m[photograph]).inverse()
+    world_from_obj = world_from_cam @ Pose(rotation, position_m)
+    rays_m = np.einsum("nij,nj->ni", world_from_cam.rotation, position_m)
+    covariance_m2 = position_covariance_m2(rays_m, _ACROSS * kind.diameter_m, _IN_DEPTH)
+    found = consensus(
+        Predictions(
+            photograph,
+            world_from_obj.rotation,
+            world_from_obj.translation_m,
+            covariance_m2 + np.eye(3) * (_MOVED * kind.diameter_m) ** 2,
+        ),
+        np.stack([pose.rotation for pose in symmetry_poses(kind.info, SYMMETRY_STEP)]),
+        min_predictions=_FEWEST_READS,
+        min_views=_FEWEST_PHOTOGRAPHS,
+    )
+    number = _where(found, photograph, len(cam_from_world.rotation))
+    there = Pose(np.full((len(number), 3, 3), np.nan), np.full((len(number), 3), np.nan))
+    for which, one in enumerate(found):
+        there.rotation[number == which], there.translation_m[number == which] = one.rotation, one.translation_m
+    return cam_from_world @ there
+
+
+def _where(found: Sequence[Consensus], photograph: np.ndarray, num: int) -> Int[np.ndarray, " photographs"]:
+    """Which consensus each photograph shows, -1 for none: of its reads' the one of most photographs.
+
+    Between photographs that show the same one the object was not moved.
+    """
+    shown_in = [np.unique(photograph[one.members]) for one in found]
+    number = np.full(num, -1)
+    for which in sorted(range(len(found)), key=lambda which: len(shown_in[which])):
+        number[shown_in[which]] = which
+    told = np.flatnonzero(number >= 0)
+    for first, second in pairwise(told):
+        if number[first] == number[second] and second - first <= _LARGEST_GAP + 1:
+            number[first:second] = number[first]
+    return number
