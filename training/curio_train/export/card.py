@@ -94,6 +94,10 @@ def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[s
     supervision = [text for term, text in _SUPERVISION.items() if getattr(terms, term)] or ["none: images alone"]
     if made.pretrained:
         supervision.append(_PRETRAINED)
+    if made.config.recipe.self_training and (photos := getattr(made.config.world, "photos", None)):
+        supervision.append(
+            f"what the network itself found in the photographs of `{photos.name}`, no label of which was opened"
+        )
     yield "world", spec.world
     yield "method", f"{made.config.method}, preset {made.config.preset}, seed {made.config.seed}"
     yield "supervision", "; ".join(supervision)

@@ -25,8 +25,9 @@ def learn_from_photographs(
 ) -> None:
     """Let templates look as photographs do, and calibrate the confidence there.
 
-    A pose is taken as correct where it agrees with the pseudo-label. Each photograph is read by templates that only the
-    other half of the photographs changed, because a network is surer of what it has learned from.
+    A pose is taken as correct where it agrees with the pseudo-label, and as wrong where there is none: what was read
+    there agreed with nothing. Each photograph is read by templates that only the other half of the photographs changed,
+    because a network is surer of what it has learned from.
 
     Raises:
         DataError: The backgrounds cannot be read.
@@ -35,11 +36,10 @@ def learn_from_photographs(
     features, correct = _read_by_others(network, world, labels)
     learn_appearance(network, labels.frames, labels.poses)
     world.calibrate_confidence(network, cache)
-    for number, pose in enumerate(labels.poses):
-        known = np.isfinite(pose.translation_m).all(axis=1)
-        hits = correct[known, number]
+    for number in range(len(labels.poses)):
+        hits = correct[:, number]
         if min(hits.sum(), (~hits).sum()) >= _FEWEST:
-            weights = fit_calibration(features[known, number], hits.tolist())
+            weights = fit_calibration(features[:, number], hits.tolist())
             network.reader.pose_correct[number] = torch.tensor(weights).float()
 
 

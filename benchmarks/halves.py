@@ -1,0 +1,128 @@
+"""What unlabelled frames teach a detector for several objects, scored on frames that it has not learned from.
+
+    python benchmarks/halves.py --data lmo [--init models/lmo] [--images 4800] [--out runs/halves] [--json]
+
+Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
+runs begin with the network of --init, and no label of a frame is opened in training. A run that is finished is kept,
+one that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, served as it is
+read once, by nine reads, and both refined by render-and-compare.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_COMMANDS = Path(sys.executable).parent
+_TARGETS = "test_targets_bop19.json"
+_KEPT = ("add_recall", "add_recall_visible_80", "confidence_ece", "present_auroc", "rotation_deg_median")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--data", type=Path, required=True, help="of BOP's layout, with one scene of test frames")
+    parser.add_argument("--init", type=Path, default=Path("models/lmo"), help="what both runs begin with")
+    parser.add_argument("--images", type=int, default=4800, help="to train the locator with, half of them photographs")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("runs/halves"))
+    parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
+    arguments = parser.parse_args()
+
+    out, data = arguments.out.absolute(), arguments.data.absolute()
+    frames = sorted(data.glob("test/*/rgb/*.*"))
+    if len({frame.parent for frame in frames}) != 1:
+        sys.exit(f"{data}: expected the test frames of one scene, found {len(frames)} frames")
+    scores = []
+    for half in range(2):
+        run = out / f"run-{half}"
+        _learn(run, data, _photographs(out / f"frames-{half}", frames[half::2]), arguments)
+        others = _scored(out / f"scored-{1 - half}", data, {int(frame.stem) for frame in frames[1 - half :: 2]})
+        scores.append({reads: _evaluate(run, others, reads) for reads in (1, 9)})
+    result = {
+        "reads": {str(reads): _mean([one[reads] for one in scores]) for reads in (1, 9)},
+        "init": arguments.init.name,
+        "images": arguments.images,
+        "seed": arguments.seed,
+        "num_frames": len(frames),
+    }
+    (out / "halves.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    print(json.dumps(result) if arguments.json else json.dumps(result, indent=2))
+
+
+def _photographs(folder: Path, frames: list[Path]) -> Path:
+    """A folder that shows these frames alone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for frame in frames:
+        if not (folder / frame.name).exists():
+            (folder / frame.name).symlink_to(frame)
+    return folder
+
+
+def _scored(folder: Path, data: Path, numbers: set[int]) -> Path:
+    """The data set with these frames as its only targets."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for part in data.iterdir():
+        if part.name != _TARGETS and not (folder / part.name).exists():
+            (folder / part.name).symlink_to(part)
+    targets = json.loads((data / _TARGETS).read_text(encoding="utf-8"))
+    chosen = [target for target in targets if target["im_id"] in numbers]
+    (folder / _TARGETS).write_text(json.dumps(chosen), encoding="utf-8")
+    return folder
+
+
+def _learn(run: Path, data: Path, photographs: Path, arguments: argparse.Namespace) -> None:
+    if (run / "report.html").exists():  # written last
+        return
+    given = ["--class", "all", "--data", data, "--photos", photographs, "--init", arguments.init]
+    budget = ["--images", arguments.images, "--batch-size", 16, "--micro-batch-size", 16, "--seed", arguments.seed]
+    begun = ["--resume", run] if (run / "config.json").exists() else ["--out", run]
+    _call("curio-train", "linemod", *given, *budget, *begun)
+
+
+def _evaluate(run: Path, data: Path, reads: int) -> dict[str, Any]:
+    """What ``curio-eval --json`` says of the frames: as read, and refined."""
+    often = ["--reads", reads] if reads > 1 else []
+    line = _call("curio-eval", run, "--data", data, "--refine", "--num-images", 20, "--json", *often)
+    found: dict[str, Any] = json.loads(line.splitlines()[-1])
+    return {"served": found["real"], "refined": found["refined"]["real"]}
+
+
+def _call(command: str, *words: Any) -> str:
+    """Run a command to its good end; what it prints."""
+    typed = [str(_COMMANDS / command), *map(str, words)]
+    done = subprocess.run(typed, check=False, stdout=subprocess.PIPE, text=True, env=os.environ)
+    if done.returncode:
+        sys.exit(f"{' '.join(typed)} ended with status {done.returncode}")
+    return done.stdout
+
+
+def _mean(halves: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means over both halves, of all objects together and of each."""
+    return {
+        kind: {name: _of_both([half[kind]["metrics"] for half in halves], name) for name in _KEPT}
+        | {"num_targets": sum(half[kind]["num_targets"] for half in halves)}
+        | {
+            "objects": {
+                name: {
+                    metric: _of_both([half[kind]["objects"][name]["metrics"] for half in halves], metric)
+                    for metric in _KEPT[:2]
+                }
+                for name in halves[0][kind]["objects"]
+            }
+        }
+        for kind in ("served", "refined")
+    }
+
+
+def _of_both(metrics: list[dict[str, float]], name: str) -> float | None:
+    found = [one[name] for one in metrics if name in one]
+    return round(float(np.mean(found)), 4) if found else None
+
+
+if __name__ == "__main__":
+    main()
