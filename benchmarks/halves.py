@@ -4,8 +4,8 @@
 
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
 runs begin with the network of --init, and no label of a frame is opened in training. A run that is finished is kept,
-one that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, served as it is
-read once, by nine reads, and both refined by render-and-compare.
+one that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, by one read
+and by nine, as served and refined by render-and-compare.
 """
 
 import argparse

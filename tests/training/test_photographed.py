@@ -15,6 +15,9 @@ from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS,
 from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS, NUM_VIEWS
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
+from curio_train.refinement.photographed_confidence import Evidence, calibrate_by, read_by_others
+from curio_train.refinement.scene_labels import SceneLabels
+from curio_train.scene_code import poses
 from curio_train.templates.photographed import learn_appearance
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
@@ -99,3 +102,30 @@ def test_what_a_photograph_shows_is_learned_and_the_rest_stays(world: SeveralObj
     far = directions @ directions[VIEW * NUM_ROLLS] < 0.9
     kept = torch.nn.functional.cosine_similarity(banks.described(0)[far], described[far], dim=2)
     assert float(kept.mean()) > 0.8, "codewords are chosen anew, which costs a little"
+
+
+def test_confidence_is_calibrated_by_photographs_that_agree_and_templates_stay(world: SeveralObjectsWorld) -> None:
+    network = with_random_templates(world)
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    frames = torch.randint(0, 255, (3, 3, 480, 640), dtype=torch.uint8, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        own = poses(network(frames[2:].float() / 255), 0)[0]
+    # Only the third photograph has a label, and the other half, which reads it, learned from none: what is read agrees.
+    rotation, position_m = np.full((3, 3, 3), np.nan), np.full((3, 3), np.nan)
+    rotation[2], position_m[2] = own.rotation, own.translation_m
+    unknown = Pose(np.full((3, 3, 3), np.nan), np.full((3, 3), np.nan))
+    evidence = read_by_others(network, world, SceneLabels(world, frames, [Pose(rotation, position_m), unknown]))
+    assert evidence.correct.tolist() == [[False, False], [False, False], [True, False]]
+    assert np.isfinite(evidence.features).all()
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+
+    calibrate_by(network, evidence)
+    assert torch.equal(network.reader.pose_correct, before["reader.pose_correct"]), "too few to tell"
+    random = np.random.default_rng(0)
+    right = random.random((60, 2)) < 0.4
+    features = random.normal(size=(60, 2, 3))
+    features[right, 0] += 3
+    calibrate_by(network, Evidence(features, right))
+    weights = network.reader.pose_correct.numpy()
+    logits = (features * weights[:, :3]).sum(axis=2) + weights[:, 3]
+    assert ((logits > 0) == right).mean() > 0.85

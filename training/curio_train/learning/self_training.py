@@ -9,10 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from curio_train.networks.several_objects.network import ObjectsNetwork
-from curio_train.refinement.photographed_objects import learn_from_photographs
+from curio_train.refinement.photographed_confidence import calibrate_by, read_by_others
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.refinement.scene_labels import SceneLabels
 from curio_train.scene_code import SceneCode
+from curio_train.templates.photographed import learn_appearance
 from curio_train.worlds.base import StagedWorld, World
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
@@ -69,7 +70,7 @@ class SelfTraining:
         self._network.train()
 
     def finish(self, cache: Path) -> None:
-        """Once the network is trained, calibrate its confidence, and let its templates learn from photographs.
+        """Once the network is trained, let its templates look as photographs do, and calibrate its confidence.
 
         Args:
             cache: Folder of the image sets that worlds draw once.
@@ -77,11 +78,13 @@ class SelfTraining:
         Raises:
             DataError: The backgrounds cannot be read.
         """
-        world, network = self._world, self._network
-        if isinstance(self._labels, SceneLabels):
-            assert isinstance(world, SeveralObjectsWorld)
+        world, network, labels = self._world, self._network, self._labels
+        if isinstance(labels, SceneLabels) and isinstance(world, SeveralObjectsWorld):
             assert isinstance(network, ObjectsNetwork)
-            learn_from_photographs(network, world, self._labels, cache)
+            evidence = read_by_others(network, world, labels)
+            learn_appearance(network, labels.frames, labels.poses)
+            world.calibrate_confidence(network, cache)
+            calibrate_by(network, evidence)
         elif isinstance(world, StagedWorld):
             world.calibrate_confidence(network, cache)
 

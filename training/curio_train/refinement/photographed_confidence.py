@@ -1,0 +1,87 @@
+"""Confidence of a detector for several objects, calibrated on photographs with pseudo-labels."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from curio_train.geometry import Pose
+from curio_train.metrics.calibration import fit_calibration
+from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
+from curio_train.networks.several_objects.network import ObjectsNetwork
+from curio_train.refinement.scene_labels import SceneLabels
+from curio_train.scene_code import poses
+from curio_train.templates.photographed import learn_appearance
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+
+_NUM_POINTS = 500  # vertices that ADD is measured at, about
+_FEWEST = 8  # correct poses, and wrong ones, that a calibration needs
+_READ_AT_ONCE = 2
+
+
+class Evidence(NamedTuple):
+    """What was read in photographs."""
+
+    features: Float[np.ndarray, "photographs objects 3"]
+    """Of the pose-correct logit."""
+    correct: Bool[np.ndarray, "photographs objects"]
+    """Whether a pose agrees with its pseudo-label. Where there is none it is wrong: what was read agreed with nothing.
+    """
+
+
+@torch.no_grad()
+def read_by_others(network: ObjectsNetwork, world: SeveralObjectsWorld, labels: SceneLabels) -> Evidence:
+    """Read each photograph by templates that only the other half of the photographs changed.
+
+    A network is surer of what it has learned from.
+
+    Args:
+        network: Its templates are the same afterwards.
+        world: Of its objects.
+        labels: The photographs.
+    """
+    network.eval()
+    rendered = {name: value.clone() for name, value in network.reader.banks.state_dict().items()}
+    num, objects = len(labels.frames), len(labels.poses)
+    evidence = Evidence(np.zeros((num, objects, 3)), np.zeros((num, objects), dtype=bool))
+    for half in range(2):
+        own, others = np.arange(half, num, 2), slice(1 - half, None, 2)
+        known = [Pose(pose.rotation[others], pose.translation_m[others]) for pose in labels.poses]
+        learn_appearance(network, labels.frames[others], known)
+        for rows in np.split(own, range(_READ_AT_ONCE, len(own), _READ_AT_ONCE)):
+            code, found = network.read(labels.frames[torch.from_numpy(rows)].float() / 255)
+            evidence.features[rows] = found.right.numpy()
+            for slot in range(objects):
+                evidence.correct[rows, slot] = _correct(world, slot, poses(code, slot), labels.poses[slot], rows)
+        network.reader.banks.load_state_dict(rendered)
+    return evidence
+
+
+def calibrate_by(network: ObjectsNetwork, evidence: Evidence) -> None:
+    """Make confidences the probabilities of correct poses in such photographs, where enough were read to tell.
+
+    All objects are calibrated together: some dozens of reads of each, some of whose labels are wrong, tell less about
+    an object than the others do (docs/experiments/real_photographs.md).
+
+    Args:
+        network: Calibrated on renderings.
+        evidence: Of its objects.
+    """
+    hits = evidence.correct.ravel()
+    if min(hits.sum(), (~hits).sum()) >= _FEWEST:
+        weights = fit_calibration(evidence.features.reshape(-1, evidence.features.shape[2]), hits.tolist())
+        network.reader.pose_correct[:] = torch.tensor(weights).float()
+
+
+def _correct(
+    world: SeveralObjectsWorld, slot: int, found: list[Pose], labels: Pose[np.ndarray], rows: np.ndarray
+) -> list[bool]:
+    member = world.members[slot]
+    points = member.mesh.vertices_m[:: max(1, len(member.mesh.vertices_m) // _NUM_POINTS)]
+    labelled = [Pose(labels.rotation[row], labels.translation_m[row]) for row in rows]
+    return [
+        bool(np.isfinite(label.translation_m).all())
+        and add_or_add_s_m(pose, label, points, member.kind.info) < ADD_THRESHOLD * member.kind.diameter_m
+        for pose, label in zip(found, labelled, strict=True)
+    ]
