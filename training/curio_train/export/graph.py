@@ -18,7 +18,7 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from curio_train.errors import ExportError
+from curio_train.errors import ExportError, UsageError
 from curio_train.export.card import Provenance, card
 from curio_train.export.crop_stage import STAGE_TENSORS, traced
 from curio_train.export.folder import ModelFolder, triton_config
@@ -29,6 +29,7 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
 from curio_train.learning.runs.initial import weights_file
 from curio_train.learning.runs.provenance import run_sessions
+from curio_train.networks.several_objects.network import FAST, ObjectsNetwork
 from curio_train.networks.templates.trunk import Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import TRANSLATION, joined
@@ -47,6 +48,7 @@ _CHECK_SEED = (20_210,)
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
 _NUM_NOISE = 1_000_003  # drawn values of jitter, shifted and repeated: drawing as many as layers have takes minutes
+_FAST = "; looks at each object in one crop a pass (--fast), which the confidence was not calibrated for"
 _LEAST_STABLE = 0.25  # of the answers to check images
 
 
@@ -123,7 +125,13 @@ def _pixels(image: Tensor) -> Tensor:
 
 
 def export(
-    run: Path, out: Path, name: str | None = None, *, half: bool = False, reduce: Reduce | None = None
+    run: Path,
+    out: Path,
+    name: str | None = None,
+    *,
+    half: bool = False,
+    fast: bool = False,
+    reduce: Reduce | None = None,
 ) -> Exported:
     """Write the network of a run as the next version of a model.
 
@@ -132,10 +140,11 @@ def export(
         out: Folder of models.
         name: Of the model; the world's choice unless given (a LineMOD model is named after its class).
         half: Store weights as float16, half as large; they are computed with in float32.
+        fast: Let a detector for several objects look at each in one crop a pass.
         reduce: Applied to the float32 graph once that agrees with torch; not together with ``half``.
 
     Raises:
-        UsageError: The name cannot be a model's, or the folder is something else.
+        UsageError: The name cannot be a model's, the folder is something else, or the network cannot be faster.
         CheckpointError: The run is missing, damaged or without a checkpoint.
         ExportError: torch and onnxruntime disagree, ``reduce`` costs too much, or the model cannot be written; nothing
             is left behind.
@@ -144,6 +153,8 @@ def export(
     world = build(folder.config.world)
     target = ModelFolder.named(out, world.model_name if name is None else name)
     state = folder.trained(world)
+    if fast:
+        _look_less(state.pose.network)
     trained = Graph(state.pose.network, world)
     deployed = Graph(_deployable(state.pose.network, half), world)
     images = check_images(world)
@@ -170,7 +181,7 @@ def export(
     put_spec(model, spec)
 
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
-    weights = _weights(half, rounding_error)
+    weights = _weights(half, rounding_error) + (_FAST if fast else "")
     known = deployed.where(stable, expected if half else learned)
     parity_error = refuse_disparity(known, deployed.where(stable, found))
     if reduce is not None:
@@ -192,6 +203,14 @@ def export(
     }
     path = target.add(version, files, config, text)
     return Exported(path, parity_error, rounding_error, model.ByteSize(), weights)
+
+
+def _look_less(network: nn.Module) -> None:
+    if not isinstance(network, ObjectsNetwork):
+        raise UsageError(
+            "--fast is for detectors of several objects (linemod --class all); others are as fast as they get"
+        )
+    network.search = FAST
 
 
 def _golden(images: Tensor, graph: Graph, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> bytes:

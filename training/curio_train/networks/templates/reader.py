@@ -17,12 +17,8 @@ from curio_train.networks.templates.rolls import ROLLS_DEG, upright_rolls
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
-NUM_HYPOTHESES = 3
 NUM_NEIGHBOURS = 4
 """Templates around the best hypothesis whose answers are averaged, in each crop of its place."""
-
-NUM_CLOSER = 2
-"""Hypotheses of the first pass around which crops are cut again, at their own distance."""
 
 STEPS = (3, 5, 4)
 """Of the alignment: of every hypothesis of the first pass and of the second, then of the best with its neighbours."""
@@ -35,6 +31,17 @@ _ALIKE_COS = 0.94  # 20 degrees between the rotations of hypotheses at one place
 _ONE_PLACE = 0.5  # diameters
 _SHARPNESS = 20.0  # of the neighbours' weights, a unit of score
 _SUPPRESSED = -10.0
+
+
+class Effort(NamedTuple):
+    """How much is tried for each object: accuracy for time (docs/experiments/real_photographs.md)."""
+
+    hypotheses: int = 3
+    """Poses that each pass aligns."""
+    closer: int = 2
+    """Of those of the first pass, around which crops are cut again, at their own distance."""
+    rolls_deg: tuple[float, ...] = ROLLS_DEG
+    """Of the crops of the second pass; an odd number around 0."""
 
 
 class Places(NamedTuple):
@@ -92,6 +99,8 @@ class PoseReader(nn.Module):
 
     banks: Banks
     """All templates."""
+    effort: Effort
+    """May be changed at any time; the confidence is calibrated for what it was then."""
     pose_correct: Tensor
     """Weights of the pose-correct logit's features and its offset, [objects, 4]; calibrated on renderings."""
     presence: Tensor
@@ -109,7 +118,7 @@ class PoseReader(nn.Module):
             steps: See :data:`STEPS`.
         """
         super().__init__()
-        num = len(geometries)
+        num, self.effort = len(geometries), Effort()
         self._any_side = geometries[0].any_side
         self.banks, self._steps = Banks(num, self._any_side), steps
         self.register_buffer("pose_correct", torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1))
@@ -134,7 +143,7 @@ class PoseReader(nn.Module):
         """The code without its confidence, and what that is made of."""
         places, roll = self._closer(trunk, images, places)
         crops = self._crops(trunk, images, places, roll)
-        best = _best(self._aligned(crops, self._hypotheses(crops, places), self._steps[1]))
+        best = self._best(self._aligned(crops, self._hypotheses(crops, places), self._steps[1]))
         pose, spread = self._averaged(crops, best)
         pose, gap = self._between(crops, best.crop, pose)
 
@@ -163,19 +172,22 @@ class PoseReader(nn.Module):
         crops = self._crops(trunk, images, places, turn)
         found = self._aligned(crops, self._hypotheses(crops, places), self._steps[0])
         score, position, place_score = (
-            values.unflatten(0, (-1, NUM_HYPOTHESES))
+            values.unflatten(0, (-1, self.effort.hypotheses))
             for values in (found.pose.score, found.in_frame(crops), found.place_score)
         )
-        upward = (crops.cam_from_crop[found.crop] @ found.pose.rotation)[..., 2].unflatten(0, (-1, NUM_HYPOTHESES))
-        best = score.topk(NUM_CLOSER, dim=1).indices
+        upward = (crops.cam_from_crop[found.crop] @ found.pose.rotation)[..., 2].unflatten(
+            0, (-1, self.effort.hypotheses)
+        )
+        best = score.topk(self.effort.closer, dim=1).indices
         of_rows = best[..., None].expand(-1, -1, 3)
         chosen = position.gather(1, of_rows).unflatten(0, (-1, self.banks.num_objects))
         chosen = chosen * self._diameter_m[:, None, None]
         in_front = torch.maximum(chosen[..., 2:], self._nearest_m[:, None, None])
         closer = torch.cat([chosen[..., :2], in_front], dim=3)
         of_places = place_score.gather(1, best).unflatten(0, (-1, self.banks.num_objects))
-        roll = upright_rolls(closer.flatten(0, 2), upward.gather(1, of_rows).flatten(0, 1))
-        return Places(*(of_all.repeat_interleave(len(ROLLS_DEG), dim=2) for of_all in (closer, of_places))), roll
+        rolls_deg = self.effort.rolls_deg
+        roll = upright_rolls(closer.flatten(0, 2), upward.gather(1, of_rows).flatten(0, 1), rolls_deg)
+        return Places(*(of_all.repeat_interleave(len(rolls_deg), dim=2) for of_all in (closer, of_places))), roll
 
     def _turned(self, places: Places) -> tuple[Places, Float[Tensor, "crops 3 3"] | None]:
         """Places in all quarter turns where objects may be rolled in any way; else as they are."""
@@ -228,7 +240,7 @@ class PoseReader(nn.Module):
         turns = self.banks.rotations.flatten(1)
         count, picked = turns.shape[0], []
         apart_m = _ONE_PLACE * self._of_rows(self._diameter_m, scores.shape[0], 1)
-        for _ in range(NUM_HYPOTHESES):
+        for _ in range(self.effort.hypotheses):
             score, best = scores.flatten(1).max(dim=1)
             place, template = torch.div(best, count, rounding_mode="floor"), best % count
             picked.append((place, template, score))
@@ -240,15 +252,15 @@ class PoseReader(nn.Module):
 
     def _aligned(self, crops: _Crops, found: _Hypotheses, num_steps: int) -> _Hypotheses:
         """Each hypothesis moved to where the template nearest to it fits best."""
-        templates = self._nearest(found.pose, 1).unflatten(0, (-1, NUM_HYPOTHESES))[..., 0]
+        templates = self._nearest(found.pose, 1).unflatten(0, (-1, self.effort.hypotheses))[..., 0]
         surface = self.banks.surface(templates)
         pose = align(crops.fine, found.crop, *surface, found.pose, crops.focal_px[found.crop], num_steps)
         return found._replace(pose=pose)
 
     def _averaged(self, crops: _Crops, best: _Hypotheses) -> tuple[Aligned, Float[Tensor, " rows"]]:
         """The mean of what the templates around a pose answer, and the spread of the logarithm of their distances."""
-        rolled, pose = _in_all_rolls(crops, best.crop, best.pose)
-        templates = self._nearest(pose, NUM_NEIGHBOURS).unflatten(0, (-1, len(ROLLS_DEG))).flatten(1)
+        rolled, pose = self._in_all_rolls(crops, best.crop, best.pose)
+        templates = self._nearest(pose, NUM_NEIGHBOURS).unflatten(0, (-1, len(self.effort.rolls_deg))).flatten(1)
         surface = self.banks.surface(templates)
         start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in pose))
         crop = rolled.repeat_interleave(NUM_NEIGHBOURS)
@@ -269,14 +281,33 @@ class PoseReader(nn.Module):
 
     def _between(self, crops: _Crops, crop: Tensor, pose: Aligned) -> tuple[Aligned, Float[Tensor, " rows"]]:
         """The pose at the mean of the distances that descriptors and outline tell, and the logarithm of their ratio."""
+        num = len(self.effort.rolls_deg)
         points, outward = (
-            of_all.repeat_interleave(len(ROLLS_DEG), dim=0)
-            for of_all in self.banks.outlines(self._nearest(pose, 1)[:, 0])
+            of_all.repeat_interleave(num, dim=0) for of_all in self.banks.outlines(self._nearest(pose, 1)[:, 0])
         )
-        rolled, seen = _in_all_rolls(crops, crop, pose)
+        rolled, seen = self._in_all_rolls(crops, crop, pose)
         gaps = outline_log_factor(crops.pictures[rolled], points, outward, seen, crops.focal_px[rolled])
-        gap = gaps.unflatten(0, (-1, len(ROLLS_DEG))).mean(dim=1)
+        gap = gaps.unflatten(0, (-1, num)).mean(dim=1)
         return pose._replace(position=pose.position * (gap / 2).exp()[:, None]), gap
+
+    def _best(self, found: _Hypotheses) -> _Hypotheses:
+        """The hypothesis of each object in each image that has the highest score."""
+        by_object = found.pose.score.unflatten(0, (-1, self.effort.hypotheses))
+        row = torch.arange(by_object.shape[0], device=by_object.device) * self.effort.hypotheses + by_object.argmax(
+            dim=1
+        )
+        return _Hypotheses(Aligned(*(of_all[row] for of_all in found.pose)), found.crop[row], found.place_score[row])
+
+    def _in_all_rolls(
+        self, crops: _Crops, crop: Int[Tensor, " rows"], pose: Aligned
+    ) -> tuple[Int[Tensor, " rolled"], Aligned]:
+        """The crops of the same place in all rolls, and poses in their cameras, one after the other."""
+        num = len(self.effort.rolls_deg)
+        rolled = (crop - crop % num)[:, None] + torch.arange(num, device=crop.device)
+        turn = crops.cam_from_crop[rolled].transpose(2, 3) @ crops.cam_from_crop[crop][:, None]
+        rotation, position = turn @ pose.rotation[:, None], (turn @ pose.position[:, None, :, None])[..., 0]
+        scores = pose.score.repeat_interleave(num)
+        return rolled.flatten(), Aligned(rotation.flatten(0, 1), position.flatten(0, 1), scores)
 
     def _nearest(self, pose: Aligned, num: int) -> Int[Tensor, "rows num"]:
         """Templates whose rotations are nearest to what poses show."""
@@ -291,23 +322,6 @@ class PoseReader(nn.Module):
 def _seen_along(position: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3 3"]:
     """What turns an object on the optical axis so that it shows the same side at a position beside it."""
     return rotation_between(position.new_tensor([0.0, 0.0, 1.0]).expand_as(position), position)
-
-
-def _best(found: _Hypotheses) -> _Hypotheses:
-    """The hypothesis of each object in each image that has the highest score."""
-    by_object = found.pose.score.unflatten(0, (-1, NUM_HYPOTHESES))
-    row = torch.arange(by_object.shape[0], device=by_object.device) * NUM_HYPOTHESES + by_object.argmax(dim=1)
-    return _Hypotheses(Aligned(*(of_all[row] for of_all in found.pose)), found.crop[row], found.place_score[row])
-
-
-def _in_all_rolls(crops: _Crops, crop: Int[Tensor, " rows"], pose: Aligned) -> tuple[Int[Tensor, " rolled"], Aligned]:
-    """The crops of the same place in all rolls, and poses in their cameras, one after the other."""
-    num = len(ROLLS_DEG)
-    rolled = (crop - crop % num)[:, None] + torch.arange(num, device=crop.device)
-    turn = crops.cam_from_crop[rolled].transpose(2, 3) @ crops.cam_from_crop[crop][:, None]
-    rotation, position = turn @ pose.rotation[:, None], (turn @ pose.position[:, None, :, None])[..., 0]
-    scores = pose.score.repeat_interleave(num)
-    return rolled.flatten(), Aligned(rotation.flatten(0, 1), position.flatten(0, 1), scores)
 
 
 def _shifts() -> Float[Tensor, "shifts 2"]:
