@@ -1,11 +1,12 @@
 """What unlabelled frames teach a detector for several objects, scored on frames that it has not learned from.
 
-    python benchmarks/halves.py --data lmo [--init models/lmo] [--images 4800] [--out runs/halves] [--json]
+    python benchmarks/halves.py --data lmo --init NETWORK [--images 4800] [--out runs/halves] [--json]
 
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
-runs begin with the network of --init, and no label of a frame is opened in training. A run that is finished is kept,
-one that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, by one read
-and by nine, as served and refined by render-and-compare.
+runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
+10c6bff; models/lmo/3 has seen them), and no label of a frame is opened in training. What is finished is kept, a run
+that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, by one read and by
+nine, as served and refined by render-and-compare.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from typing import Any
 import numpy as np
 
 _COMMANDS = Path(sys.executable).parent
+_RENDERINGS = 2  # are scored, too, and not looked at here
 _TARGETS = "test_targets_bop19.json"
 _KEPT = ("add_recall", "add_recall_visible_80", "confidence_ece", "present_auroc", "rotation_deg_median")
 
@@ -26,7 +28,7 @@ _KEPT = ("add_recall", "add_recall_visible_80", "confidence_ece", "present_auroc
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--data", type=Path, required=True, help="of BOP's layout, with one scene of test frames")
-    parser.add_argument("--init", type=Path, default=Path("models/lmo"), help="what both runs begin with")
+    parser.add_argument("--init", type=Path, required=True, help="run or model that both runs begin with")
     parser.add_argument("--images", type=int, default=4800, help="to train the locator with, half of them photographs")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/halves"))
@@ -85,10 +87,13 @@ def _learn(run: Path, data: Path, photographs: Path, arguments: argparse.Namespa
 
 
 def _evaluate(run: Path, data: Path, reads: int) -> dict[str, Any]:
-    """What ``curio-eval --json`` says of the frames: as read, and refined."""
-    often = ["--reads", reads] if reads > 1 else []
-    line = _call("curio-eval", run, "--data", data, "--refine", "--num-images", 20, "--json", *often)
-    found: dict[str, Any] = json.loads(line.splitlines()[-1])
+    """What ``curio-eval --json`` says of the frames, as read and refined; kept beside the run."""
+    kept = run.parent / f"{run.name}-reads-{reads}.json"
+    if not kept.exists():
+        often = ["--reads", reads] if reads > 1 else []
+        line = _call("curio-eval", run, "--data", data, "--refine", "--num-images", _RENDERINGS, "--json", *often)
+        kept.write_text(line.splitlines()[-1] + "\n", encoding="utf-8")
+    found: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
     return {"served": found["real"], "refined": found["refined"]["real"]}
 
 
