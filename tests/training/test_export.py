@@ -210,6 +210,12 @@ def test_impossible_names_are_refused(run: Path, tmp_path: Path, name: str) -> N
         export(run, tmp_path, name)
 
 
+def test_only_detectors_for_several_objects_can_look_less(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--fast is for detectors of several objects"):
+        export(run, tmp_path, fast=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_that_is_no_model_is_not_touched(run: Path, tmp_path: Path) -> None:
     (tmp_path / "circles").mkdir()
     (tmp_path / "circles" / "thesis.txt").write_text("dear")
