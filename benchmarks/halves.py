@@ -5,8 +5,8 @@
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
 10c6bff; models/lmo/3 has seen them), and no label of a frame is opened in training. What is finished is kept, a run
-that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, by one read and by
-nine, as served and refined by render-and-compare.
+that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, by one read, by
+nine, and by one of the model that ``curio-export --fast`` makes, each as served and refined by render-and-compare.
 """
 
 import argparse
@@ -44,9 +44,9 @@ def main() -> None:
         run = out / f"run-{half}"
         _learn(run, data, _photographs(out / f"frames-{half}", frames[half::2]), arguments)
         others = _scored(out / f"scored-{1 - half}", data, {int(frame.stem) for frame in frames[1 - half :: 2]})
-        scores.append({reads: _evaluate(run, others, reads) for reads in (1, 9)})
-    result = {
-        "reads": {str(reads): _mean([one[reads] for one in scores]) for reads in (1, 9)},
+        scores.append({"reads_1": _evaluate(run, others, 1), "reads_9": _evaluate(run, others, 9)})
+        scores[-1]["fast"] = _evaluate(_fast(run, out / f"fast-{half}"), others, 1)
+    result = {name: _mean([one[name] for one in scores]) for name in scores[0]} | {
         "init": arguments.init.name,
         "images": arguments.images,
         "seed": arguments.seed,
@@ -86,9 +86,17 @@ def _learn(run: Path, data: Path, photographs: Path, arguments: argparse.Namespa
     _call("curio-train", "linemod", *given, *budget, *begun)
 
 
+def _fast(run: Path, models: Path) -> Path:
+    """The run as a model that looks at each object in one crop a pass."""
+    model = models / "lmo"
+    if not model.exists():
+        _call("curio-export", run, "--out", models, "--name", "lmo", "--half", "--fast")
+    return model
+
+
 def _evaluate(run: Path, data: Path, reads: int) -> dict[str, Any]:
-    """What ``curio-eval --json`` says of the frames, as read and refined; kept beside the run."""
-    kept = run.parent / f"{run.name}-reads-{reads}.json"
+    """What ``curio-eval --json`` says of a run or a model and the frames, as read and refined; kept in OUT."""
+    kept = data.parent / f"{data.name}-{run.name}-reads-{reads}.json"
     if not kept.exists():
         often = ["--reads", reads] if reads > 1 else []
         line = _call("curio-eval", run, "--data", data, "--refine", "--num-images", _RENDERINGS, "--json", *often)
