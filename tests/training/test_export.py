@@ -296,3 +296,4 @@ def test_differences_that_are_not_numbers_are_infinite() -> None:
     assert largest_difference(one, {"a": torch.tensor([1.0, float("nan")])}) == float("inf")
     assert largest_difference(one, {"a": torch.tensor([1.0])}) == float("inf")
     assert largest_difference(one, {}) == float("inf")
+    assert largest_difference({"a": torch.zeros(0, 3)}, {"a": torch.zeros(0, 3)}) == 0
