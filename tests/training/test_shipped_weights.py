@@ -54,7 +54,7 @@ def described_world(model: ExportedModel) -> TwoStageWorld:
 def test_the_graph_gives_its_golden_answer(version: Path) -> None:
     golden = dict(np.load(version / "golden.npz"))
     found = ExportedModel.open(version / "model.onnx")(torch.from_numpy(golden.pop("image"))[None])
-    assert found.keys() == golden.keys()
+    assert {"translation_m", "rotation", "confidence"} <= golden.keys() <= found.keys()
     for name, expected in golden.items():
         np.testing.assert_allclose(found[name][0].numpy(), expected, atol=5e-3, err_msg=name)
 
