@@ -56,7 +56,9 @@ def test_the_graph_gives_its_golden_answer(version: Path) -> None:
     found = ExportedModel.open(version / "model.onnx")(torch.from_numpy(golden.pop("image"))[None])
     assert {"translation_m", "rotation", "confidence"} <= golden.keys() <= found.keys()
     for name, expected in golden.items():
-        np.testing.assert_allclose(found[name][0].numpy(), expected, atol=5e-3, err_msg=name)
+        known = ~np.isnan(expected)  # the others are decided by rounding
+        assert known.mean() > 0.5
+        np.testing.assert_allclose(found[name][0].numpy()[known], expected[known], atol=5e-3, err_msg=name)
 
 
 @pytest.mark.parametrize("version", SEVERAL, ids=lambda version: version.parent.name)
