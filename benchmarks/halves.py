@@ -47,7 +47,7 @@ def main() -> None:
         scores.append({"reads_1": _evaluate(run, others, 1), "reads_9": _evaluate(run, others, 9)})
         scores[-1]["fast"] = _evaluate(_fast(run, out / f"fast-{half}"), others, 1)
     result = {name: _mean([one[name] for one in scores]) for name in scores[0]} | {
-        "init": arguments.init.name,
+        "init": "/".join(arguments.init.parts[-2:]),
         "images": arguments.images,
         "seed": arguments.seed,
         "num_frames": len(frames),

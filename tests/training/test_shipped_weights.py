@@ -19,7 +19,7 @@ from curio_train.worlds.single_object.world import Object
 from safetensors.torch import load_file
 
 VERSIONS = sorted((Path(__file__).parents[2] / "models").glob("*/[0-9]*"))
-SEVERAL = [version for version in VERSIONS if version.parent.name == "lmo"]
+SEVERAL = [version for version in VERSIONS if version.parent.name.startswith("lmo")]
 """Models of several objects, whose templates are in the graph alone."""
 SINGLE = [version for version in VERSIONS if version not in SEVERAL]
 MESH = chair(0.1)  # only rendering would need the object's own

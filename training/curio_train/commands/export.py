@@ -30,7 +30,7 @@ class ExportCommand:
     int8: FlagCreatePairsOff[bool] = False
     """Convolutions in int8: a third of the size, and faster. Draws renderings; refused if accuracy falls by a point."""
     fast: FlagCreatePairsOff[bool] = False
-    """Look at each of several objects in one crop a pass: a fifth of the time. For runs that learned from --photos."""
+    """Look at each of several objects in one crop a pass: a fourth of the time. For runs that learned from --photos."""
     cache: Path = CACHE
     """Where image sets that a world draws once are kept, for --int8 and --intervals."""
     intervals: FlagCreatePairsOff[bool] = False

@@ -22,7 +22,7 @@ class Search(NamedTuple):
 
 
 FAST = Search(1, Effort(hypotheses=1, closer=1, rolls_deg=(0.0,)))
-"""A fifth of the time. For locators that learned from photographs: nine times in ten their first place is right
+"""A fourth of the time. For locators that learned from photographs: nine times in ten their first place is right
 (docs/experiments/real_photographs.md)."""
 
 
