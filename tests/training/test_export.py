@@ -16,13 +16,8 @@ from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, ExportError, UsageError
 from curio_train.export.card import EVALUATION_FILE, Provenance, card, portable
 from curio_train.export.folder import ModelFolder
-from curio_train.export.graph import (
-    Exported,
-    check_images,
-    export,
-    largest_difference,
-    refuse_disparity,
-)
+from curio_train.export.graph import Exported, check_images, export
+from curio_train.export.parity import largest_difference, refuse_disparity
 from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import this_session

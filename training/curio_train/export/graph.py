@@ -23,6 +23,7 @@ from curio_train.export.card import Provenance, card
 from curio_train.export.crop_stage import STAGE_TENSORS, traced
 from curio_train.export.folder import ModelFolder, triton_config
 from curio_train.export.onnx import put_spec, store_half
+from curio_train.export.parity import LARGEST_PARITY_ERROR, largest_difference, refuse_disparity
 from curio_train.export.spec import model_spec
 from curio_train.exported_model import WEIGHTS_FILE, ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
@@ -35,9 +36,6 @@ from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import TRANSLATION, joined
 from curio_train.worlds import build
 from curio_train.worlds.base import World
-
-LARGEST_PARITY_ERROR = 1e-4
-"""Largest absolute difference between torch and onnxruntime that an export may have, in any output."""
 
 NUM_JITTERED = 12
 """Rounds of jitter in the check of numerical stability; it misses a tie once in 2 to the power of this."""
@@ -322,35 +320,3 @@ def _jittered_layers(network: nn.Module, generator: torch.Generator) -> Iterator
     finally:
         for hook in hooks:
             hook.remove()
-
-
-def largest_difference(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
-    """Largest absolute difference of two sets of outputs; infinite where one is not finite or shapes differ.
-
-    An output without a value differs by 0: of many objects one is unstable in each image, and with it what an image has
-    once.
-    """
-    largest = 0.0
-    for name, values in one.items():
-        if name not in other or values.shape != other[name].shape:
-            return float("inf")
-        if values.numel():
-            difference = (values.double() - other[name].double()).abs().max().item()
-            largest = max(largest, difference if np.isfinite(difference) else float("inf"))
-    return largest
-
-
-def refuse_disparity(expected: dict[str, Tensor], found: dict[str, Tensor]) -> float:
-    """The parity error.
-
-    Raises:
-        ExportError: It is too large; says in which output.
-    """
-    errors = {name: largest_difference({name: values}, found) for name, values in expected.items()}
-    worst = max(errors, key=lambda name: errors[name])
-    if errors[worst] > LARGEST_PARITY_ERROR:
-        raise ExportError(
-            f"torch and onnxruntime differ by {errors[worst]:.3g} in {worst}, expected at most "
-            f"{LARGEST_PARITY_ERROR:g}; nothing was written. Has the training diverged?"
-        )
-    return errors[worst]
