@@ -183,4 +183,4 @@ def test_photographs_without_texture_teach_one_by_one_and_say_why(
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((480, 640, 3), 40 * number, np.uint8))
     with caplog.at_level(logging.WARNING):
         assert LinemodPhotographs(tmp_path, thing().camera).unlabelled().cameras is None
-    assert "one by one" in caplog.text
+    assert "do not correct each other" in caplog.text
