@@ -171,12 +171,10 @@ class PoseReader(nn.Module):
         places, turn = self._turned(places)
         crops = self._crops(trunk, images, places, turn)
         found = self._aligned(crops, self._hypotheses(crops, places), self._steps[0])
-        score, position, place_score = (
+        upward = (crops.cam_from_crop[found.crop] @ found.pose.rotation)[..., 2]
+        score, position, place_score, upward = (
             values.unflatten(0, (-1, self.effort.hypotheses))
-            for values in (found.pose.score, found.in_frame(crops), found.place_score)
-        )
-        upward = (crops.cam_from_crop[found.crop] @ found.pose.rotation)[..., 2].unflatten(
-            0, (-1, self.effort.hypotheses)
+            for values in (found.pose.score, found.in_frame(crops), found.place_score, upward)
         )
         best = score.topk(self.effort.closer, dim=1).indices
         of_rows = best[..., None].expand(-1, -1, 3)
@@ -292,10 +290,9 @@ class PoseReader(nn.Module):
 
     def _best(self, found: _Hypotheses) -> _Hypotheses:
         """The hypothesis of each object in each image that has the highest score."""
-        by_object = found.pose.score.unflatten(0, (-1, self.effort.hypotheses))
-        row = torch.arange(by_object.shape[0], device=by_object.device) * self.effort.hypotheses + by_object.argmax(
-            dim=1
-        )
+        num = self.effort.hypotheses
+        by_object = found.pose.score.unflatten(0, (-1, num))
+        row = torch.arange(by_object.shape[0], device=by_object.device) * num + by_object.argmax(dim=1)
         return _Hypotheses(Aligned(*(of_all[row] for of_all in found.pose)), found.crop[row], found.place_score[row])
 
     def _in_all_rolls(
