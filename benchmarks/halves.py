@@ -6,7 +6,8 @@ Every second frame of the data set's scene is learned from and the others are sc
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
 10c6bff; models/lmo/3 has seen them), and no label of a frame is opened in training. What is finished is kept, a run
 that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, by one read, by
-nine, and by one of the model that ``curio-export --fast`` makes, each as served and refined by render-and-compare.
+nine, and by one and three of the model that ``curio-export --fast`` makes; as served, and refined by
+render-and-compare.
 """
 
 import argparse
@@ -45,7 +46,8 @@ def main() -> None:
         _learn(run, data, _photographs(out / f"frames-{half}", frames[half::2]), arguments)
         others = _scored(out / f"scored-{1 - half}", data, {int(frame.stem) for frame in frames[1 - half :: 2]})
         scores.append({"reads_1": _evaluate(run, others, 1), "reads_9": _evaluate(run, others, 9)})
-        scores[-1]["fast"] = _evaluate(_fast(run, out / f"fast-{half}"), others, 1)
+        fast = _fast(run, out / f"fast-{half}")
+        scores[-1] |= {"fast": _evaluate(fast, others, 1), "fast_reads_3": _evaluate(fast, others, 3)}
     result = {name: _mean([one[name] for one in scores]) for name in scores[0]} | {
         "init": "/".join(arguments.init.parts[-2:]),
         "images": arguments.images,

@@ -22,7 +22,8 @@ For these latencies and goodputs the server has one half of the cores and the lo
 load does not pass for the server's weakness. ``offered_over_peak`` says what load was really made.
 
 objects8_frame_ms  CPU time a frame of models/lmo, which reads eight objects, served with one worker;
-                   ``bare_objects8_frame_ms`` of the bare loop
+                   ``bare_objects8_frame_ms`` of the bare loop; ``fast_objects8_frame_ms`` and
+                   ``bare_fast_objects8_frame_ms`` of models/lmo-fast
 
 With ``--peers``, other servers around the same decoding, warp and session stand beside ours under ``peers``, each with
 its version, the CPU time a request of all its processes, the answers a second at concurrency 4 with the load generator
@@ -71,7 +72,8 @@ from load.peers import all_peers, installed_version, prepare, running_peer
 _START_LIMIT_S = 60.0
 _WARM_UP_S = 2.0
 _TIGHT_DEADLINE_S = 0.1
-_OBJECTS8, _OBJECTS8_CALLS, _OBJECTS8_DEADLINE_S = Path("models/lmo"), 10, 60.0
+_OBJECTS8 = {"objects8": Path("models/lmo"), "fast_objects8": Path("models/lmo-fast")}
+_OBJECTS8_CALLS, _OBJECTS8_DEADLINE_S = 10, 60.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,8 @@ def main() -> None:
         figures = {"ready_s": round(statistics.median(start_time_s(models) for _ in range(3)), 3)}
         figures |= cost(models, frames, arguments)
         figures |= limits(models, frames, arguments.seconds)
-        figures |= eight_objects(frames, arguments.seconds)
+        for name, model in _OBJECTS8.items():
+            figures |= eight_objects(name, model, frames, arguments.seconds)
         if arguments.peers:
             figures["peers"] = beside_peers(models, frames, arguments.seconds)
     if arguments.json:
@@ -173,20 +176,20 @@ def limits(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any]:
     }
 
 
-def eight_objects(frames: list[bytes], seconds: float) -> dict[str, float]:
-    """CPU time a frame of the shipped model of eight objects, served and bare."""
+def eight_objects(name: str, model: Path, frames: list[bytes], seconds: float) -> dict[str, float]:
+    """CPU time a frame of a shipped model of eight objects, served and bare."""
     core = sorted(os.sched_getaffinity(0))[:1]
     with tempfile.TemporaryDirectory() as folder:
-        shutil.copytree(_OBJECTS8, Path(folder) / _OBJECTS8.name)
+        shutil.copytree(model, Path(folder) / model.name)
         with running_server(Path(folder), core) as (address, pid), worker(core) as load:
-            target = pose_target(address, frames, pid, model=_OBJECTS8.name)
+            target = pose_target(address, frames, pid, model=model.name)
             load(closed_loop_of, target, 1, 1, _OBJECTS8_DEADLINE_S)
             before_s = cpu_s(pid)
             load(closed_loop_of, target, 1, _OBJECTS8_CALLS, _OBJECTS8_DEADLINE_S)
             served_ms = 1000 * (cpu_s(pid) - before_s) / _OBJECTS8_CALLS
     with worker(core) as bare:
-        bare_ms = bare(bare_cpu_ms, _OBJECTS8, frames, 1, seconds)
-    return {"objects8_frame_ms": round(served_ms, 3), "bare_objects8_frame_ms": round(bare_ms, 3)}
+        bare_ms = bare(bare_cpu_ms, model, frames, 1, seconds)
+    return {f"{name}_frame_ms": round(served_ms, 3), f"bare_{name}_frame_ms": round(bare_ms, 3)}
 
 
 def beside_peers(models: Path, frames: list[bytes], seconds: float) -> dict[str, dict[str, Any]]:

@@ -18,10 +18,10 @@ from curio_train.meshes.meshes import Mesh
 from curio_train.meshes.shapes import chair
 from curio_train.refinement.crops import rotation_from_vector
 from curio_train.refinement.inpainting import inpainted
-from curio_train.refinement.predictions import of_slot, with_refinement
+from curio_train.refinement.predictions import with_refinement
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.refinement.template_poses import with_mean_depth
-from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode, poses
+from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode, of_slot, poses
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld

@@ -30,7 +30,7 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
 from curio_train.learning.runs.initial import weights_file
 from curio_train.learning.runs.provenance import run_sessions
-from curio_train.networks.several_objects.network import FAST, ObjectsNetwork
+from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.templates.trunk import Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import TRANSLATION, joined
@@ -152,7 +152,9 @@ def export(
     target = ModelFolder.named(out, world.model_name if name is None else name)
     state = folder.trained(world)
     if fast:
-        _look_less(state.pose.network)
+        if not isinstance(state.pose.network, ObjectsNetwork):
+            raise UsageError(f"--fast is for detectors of several objects, and {run} is of another kind; leave it out")
+        state.pose.network.look_less()
     trained = Graph(state.pose.network, world)
     deployed = Graph(_deployable(state.pose.network, half), world)
     images = check_images(world)
@@ -179,7 +181,7 @@ def export(
     put_spec(model, spec)
 
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
-    weights = _weights(half, rounding_error) + (_FAST if fast else "")
+    weights = _weights(half, rounding_error)
     known = deployed.where(stable, expected if half else learned)
     parity_error = refuse_disparity(known, deployed.where(stable, found))
     if reduce is not None:
@@ -192,7 +194,8 @@ def export(
     put_spec(model, spec)
     version = target.next_version()
     pretrained = any(isinstance(module, Trunk) for module in state.pose.network.modules())
-    made = Provenance(run, folder.config, sessions, state.progress, weights, pretrained)
+    about = weights + _FAST if fast else weights
+    made = Provenance(run, folder.config, sessions, state.progress, about, pretrained)
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),
@@ -201,14 +204,6 @@ def export(
     }
     path = target.add(version, files, config, text)
     return Exported(path, parity_error, rounding_error, model.ByteSize(), weights)
-
-
-def _look_less(network: nn.Module) -> None:
-    if not isinstance(network, ObjectsNetwork):
-        raise UsageError(
-            "--fast is for detectors of several objects (linemod --class all); others are as fast as they get"
-        )
-    network.search = FAST
 
 
 def _golden(images: Tensor, graph: Graph, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> bytes:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from curio_serve.consensus.poses import Predictions, angles_deg, consensus, position_covariance_m2
+from curio_serve.consensus.poses import Consensus, Predictions, angles_deg, consensus, position_covariance_m2
 from jaxtyping import Bool, Int
 from torch import Tensor
 
@@ -67,10 +67,6 @@ class _StaticScene(NamedTuple):
     known: Bool[np.ndarray, " num"]
     """Photographs whose camera pose is known."""
 
-    def world_from_obj(self, predictions: _Predictions) -> Pose[np.ndarray]:
-        """Predictions in the scene's frame."""
-        return _rows(self.cam_from_world, predictions.frame).inverse() @ predictions.cam_from_obj
-
 
 def consensus_poses(
     refiner: RenderAndCompare,
@@ -111,7 +107,10 @@ def consensus_poses(
     cam_from_world = _known_or_identity(cameras)
     scene = _StaticScene(Pose(cam_from_world.rotation, scale * cam_from_world.translation_m), known)
     predictions = _Predictions(frame, Pose(rotation, translation_m))
-    poses = _clusters(scene, predictions, refiner.diameter_m, symmetry_rotations)
+    agreed = consensus_in_scene(
+        scene.cam_from_world, predictions.frame, predictions.cam_from_obj, refiner.diameter_m, symmetry_rotations
+    )
+    poses = [Pose(one.rotation, one.translation_m) for one in agreed]
     return _verified(refiner, frames, scene, poses, estimates, symmetry_rotations)
 
 
@@ -171,23 +170,37 @@ def _rotated(rotation: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return np.einsum("nij,nj->ni", rotation, vectors)
 
 
-def _clusters(
-    scene: _StaticScene, predictions: _Predictions, diameter_m: float, symmetries: np.ndarray
-) -> list[Pose[np.ndarray]]:
-    """Poses world_from_obj on which predictions of several photographs agree, those of most predictions first."""
-    poses = scene.world_from_obj(predictions)
-    rotation = _rows(scene.cam_from_world, predictions.frame).inverse().rotation
-    rays_m = _rotated(rotation, predictions.cam_from_obj.translation_m)
-    covariance = (
-        position_covariance_m2(rays_m, _ACROSS * diameter_m, _IN_DEPTH) + np.eye(3) * (_MOVED * diameter_m) ** 2
-    )
-    found = consensus(
-        Predictions(predictions.frame, poses.rotation, poses.translation_m, covariance),
+def consensus_in_scene(
+    cam_from_world: Pose[np.ndarray],
+    frame: Int[np.ndarray, " n"],
+    cam_from_obj: Pose[np.ndarray],
+    diameter_m: float,
+    symmetries: np.ndarray,
+    *,
+    in_depth: float = _IN_DEPTH,
+    moved: float = _MOVED,
+) -> list[Consensus]:
+    """Poses world_from_obj on which predictions of several photographs agree, those of most predictions first.
+
+    Args:
+        cam_from_world: Of the photographs, metres.
+        frame: Number of the photograph that each prediction is of.
+        cam_from_obj: The predictions, [n, …].
+        diameter_m: Of the object.
+        symmetries: Rotations [m, 3, 3] of the object onto itself.
+        in_depth: Standard deviation of distances, relative.
+        moved: Standard deviation of movements in the scene, diameters.
+    """
+    world_from_cam = _rows(cam_from_world, frame).inverse()
+    poses = world_from_cam @ cam_from_obj
+    rays_m = _rotated(world_from_cam.rotation, cam_from_obj.translation_m)
+    covariance = position_covariance_m2(rays_m, _ACROSS * diameter_m, in_depth) + np.eye(3) * (moved * diameter_m) ** 2
+    return consensus(
+        Predictions(frame, poses.rotation, poses.translation_m, covariance),
         symmetries,
         min_predictions=_MIN_PREDICTIONS,
         min_views=_MIN_PHOTOGRAPHS,
     )
-    return [Pose(one.rotation, one.translation_m) for one in found]
 
 
 def _verified(

@@ -12,22 +12,20 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from curio_serve.consensus.poses import Consensus, Predictions, consensus, position_covariance_m2
+from curio_serve.consensus.poses import Consensus
 from jaxtyping import Bool, Int
 from scipy.stats import trim_mean
 
 from curio_train.data.photographs import CameraPoses
 from curio_train.geometry import Pose, matrix_from_rotation_6d
 from curio_train.metrics.poses import symmetry_poses
-from curio_train.refinement.multi_view import estimate_scale
+from curio_train.refinement.multi_view import consensus_in_scene, estimate_scale
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, SceneCode, of_slot
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
 
 _LEAST_CONFIDENCE = 0.1  # of reads that count
-_FEWEST_READS, _FEWEST_PHOTOGRAPHS = 4, 3  # in a consensus
-_ACROSS, _IN_DEPTH = 0.04, 0.03  # standard deviations of positions: diameters across the view, relative in depth
-_MOVED = 0.02  # standard deviation of what an object that lies still moves in the scene, diameters
+_IN_DEPTH, _MOVED = 0.03, 0.02  # standard deviations: of distances, relative, and of what lies still, diameters
 _OUTLYING = 0.2  # of the objects' scales that are left out, at either end
 _LARGEST_GAP = 5  # photographs without a member between two that show an object at one place
 
@@ -83,20 +81,15 @@ def _of_object(
     photograph = reads.photograph[chosen]
     rotation = matrix_from_rotation_6d(reads.code[ROTATION_6D][:, slot]).double().numpy()[chosen]
     position_m = correction * reads.code[TRANSLATION][:, slot].double().numpy()[chosen]
-    world_from_cam = Pose(cam_from_world.rotation[photograph], cam_from_world.translation_m[photograph]).inverse()
-    world_from_obj = world_from_cam @ Pose(rotation, position_m)
-    rays_m = np.einsum("nij,nj->ni", world_from_cam.rotation, position_m)
-    covariance_m2 = position_covariance_m2(rays_m, _ACROSS * kind.diameter_m, _IN_DEPTH)
-    found = consensus(
-        Predictions(
-            photograph,
-            world_from_obj.rotation,
-            world_from_obj.translation_m,
-            covariance_m2 + np.eye(3) * (_MOVED * kind.diameter_m) ** 2,
-        ),
-        np.stack([pose.rotation for pose in symmetry_poses(kind.info, SYMMETRY_STEP)]),
-        min_predictions=_FEWEST_READS,
-        min_views=_FEWEST_PHOTOGRAPHS,
+    symmetries = np.stack([pose.rotation for pose in symmetry_poses(kind.info, SYMMETRY_STEP)])
+    found = consensus_in_scene(
+        cam_from_world,
+        photograph,
+        Pose(rotation, position_m),
+        kind.diameter_m,
+        symmetries,
+        in_depth=_IN_DEPTH,
+        moved=_MOVED,
     )
     number = _where(found, photograph, len(cam_from_world.rotation))
     there = Pose(np.full((len(number), 3, 3), np.nan), np.full((len(number), 3), np.nan))
