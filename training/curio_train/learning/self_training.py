@@ -78,10 +78,7 @@ class SelfTraining:
         Raises:
             DataError: The backgrounds cannot be read.
         """
-        world, network = self._world, self._network
-        if isinstance(world, SeveralObjectsWorld) and self._fraction > 0 and self._labels is None:
-            self.run_round(1.0)  # of a run that was resumed after its last round
-        labels = self._labels
+        world, network, labels = self._world, self._network, self._labels
         if isinstance(labels, SceneLabels) and isinstance(world, SeveralObjectsWorld):
             assert isinstance(network, ObjectsNetwork)
             evidence = read_by_others(network, world, labels)
