@@ -15,6 +15,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ def main() -> None:
     scores = []
     for half in range(2):
         run = out / f"run-{half}"
-        _learn(run, data, _photographs(out / f"frames-{half}", frames[half::2]), arguments)
+        _learn(run, data, _linked(out / f"frames-{half}", frames[half::2]), arguments)
         others = _scored(out / f"scored-{1 - half}", data, {int(frame.stem) for frame in frames[1 - half :: 2]})
         scores.append({"reads_1": _evaluate(run, others, 1), "reads_9": _evaluate(run, others, 9)})
         fast = _fast(run, out / f"fast-{half}")
@@ -55,24 +56,21 @@ def main() -> None:
         "num_frames": len(frames),
     }
     (out / "halves.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    print(json.dumps(result) if arguments.json else json.dumps(result, indent=2))
+    print(json.dumps(result, indent=None if arguments.json else 2))
 
 
-def _photographs(folder: Path, frames: list[Path]) -> Path:
-    """A folder that shows these frames alone."""
+def _linked(folder: Path, parts: Iterable[Path]) -> Path:
+    """A folder that shows these files and folders alone."""
     folder.mkdir(parents=True, exist_ok=True)
-    for frame in frames:
-        if not (folder / frame.name).exists():
-            (folder / frame.name).symlink_to(frame)
+    for part in parts:
+        if not (folder / part.name).exists():
+            (folder / part.name).symlink_to(part)
     return folder
 
 
 def _scored(folder: Path, data: Path, numbers: set[int]) -> Path:
     """The data set with these frames as its only targets."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for part in data.iterdir():
-        if part.name != _TARGETS and not (folder / part.name).exists():
-            (folder / part.name).symlink_to(part)
+    _linked(folder, (part for part in data.iterdir() if part.name != _TARGETS))
     targets = json.loads((data / _TARGETS).read_text(encoding="utf-8"))
     chosen = [target for target in targets if target["im_id"] in numbers]
     (folder / _TARGETS).write_text(json.dumps(chosen), encoding="utf-8")

@@ -152,9 +152,7 @@ def export(
     target = ModelFolder.named(out, world.model_name if name is None else name)
     state = folder.trained(world)
     if fast:
-        if not isinstance(state.pose.network, ObjectsNetwork):
-            raise UsageError(f"--fast is for detectors of several objects, and {run} is of another kind; leave it out")
-        state.pose.network.look_less()
+        _look_less(state.pose.network, run)
     trained = Graph(state.pose.network, world)
     deployed = Graph(_deployable(state.pose.network, half), world)
     images = check_images(world)
@@ -194,8 +192,7 @@ def export(
     put_spec(model, spec)
     version = target.next_version()
     pretrained = any(isinstance(module, Trunk) for module in state.pose.network.modules())
-    about = weights + _FAST if fast else weights
-    made = Provenance(run, folder.config, sessions, state.progress, about, pretrained)
+    made = Provenance(run, folder.config, sessions, state.progress, weights + _FAST * fast, pretrained)
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),
@@ -204,6 +201,12 @@ def export(
     }
     path = target.add(version, files, config, text)
     return Exported(path, parity_error, rounding_error, model.ByteSize(), weights)
+
+
+def _look_less(network: nn.Module, run: Path) -> None:
+    if not isinstance(network, ObjectsNetwork):
+        raise UsageError(f"--fast is for detectors of several objects, and {run} is of another kind; leave it out")
+    network.look_less()
 
 
 def _golden(images: Tensor, graph: Graph, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> bytes:
