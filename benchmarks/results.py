@@ -32,9 +32,9 @@ SEVERAL_SEEDS = {
     "chairs": {"noncur_cells", "our_cells"},
     "varied": {"noncur_cells", "our_cells"},
 }
-# Objects that stand under a fixed sun are found among hypotheses.
+# Objects that stand on the ground are found among hypotheses.
 _HYPOTHESES = "hypotheses_cells"
-_STANDING = {"chairs", "multi"}
+_STANDING = {"chairs", "multi", "light"}
 # Not in Circles: one thing alone needs no cells.
 _CELLS = ("sleep_cells", "super_1.0_cells", "noncur_cells", "our_cells")
 # Quick ones first, so that a reference is there early.

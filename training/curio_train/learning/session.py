@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from curio_train.config import RunConfig
-from curio_train.errors import UsageError
+from curio_train.learning.explaining import explained, explainer_of
 from curio_train.learning.hardware import choose_threads
 from curio_train.learning.loop import Outcome, train
 from curio_train.learning.parallel import ranks
@@ -20,7 +20,7 @@ from curio_train.learning.trainer import Trainer
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.templates.build import fill_objects
 from curio_train.worlds import build
-from curio_train.worlds.base import HypothesisWorld, ImageSource, World, stages_of
+from curio_train.worlds.base import stages_of
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
 
@@ -31,17 +31,6 @@ def _draw_templates(trainer: Trainer, cache: Path) -> None:
         begin = time.monotonic()
         fill_objects(network, world, cache)
         trainer.state.progress.seconds += time.monotonic() - begin
-
-
-def _explained(world: World, source: ImageSource) -> ImageSource:
-    """The images with the scenes found for them.
-
-    Raises:
-        UsageError: The world has no hypotheses.
-    """
-    if not isinstance(world, HypothesisWorld):
-        raise UsageError(f"--method hypotheses: {world.name} has no hypotheses; expected chairs or multi")
-    return world.explained(source)
 
 
 def learn(
@@ -77,8 +66,7 @@ def learn(
         sources = [
             stage.source("train", config.seed, with_code=config.terms.label, cache=cache) for stage in stages_of(world)
         ]
-        if config.terms.hypotheses:
-            sources = [_explained(world, source) for source in sources]
+        explainer = explainer_of(world) if config.terms.hypotheses else None
         if config.labels < 1:
             sources = [source.subset(config.labels) for source in sources]
         run = RunFolder(path, config)
@@ -86,6 +74,8 @@ def learn(
             own.enter_context(run.lock())
             run.write_config(new=not resume)
             record_session(path)
+        if explainer is not None:
+            sources = [explained(explainer, source, path) for source in sources]
         trainer = Trainer(config, world, sources, here)
         if here.device.type == "cpu":
             # The thread that renders synthetic batches ahead needs a core of its own.

@@ -244,12 +244,22 @@ class AugmentedWorld(Protocol):
         """Renderings [batch, 3, height, width] with the differences applied, for the loss term ``sleep``."""
 
 
+class Explainer(Protocol):
+    """Finds the scenes of images by rendering many hypotheses."""
+
+    def explain(self, images: Tensor) -> SceneCode:
+        """The codes that were found for images, uint8 [batch, 3, height, width]; none of them is a label.
+
+        Objects that were not found have a confidence of 0.
+        """
+
+
 @runtime_checkable
 class HypothesisWorld(Protocol):
-    """A world that finds the scenes of images by rendering many hypotheses."""
+    """A world that finds the scenes of its images."""
 
-    def explained(self, source: ImageSource) -> ImageSource:
-        """The images with the codes that were found for them, of which none is a label.
+    def explainer(self) -> Explainer:
+        """What finds them.
 
         Raises:
             UsageError: Scenes of this world cannot be found so.

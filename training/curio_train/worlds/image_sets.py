@@ -111,8 +111,8 @@ def stored_images(
     images, codes = folder / f"{split}.images.npz", folder / f"{split}.codes.npz"
     if not images.exists():
         _draw(world, split, images, codes)
-    code = {name: torch.from_numpy(value) for name, value in _load(codes).items()} if with_code else None
-    return StoredImages(torch.from_numpy(_load(images)["images"]), code, seed=seed, shuffle=split == "train")
+    code = {name: torch.from_numpy(value) for name, value in load_arrays(codes).items()} if with_code else None
+    return StoredImages(torch.from_numpy(load_arrays(images)["images"]), code, seed=seed, shuffle=split == "train")
 
 
 @torch.no_grad()
@@ -120,12 +120,21 @@ def _draw(world: World, split: Split, images: Path, codes: Path) -> None:
     code = world.sample(NUM_IMAGES[split], (SPLITS.index(split),))
     chunks = [world.render(index(code, slice(start, start + _CHUNK))) for start in range(0, NUM_IMAGES[split], _CHUNK)]
     pixels = (torch.cat(chunks).clamp(0, 1) * 255).round().byte()
-    _save(codes, {name: value.numpy() for name, value in code.items()})
-    _save(images, {"images": pixels.numpy()})  # last: its presence says that both are there
+    try:
+        save_arrays(codes, {name: value.numpy() for name, value in code.items()})
+        save_arrays(images, {"images": pixels.numpy()})  # last: its presence says that both are there
+    except OSError as exc:
+        raise DataError(
+            f"cannot write {images}: {exc.strerror}; name a writable folder with enough space: --cache"
+        ) from exc
 
 
-def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write whole or not at all, so that neither a full disk nor a second process leaves half a file."""
+def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write whole or not at all, so that neither a full disk nor a second process leaves half a file.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp") as file:
@@ -133,14 +142,15 @@ def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
             os.chmod(file.name, 0o644)
             os.link(file.name, path)
     except FileExistsError:
-        return  # another process has written the same images
-    except OSError as exc:
-        raise DataError(
-            f"cannot write {path}: {exc.strerror}; name a writable folder with enough space: --cache"
-        ) from exc
+        return  # another process has written the same
 
 
-def _load(path: Path) -> dict[str, np.ndarray]:
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """What :func:`save_arrays` wrote.
+
+    Raises:
+        DataError: The file is damaged.
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}

@@ -8,13 +8,11 @@ from torch import Tensor
 
 from curio_train.errors import UsageError
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, YAW, Field, Layout
-from curio_train.worlds.base import ImageSource
 from curio_train.worlds.generated.fields import HIGHEST_SUN_DEG, LOWEST_SUN_DEG
-from curio_train.worlds.generated.hypotheses import GroundHypotheses
+from curio_train.worlds.generated.hypotheses.search import GroundHypotheses
 from curio_train.worlds.generated.mesh_world import MeshKind, MeshWorld
 from curio_train.worlds.generated.orientation import Orientation
 from curio_train.worlds.generated.scene_setup import SceneSetup
-from curio_train.worlds.image_sets import StoredImages
 from curio_train.worlds.placement import (
     MIN_SATURATION,
     MIN_VALUE,
@@ -83,16 +81,15 @@ class GeneratedWorld(MeshWorld):
             code[LIGHT] = random_suns(count, LOWEST_SUN_DEG, HIGHEST_SUN_DEG, random)
         return code
 
-    def explained(self, source: ImageSource) -> StoredImages:
-        """The images with the scenes found for them among rendered hypotheses, see ``hypotheses.py``.
+    def explainer(self) -> GroundHypotheses:
+        """What finds the scenes of images among rendered hypotheses, see ``hypotheses/``.
 
         Raises:
             UsageError: Scenes of this world cannot be found so.
         """
-        if self.setup.ground_srgb is None or YAW not in self.layout or LIGHT in self.layout:
+        if self.setup.ground_srgb is None or YAW not in self.layout:
             raise UsageError(
-                f"--method hypotheses: finds objects that stand under a fixed sun, as in chairs and multi, "
+                f"--method hypotheses: finds objects that stand on the ground, as in chairs, multi and light, "
                 f"and {self.name} is another world; use --method our or sleep"
             )
-        assert isinstance(source, StoredImages)  # all generated worlds have those
-        return source.with_code(GroundHypotheses(self).explain(source.images))
+        return GroundHypotheses(self)
