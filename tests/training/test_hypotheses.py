@@ -48,9 +48,9 @@ def test_scenes_are_found_from_their_images_alone(name: str) -> None:
 
 def test_a_sun_that_moves_is_found_with_the_scene() -> None:
     world = world_of("light")
-    code = world.sample(4, (5,))
+    code = world.sample(2, (5,))
     found = world.explainer().explain(photographed(world, code))
-    assert error(world, found, code) < 0.3 * error(world, world.sample(4, (6,)), code)
+    assert error(world, found, code) < 0.3 * error(world, world.sample(2, (6,)), code)
     off = each_parameter_error(world.layout, found, code)["light_deg"]
     assert off.median() < 2
 

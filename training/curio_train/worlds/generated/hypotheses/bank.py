@@ -16,6 +16,9 @@ from curio_train.worlds.generated.hypotheses.places import Places
 from curio_train.worlds.generated.mesh_world import MeshWorld
 
 NUM_YAWS = 24
+YAWS = torch.arange(NUM_YAWS) * (2 * math.pi / NUM_YAWS)
+"""Yaws of hypotheses, radians, as seen in the middle of the ground."""
+
 COLOR_RANGE = 0.02, 0.98
 """Of found colours: sRGB is steep at 0, and the network's sigmoid at both ends."""
 
@@ -38,7 +41,6 @@ class Bank:
             sun: Entry ``LIGHT`` of the scene code, if the world's code has one.
         """
         self._world, self._places, self._sun = world, places, sun
-        self.yaws = torch.arange(NUM_YAWS) * (2 * math.pi / NUM_YAWS)
         shades, masks = zip(*map(self._draw, range(len(world.objects))), strict=True)
         self._shades, self.masks = torch.cat(shades), torch.cat(masks)
 
@@ -85,7 +87,7 @@ class Bank:
     def _draw(self, kind: int) -> tuple[Float[Tensor, "yaws 3 area"], Float[Tensor, "yaws area"]]:
         """Crops of an object of the kind in all yaws, white if it may have any colour: its pixels, and where it is."""
         slot, code = self._world.objects[kind].slots[0], empty_scenes(self._world, NUM_YAWS)
-        code[YAW][:, slot] = torch.stack([self.yaws.cos(), self.yaws.sin()], dim=-1)
+        code[YAW][:, slot] = torch.stack([YAWS.cos(), YAWS.sin()], dim=-1)
         code[CONFIDENCE][:, slot] = 1
         if self._sun is not None:
             code[LIGHT] = self._sun.expand(NUM_YAWS, 2)

@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, YAW, SceneCode, index, joined
-from curio_train.worlds.generated.hypotheses.bank import NUM_YAWS, Bank, empty_scenes
+from curio_train.worlds.generated.hypotheses.bank import NUM_YAWS, YAWS, Bank, empty_scenes
 from curio_train.worlds.generated.hypotheses.descent import better_of, descended, image_losses
 from curio_train.worlds.generated.hypotheses.places import Places
 from curio_train.worlds.generated.hypotheses.suns import Sun, Suns
@@ -60,7 +60,7 @@ class GroundHypotheses:
     """All hypotheses of a world whose objects stand on the ground."""
 
     def __init__(self, world: MeshWorld) -> None:
-        """Render every kind of object in every yaw under every sun.
+        """Choose places and suns; banks are rendered when an image asks for them.
 
         Args:
             world: With a ground and yaws.
@@ -68,7 +68,7 @@ class GroundHypotheses:
         self._world, self._suns = world, Suns(world)
         height_m = float(np.mean([kind.mesh.vertices_m[:, 1].max() for kind in world.kinds])) / 2
         self._places = Places(world, height_m)
-        self._banks = [Bank(world, self._places, sun) for sun in self._suns.banks]
+        self._banks = dict[int, Bank]()  # by number of the sun
         slots = [kind.slots for kind in world.objects]
         self._kind_of_slot = np.repeat(np.arange(len(slots)), [len(members) for members in slots])
 
@@ -97,8 +97,8 @@ class GroundHypotheses:
         suns, lit = self._suns.of_image(image)
         errors = self._ground_errors(image, lit)
         views = [_View(image, errors, torch.ones_like(errors), self._empty(sun)) for sun in suns]
-        crops = self._crops(views[0], self._banks[suns[0].bank])
-        found = [self._with_objects(view, crops, self._banks[sun.bank]) for view, sun in zip(views, suns, strict=True)]
+        crops = self._crops(views[0], self._bank(suns[0].bank))
+        found = [self._with_objects(view, crops, self._bank(sun.bank)) for view, sun in zip(views, suns, strict=True)]
         return self._best(found, image)
 
     def _best(self, codes: Sequence[dict[str, Tensor]], image: Float[Tensor, "3 height width"]) -> dict[str, Tensor]:
@@ -125,9 +125,8 @@ class GroundHypotheses:
         kept = {**code, CONFIDENCE: code[CONFIDENCE].clone()}
         kept[CONFIDENCE][0, gone] = 0
         behind = self._world.render(kept)[0]
-        errors = torch.minimum(
-            (behind - image).square().sum(dim=0, keepdim=True), self._ground_errors(image, float(behind.max()))
-        )
+        of_ground = self._ground_errors(image, self._suns.of_image(image)[1])
+        errors = torch.minimum((behind - image).square().sum(dim=0, keepdim=True), of_ground)
         unexplained = torch.ones_like(errors)
         for slot in masks.keys() - set(gone):
             unexplained = unexplained * (1 - masks[slot])
@@ -140,7 +139,7 @@ class GroundHypotheses:
 
     def _turned(self, code: dict[str, Tensor], slot: int, image: Tensor) -> dict[str, Tensor]:
         """The scene with one of its objects in the yaw in which its rendering is nearest to the image."""
-        yaw = torch.atan2(code[YAW][0, slot, 1], code[YAW][0, slot, 0]) + self._banks[0].yaws
+        yaw = torch.atan2(code[YAW][0, slot, 1], code[YAW][0, slot, 0]) + YAWS
         turned = joined([code] * NUM_YAWS)
         turned[YAW][:, slot] = torch.stack([yaw.cos(), yaw.sin()], dim=-1)
         return self._best([index(turned, slice(n, n + 1)) for n in range(NUM_YAWS)], image)
@@ -156,7 +155,7 @@ class GroundHypotheses:
         for number, column in zip(*linear_sum_assignment(gains, maximize=True), strict=True):
             one, slot = found[number], free[column]
             kind = self._kind_of_slot[slot]
-            yaw = bank.yaws[one.hypothesis[kind] % NUM_YAWS] + self._places.turns[one.place]
+            yaw = YAWS[one.hypothesis[kind] % NUM_YAWS] + self._places.turns[one.place]
             code[TRANSLATION][0, slot] = self._places.positions[one.place]
             code[YAW][0, slot] = torch.stack([yaw.cos(), yaw.sin()])
             code[CONFIDENCE][0, slot] = 1
@@ -203,15 +202,20 @@ class GroundHypotheses:
         """About where an object is in the image, whatever stands before it."""
         place = self._places.nearest(code[TRANSLATION][0, slot])
         yaw = torch.atan2(code[YAW][0, slot, 1], code[YAW][0, slot, 0]) - self._places.turns[place]
-        number = int((yaw / (bank.yaws[1] - bank.yaws[0])).round()) % NUM_YAWS
+        number = int((yaw / (YAWS[1] - YAWS[0])).round()) % NUM_YAWS
         return self._places.paste(bank.masks[int(self._kind_of_slot[slot]) * NUM_YAWS + number], place)
 
     def _bank_of(self, code: SceneCode) -> Bank:
         """The bank whose sun is nearest to a scene's."""
         if LIGHT not in code:
-            return self._banks[0]
+            return self._bank(0)
         suns = torch.stack([sun for sun in self._suns.banks if sun is not None])
-        return self._banks[int((suns - code[LIGHT]).norm(dim=1).argmin())]
+        return self._bank(int((suns - code[LIGHT]).norm(dim=1).argmin()))
+
+    def _bank(self, number: int) -> Bank:
+        if number not in self._banks:
+            self._banks[number] = Bank(self._world, self._places, self._suns.banks[number])
+        return self._banks[number]
 
 
 def _mean_around(residual: Float[Tensor, "1 height width"], mask: Float[Tensor, "1 height width"]) -> float:
