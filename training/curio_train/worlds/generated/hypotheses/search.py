@@ -139,10 +139,10 @@ class GroundHypotheses:
 
     def _turned(self, code: dict[str, Tensor], slot: int, image: Tensor) -> dict[str, Tensor]:
         """The scene with one of its objects in the yaw in which its rendering is nearest to the image."""
-        yaw = torch.atan2(code[YAW][0, slot, 1], code[YAW][0, slot, 0]) + YAWS
-        turned = joined([code] * NUM_YAWS)
+        yaw = torch.atan2(code[YAW][0, slot, 1], code[YAW][0, slot, 0]) + YAWS[::2]  # the gradient does the rest
+        turned = joined([code] * len(yaw))
         turned[YAW][:, slot] = torch.stack([yaw.cos(), yaw.sin()], dim=-1)
-        return self._best([index(turned, slice(n, n + 1)) for n in range(NUM_YAWS)], image)
+        return self._best([index(turned, slice(n, n + 1)) for n in range(len(yaw))], image)
 
     def _with_objects(self, view: _View, crops: _Crops, bank: Bank) -> dict[str, Tensor]:
         """The code of the view with all objects that are found in it, in the slots in which they explain most."""
