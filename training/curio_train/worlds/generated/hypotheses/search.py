@@ -17,6 +17,7 @@ from curio_train.worlds.generated.hypotheses.places import Places
 from curio_train.worlds.generated.hypotheses.suns import Sun, Suns
 from curio_train.worlds.generated.mesh_world import MeshWorld
 
+_AT_ONCE = 128  # places: the crops of all of them would be allocated anew each time, which takes longer than the rest
 _MAX_PEAKS = 72  # places of an image that are compared again after each object
 _LEAST_IMPROVEMENT = 0.3  # squared error that an object must explain better than what is behind it
 _EXPLAINED = 0.006  # mean squared error of an object's pixels and those around it, a sum over the channels
@@ -165,12 +166,14 @@ class GroundHypotheses:
 
     def _crops(self, view: _View, bank: Bank) -> _Crops:
         """Around the places where one of the bank's hypotheses explains most."""
-        layers = torch.cat([view.image, view.errors, view.unexplained])
-        crops = self._places.cut(layers).split((3, 1, 1), dim=1)
-        pixels, errors, weights = crops
-        improvements = bank.improvements(pixels, errors, weights, self._places.scales).amax(dim=1)
-        peaks = self._places.peaks(improvements, _MAX_PEAKS)
-        return _Crops(peaks, pixels[peaks], errors[peaks])
+        layers, places = torch.cat([view.image, view.errors, view.unexplained]), self._places
+        best = []
+        for some in torch.arange(len(places.positions)).split(_AT_ONCE):
+            pixels, errors, weights = places.cut(layers, some).split((3, 1, 1), dim=1)
+            best.append(bank.improvements(pixels, errors, weights, places.scales[some]).amax(dim=1))
+        peaks = places.peaks(torch.cat(best), _MAX_PEAKS)
+        pixels, errors, _ = places.cut(layers, peaks).split((3, 1, 1), dim=1)
+        return _Crops(peaks, pixels, errors)
 
     def _objects(self, view: _View, crops: _Crops, bank: Bank, free: Sequence[int]) -> list[_Object]:
         """The objects that a view lacks, the one that explains most first, at most one a free slot."""
