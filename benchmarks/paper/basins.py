@@ -2,11 +2,13 @@
 
     python benchmarks/paper/basins.py [--worlds chairs multi light] [--scenes 24] [--steps 60] [--json]
 
-Starts from true scenes in which one object is turned, or moved in a random direction; everything else is known. The
-image loss then descends its gradient in the places and yaws of all objects, once between the images as they are and
-once between blurred ones. Printed, and in docs/results/basins.json: the share of those objects that come back.
+Starts from true scenes in which one object is turned, or moved in a random direction, or has exchanged its place with
+one of another shape; everything else is known. The image loss then descends its gradient in the places and yaws of all
+objects, once between the images as they are and once between blurred ones. Printed, and in docs/results/basins.json:
+the share of those objects that come back.
 
 yaw_deg, position_m   by how far the object was off: the share within 10 degrees, or 30 mm, in the end
+exchanged             the share within 30 mm; null where all objects have one shape
 """
 
 import json
@@ -58,6 +60,9 @@ class Settings:
 class Scenes:
     """Scenes of a world, in each of which one object is put in the wrong place or yaw."""
 
+    several_shapes: Tensor
+    """Whether each scene has an object of another shape than that one, [scenes]."""
+
     def __init__(self, world: World, count: int, seed: int) -> None:
         self._world, self._count = world, count
         self._code = world.sample(count, (seed, 0))
@@ -65,6 +70,10 @@ class Scenes:
         random = torch.Generator().manual_seed(seed)
         self._slot = torch.multinomial(present, 1, generator=random)[:, 0]
         self._angle = 2 * math.pi * torch.rand(count, generator=random)
+        kind = torch.tensor([number for number, kind in enumerate(world.objects) for _ in kind.slots])
+        others = present * (kind[None] != kind[self._slot][:, None])
+        self.several_shapes = others.sum(dim=1) > 0
+        self._other = torch.multinomial(others + ~self.several_shapes[:, None] * 1.0, 1, generator=random)[:, 0]
         with torch.no_grad():
             self._images = world.render(self._code)
 
@@ -81,6 +90,12 @@ class Scenes:
         zero = torch.zeros(self._count)
         step = meters * torch.stack([self._angle.cos(), zero, self._angle.sin()], dim=-1)
         return self._with(TRANSLATION, self._code[TRANSLATION][self._rows, self._slot] + step)
+
+    def exchanged(self) -> dict[str, Tensor]:
+        """With that object in the place of one of another shape where there is one, and the other way round."""
+        code = self._with(TRANSLATION, self._code[TRANSLATION][self._rows, self._other])
+        code[TRANSLATION][self._rows, self._other] = self._code[TRANSLATION][self._rows, self._slot]
+        return code
 
     def descended(self, start: SceneCode, steps: int, side_px: int) -> dict[str, Tensor]:
         """Where the image loss leads from there."""
@@ -99,12 +114,12 @@ class Scenes:
                 group["lr"] *= _SLOWER
         return {**start, **{name: value.detach() for name, value in free.items()}}
 
-    def back(self, found: SceneCode, name: str) -> float:
-        """Share of the objects that are back."""
+    def are_back(self, found: SceneCode, name: str) -> Tensor:
+        """Whether the object of each scene is back."""
         one, true = (code[name][self._rows, self._slot] for code in (found, self._code))
         if name == YAW:
-            return float((rotation_angle_deg(matrix_from_yaw(one), matrix_from_yaw(true)) < _BACK_DEG).float().mean())
-        return float(((one - true).norm(dim=-1) < _BACK_M).float().mean())
+            return rotation_angle_deg(matrix_from_yaw(one), matrix_from_yaw(true)) < _BACK_DEG
+        return (one - true).norm(dim=-1) < _BACK_M
 
     @property
     def _rows(self) -> Tensor:
@@ -117,13 +132,19 @@ class Scenes:
         return code
 
 
-def shares(scenes: Scenes, steps: int, side_px: int) -> dict[str, dict[str, float]]:
+def shares(scenes: Scenes, steps: int, side_px: int) -> dict[str, Any]:
     """By kind of error and its size, the share of objects that come back."""
 
-    def share(start: SceneCode, name: str) -> float:
-        return round(scenes.back(scenes.descended(start, steps, side_px), name), 3)
+    def back(start: SceneCode, name: str) -> Tensor:
+        return scenes.are_back(scenes.descended(start, steps, side_px), name).float()
 
+    def share(start: SceneCode, name: str) -> float:
+        return round(float(back(start, name).mean()), 3)
+
+    apart = scenes.several_shapes
+    exchanged = back(scenes.exchanged(), TRANSLATION)[apart].mean() if apart.any() else None
     return {
+        "exchanged": None if exchanged is None else round(float(exchanged), 3),
         "yaw_deg": {str(size): share(scenes.turned(size), YAW) for size in _TURNS_DEG},
         "position_m": {str(size): share(scenes.moved(size), TRANSLATION) for size in _MOVES_M},
     }
