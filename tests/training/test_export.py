@@ -14,6 +14,7 @@ import torch
 from curio_train.commands import export as export_command
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, ExportError, UsageError
+from curio_train.export.ahead import TracingAhead
 from curio_train.export.card import EVALUATION_FILE, Provenance, card, portable
 from curio_train.export.folder import ModelFolder
 from curio_train.export.graph import Exported, check_images, export
@@ -58,6 +59,23 @@ def network(run: Path) -> torch.nn.Module:
 
 def files(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_a_graph_traced_before_there_were_weights_is_the_same(
+    run: Path, single: Exported, tmp_path: Path, num_threads: int
+) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(num_threads)
+    try:
+        with TracingAhead(RunFolder.open(run).config) as ahead:
+            assert torch.get_num_threads() == 1, "the other core traces"
+            done = export(run, tmp_path / "models", ahead=ahead.model)
+        assert torch.get_num_threads() == num_threads
+    finally:
+        torch.set_num_threads(before)
+    found, direct = (onnx.load(exported.path / "model.onnx") for exported in (done, single))
+    assert found.graph == direct.graph
 
 
 @pytest.mark.parametrize("num_images", [1, 2, 7])

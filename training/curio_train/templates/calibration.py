@@ -14,6 +14,7 @@ from curio_train.geometry import Pose
 from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.networks.templates.network import TemplateNetwork
+from curio_train.networks.templates.quick_trunk import with_quick_trunk
 from curio_train.networks.templates.reader import CalibrationFeatures
 from curio_train.scene_code import poses
 from curio_train.worlds.single_object.world import SingleObjectWorld
@@ -31,6 +32,7 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -
     Raises:
         DataError: The backgrounds cannot be read.
     """
+    reader = with_quick_trunk(network)
     source, kind = world.source("validation", 0, with_code=True, cache=cache), world.object.kind
     points = world.object.mesh.vertices_m[:: max(1, len(world.object.mesh.vertices_m) // _NUM_POINTS)]
     steps = _NUM_FRAMES // _BATCH_SIZE
@@ -41,12 +43,12 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -
     for step in range(steps):
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
-        code, features = network.read(world.augment(batch.images, (0, step)).clamp(0, 1))
+        code, features = reader.read(world.augment(batch.images, (0, step)).clamp(0, 1))
         found, true = found + poses(code), true + poses(batch.code)
         full.append(features)
         behind = source.backgrounds(steps + step, _BATCH_SIZE)
         assert behind is not None  # these worlds always have some
-        empty.append(network.read(world.augment(behind, (1, step)).clamp(0, 1))[1])
+        empty.append(reader.read(world.augment(behind, (1, step)).clamp(0, 1))[1])
 
     errors_m = map(add_or_add_s_m, found, true, repeat(points), repeat(kind.info))
     right = [error_m < ADD_THRESHOLD * kind.diameter_m for error_m in errors_m]
