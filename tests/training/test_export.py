@@ -69,12 +69,13 @@ def test_a_graph_traced_before_there_were_weights_is_the_same(
     torch.set_num_threads(num_threads)
     try:
         with TracingAhead(RunFolder.open(run).config) as ahead:
-            assert torch.get_num_threads() == 1, "the other core traces"
+            assert ahead.busy_cores == num_threads - 1
             done = export(run, tmp_path / "models", ahead=ahead.model)
-        assert torch.get_num_threads() == num_threads
     finally:
         torch.set_num_threads(before)
     found, direct = (onnx.load(exported.path / "model.onnx") for exported in (done, single))
+    for node in (*found.graph.node, *direct.graph.node):
+        node.ClearField("name")  # some are numbered
     assert found.graph == direct.graph
 
 

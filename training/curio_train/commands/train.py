@@ -180,7 +180,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         config = with_kept_meshes(config, path)
     if config.terms.templates:
         with TracingAhead(config) if isinstance(config.world, CaptureOptions) else nullcontext() as ahead:
-            seconds = draw_templates(config, path, session.cache).seconds
+            seconds = draw_templates(config, path, session.cache, 0 if ahead is None else ahead.busy_cores).seconds
             print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
             report(end(path, config, session.cache, warn, ahead))
         return 0

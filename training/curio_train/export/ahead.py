@@ -12,7 +12,6 @@ from types import TracebackType
 import onnx
 import onnx_ir as ir
 import torch
-from torch import nn
 
 from curio_train.config import RunConfig
 from curio_train.errors import CurioError
@@ -23,26 +22,28 @@ from curio_train.worlds import build
 
 
 class TracingAhead:
-    """A graph that another process traces; as a context, it leaves one core to that process."""
+    """A graph that another process traces within this context."""
+
+    busy_cores: int
+    """Of that process: 0 where there is one core alone, and nothing is traced ahead."""
 
     def __init__(self, config: RunConfig) -> None:
-        """Prepare; where there is one core alone, nothing is traced ahead.
+        """Begin nothing yet.
 
         Args:
             config: Of the run, from which the graph's structure follows.
         """
-        self._config, self._num_threads = config, torch.get_num_threads()
+        self._config, self.busy_cores = config, int(torch.get_num_threads() > 1)
         self._receiver: Connection | None = None
 
     def __enter__(self) -> "TracingAhead":
-        if self._num_threads > 1:
+        if self.busy_cores:
             context = multiprocessing.get_context("spawn")
             self._receiver, sender = context.Pipe(duplex=False)
             # A daemon ends with this process, however that ends.
             self._process = context.Process(target=_send_trace, args=(self._config, sender), daemon=True)
             self._process.start()
             sender.close()
-            torch.set_num_threads(self._num_threads - 1)
         return self
 
     def __exit__(
@@ -50,11 +51,11 @@ class TracingAhead:
     ) -> None:
         self._end()
 
-    def model(self, network: nn.Module) -> onnx.ModelProto | None:
-        """The graph with the weights of a network; None: it was not traced, for whatever reason.
+    def model(self, graph: Graph) -> onnx.ModelProto | None:
+        """The traced graph with the weights of another; None: it was not traced, for whatever reason.
 
         Args:
-            network: Of the same configuration, as it is deployed.
+            graph: Of the same configuration, with the network as it is deployed.
         """
         if self._receiver is None:
             return None
@@ -62,10 +63,9 @@ class TracingAhead:
             content = self._receiver.recv_bytes()
         except EOFError:
             return None
-        finally:
-            self._end()
+        self._process.join()  # where it is ended from here, it leaves a warning of Python's behind
         model = ir.from_proto(onnx.load_from_string(content))
-        values = dict(network.named_parameters()) | dict(network.named_buffers())
+        values = dict(graph.named_parameters()) | dict(graph.named_buffers())
         for name, initializer in model.graph.initializers.items():
             if name in values:
                 initializer.const_value = ir.tensor(values[name].detach().numpy(), name=name)
@@ -77,7 +77,6 @@ class TracingAhead:
             self._process.terminate()
             self._process.join()
             self._receiver = None
-            torch.set_num_threads(self._num_threads)
 
 
 def _send_trace(config: RunConfig, sender: Connection) -> None:

@@ -131,7 +131,7 @@ def export(
     half: bool = False,
     fast: bool = False,
     reduce: Reduce | None = None,
-    ahead: Callable[[nn.Module], onnx.ModelProto | None] = lambda network: None,
+    ahead: Callable[[Graph], onnx.ModelProto | None] = lambda graph: None,
 ) -> Exported:
     """Write the network of a run as the next version of a model.
 
@@ -142,7 +142,7 @@ def export(
         half: Store weights as float16, half as large; they are computed with in float32.
         fast: Let a detector for several objects look at each in one crop a pass.
         reduce: Applied to the float32 graph once that agrees with torch; not together with ``half``.
-        ahead: The graph of the network as it is deployed, where it has been traced before; not together with ``half``.
+        ahead: Gives the traced graph, where it has been traced before; not together with ``half``.
 
     Raises:
         UsageError: The name cannot be a model's, the folder is something else, or the network cannot be faster.
@@ -170,7 +170,7 @@ def export(
     checked = deployed if half else trained
     stable = numerically_stable(Graph(with_quick_trunk(checked.network), world), images)
 
-    model = ahead(deployed.network) or traced(deployed, deployed.network, world.camera, list(expected))
+    model = ahead(deployed) or traced(deployed, deployed.network, world.camera, list(expected))
     if half:
         store_half(model)
     spec = model_spec(world, target.path.name)

@@ -25,7 +25,9 @@ class QuickTrunk(Trunk):
         for module in self.modules():
             if isinstance(module, nn.ReLU6):
                 module.inplace = True
-        self.to(memory_format=torch.channels_last).requires_grad_(False)
+            if isinstance(module, nn.Conv2d):
+                module.weight.data = module.weight.contiguous(memory_format=torch.channels_last)
+        self.requires_grad_(False)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """As the trunk does, a few images at a time."""
