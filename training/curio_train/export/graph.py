@@ -12,11 +12,13 @@ import numpy as np
 import onnx
 import torch
 import torch.nn.functional as F
+from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve.models.golden import GOLDEN_FILE
 from curio_serve.models.model_folder import MODEL_FILE
 from jaxtyping import Bool
 from torch import Tensor, nn
 
+from curio_train.config import RunConfig
 from curio_train.errors import ExportError, UsageError
 from curio_train.export.card import Provenance, card
 from curio_train.export.crop_stage import STAGE_TENSORS, traced
@@ -29,6 +31,7 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
 from curio_train.learning.runs.initial import weights_file
 from curio_train.learning.runs.provenance import run_sessions
+from curio_train.learning.state import TrainingProgress
 from curio_train.networks.layers import fold_batch_norm
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.templates.quick_trunk import with_quick_trunk
@@ -167,20 +170,15 @@ def export(
     shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
     config = triton_config(target.path.name, tuple(images.shape[1:]), shapes)
     target.refuse_other_tensors(config)
-    checked = deployed if half else trained
-    stable = numerically_stable(Graph(with_quick_trunk(checked.network), world), images)
+    checked = with_quick_trunk(deployed.network if half else trained.network)
+    stable = numerically_stable(Graph(checked, world), images)
 
     model = ahead(deployed) or traced(deployed, deployed.network, world.camera, list(expected))
     if half:
         store_half(model)
-    spec = model_spec(world, target.path.name)
-    spec.recipe = json.dumps(to_portable(folder.config))
     sessions = run_sessions(run)
-    spec.commit, spec.images_seen, spec.training_seconds = (
-        sessions[0].commit,
-        state.progress.all_images,
-        state.progress.all_seconds,
-    )
+    spec = model_spec(world, target.path.name)
+    _describe(spec, folder.config, sessions[0].commit, state.progress)
     put_spec(model, spec)
 
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
@@ -206,6 +204,12 @@ def export(
     }
     path = target.add(version, files, config, text)
     return Exported(path, parity_error, rounding_error, model.ByteSize(), weights)
+
+
+def _describe(spec: ModelSpec, config: RunConfig, commit: str, progress: TrainingProgress) -> None:
+    """What a model was made by and from."""
+    spec.recipe, spec.commit = json.dumps(to_portable(config)), commit
+    spec.images_seen, spec.training_seconds = progress.all_images, progress.all_seconds
 
 
 def _look_less(network: nn.Module, run: Path) -> None:
