@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from curio_train.learning.hardware import autocast, choose_threads, leaving_cores, quick_bfloat16
+from curio_train.learning.hardware import autocast, choose_threads, one_thread, quick_bfloat16
 from curio_train.learning.muon import orthogonal
 from curio_train.templates.threads import in_threads
 
@@ -38,10 +38,9 @@ def test_threads_for_other_work_are_left_alone(reserved: int, expected: int) -> 
     assert choose_threads(slow_alone, reserved=reserved) == torch.get_num_threads() == expected
 
 
-@pytest.mark.parametrize(("busy", "expected"), [(0, 2), (1, 1), (5, 1)])
-def test_cores_are_left_to_other_processes(busy: int, expected: int) -> None:
-    with leaving_cores(busy):
-        assert torch.get_num_threads() == expected
+def test_one_thread_computes_within_the_block_alone() -> None:
+    with one_thread() as allowed:
+        assert (allowed, torch.get_num_threads()) == (2, 1)
     assert torch.get_num_threads() == 2
 
 
@@ -53,10 +52,10 @@ def test_calls_in_threads_keep_their_order_and_record_no_gradients() -> None:
         return seconds, (weight * seconds).requires_grad, torch.get_num_threads()
 
     waits = [0.1, 0.0, 0.05, 0.0]
-    assert list(in_threads(late, iter(waits))) == [(seconds, False, 1) for seconds in waits]
+    assert list(in_threads(late, iter(waits), 3)) == [(seconds, False, 1) for seconds in waits]
     assert torch.get_num_threads() == 2
     with pytest.raises(ZeroDivisionError):
-        list(in_threads(lambda value: 1 // value, [1, 0, 1]))
+        list(in_threads(lambda value: 1 // value, [1, 0, 1], 2))
 
 
 @pytest.mark.parametrize("device_type", ["cpu", "cuda"])

@@ -24,26 +24,22 @@ from curio_train.worlds import build
 class TracingAhead:
     """A graph that another process traces within this context."""
 
-    busy_cores: int
-    """Of that process: 0 where there is one core alone, and nothing is traced ahead."""
-
     def __init__(self, config: RunConfig) -> None:
         """Begin nothing yet.
 
         Args:
             config: Of the run, from which the graph's structure follows.
         """
-        self._config, self.busy_cores = config, int(torch.get_num_threads() > 1)
+        self._config = config
         self._receiver: Connection | None = None
 
     def __enter__(self) -> "TracingAhead":
-        if self.busy_cores:
-            context = multiprocessing.get_context("spawn")
-            self._receiver, sender = context.Pipe(duplex=False)
-            # A daemon ends with this process, however that ends.
-            self._process = context.Process(target=_send_trace, args=(self._config, sender), daemon=True)
-            self._process.start()
-            sender.close()
+        context = multiprocessing.get_context("spawn")
+        self._receiver, sender = context.Pipe(duplex=False)
+        # A daemon ends with this process, however that ends.
+        self._process = context.Process(target=_send_trace, args=(self._config, sender), daemon=True)
+        self._process.start()
+        sender.close()
         return self
 
     def __exit__(

@@ -43,12 +43,12 @@ def choose_threads(work: Callable[[], object], *, reserved: int = 0) -> int:
 
 
 @contextmanager
-def leaving_cores(num: int) -> Iterator[None]:
-    """Within the block torch computes with fewer threads than it may use, because other processes need cores."""
+def one_thread() -> Iterator[int]:
+    """Within the block torch computes each operation in one thread; gives the number that it may use."""
     allowed = torch.get_num_threads()
-    torch.set_num_threads(max(1, allowed - num))
+    torch.set_num_threads(1)
     try:
-        yield
+        yield allowed
     finally:
         torch.set_num_threads(allowed)
 

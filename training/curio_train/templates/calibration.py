@@ -25,7 +25,7 @@ _NUM_POINTS = 500  # vertices that ADD is measured at, about
 
 
 @torch.no_grad()
-def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> None:
+def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, num_threads: int = 1) -> None:
     """Fit the two logits of the confidence on augmented whole frames.
 
     Frames with the object show whether its pose is correct; as many frames without it show its absence.
@@ -49,7 +49,7 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -
             yield world.augment(batch.images, (0, step)).clamp(0, 1)
             yield world.augment(behind, (1, step)).clamp(0, 1)
 
-    answers = list(in_threads(reader.read, frames()))
+    answers = list(in_threads(reader.read, frames(), num_threads))
     found = [pose for code, _ in answers[::2] for pose in poses(code)]
     full, empty = ([features for _, features in some] for some in (answers[::2], answers[1::2]))
     errors_m = map(add_or_add_s_m, found, true, repeat(points), repeat(kind.info))

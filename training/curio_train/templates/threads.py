@@ -11,23 +11,24 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """As ``map``, with as many calls at once as torch may use threads; each of them computes with one.
+def in_threads(function: Callable[[Item], Result], items: Iterable[Item], num_threads: int) -> Iterator[Result]:
+    """As ``map``, with several calls at once, each of which computes in one thread.
 
     Args:
         function: Called in other threads, which record no gradients.
         items: Made in this thread, few of them ahead.
+        num_threads: How many calls at once.
 
     Raises:
         Exception: Whatever ``function`` raised.
     """
     allowed = torch.get_num_threads()
     pending = deque[Future[Result]]()
-    with ThreadPoolExecutor(allowed, "in-threads", _begin) as threads:
+    with ThreadPoolExecutor(num_threads, "in-threads", _begin) as threads:
         try:
             for item in items:
                 pending.append(threads.submit(function, item))
-                if len(pending) > allowed:
+                if len(pending) > num_threads:
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()

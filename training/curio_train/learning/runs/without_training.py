@@ -6,7 +6,6 @@ from pathlib import Path
 import torch
 
 from curio_train.config import RunConfig
-from curio_train.learning.hardware import leaving_cores
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress, TrainState
@@ -17,14 +16,14 @@ from curio_train.worlds import build
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 
-def draw_templates(config: RunConfig, path: Path, cache: Path, busy_cores: int = 0) -> TrainingProgress:
+def draw_templates(config: RunConfig, path: Path, cache: Path, num_threads: int = 1) -> TrainingProgress:
     """Draw an object's templates, calibrate their confidence, and write both as a run.
 
     Args:
         config: Of the object.
         path: The run folder, a new one.
         cache: Where worlds keep the image sets that they render once.
-        busy_cores: How many other processes compute for as long as drawing takes.
+        num_threads: In how many the calibration reads frames.
 
     Raises:
         CurioError: Any of this package's errors. The folder then holds no checkpoint.
@@ -40,9 +39,8 @@ def draw_templates(config: RunConfig, path: Path, cache: Path, busy_cores: int =
         run.write_config(new=True)
         record_session(path)
         begin = time.monotonic()
-        with leaving_cores(busy_cores):
-            fill(network, world, cache)
-        calibrate(network, world, cache)
+        fill(network, world, cache)
+        calibrate(network, world, cache, num_threads)
         state.progress.seconds = time.monotonic() - begin
         run.save(state)
     return state.progress
