@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from curio_train.learning.hardware import autocast, choose_threads, quick_bfloat16
+from curio_train.learning.hardware import autocast, choose_threads, one_thread, quick_bfloat16
 from curio_train.learning.muon import orthogonal
+from curio_train.templates.threads import in_threads
 
 
 @pytest.fixture(autouse=True)
@@ -35,6 +36,26 @@ def test_a_process_of_one_thread_tries_nothing() -> None:
 def test_threads_for_other_work_are_left_alone(reserved: int, expected: int) -> None:
     slow_alone = lambda: time.sleep(0.5 if torch.get_num_threads() == 1 else 0.0)  # noqa: E731
     assert choose_threads(slow_alone, reserved=reserved) == torch.get_num_threads() == expected
+
+
+def test_one_thread_computes_within_the_block_alone() -> None:
+    with one_thread() as allowed:
+        assert (allowed, torch.get_num_threads()) == (2, 1)
+    assert torch.get_num_threads() == 2
+
+
+def test_calls_in_threads_keep_their_order_and_record_no_gradients() -> None:
+    weight = torch.ones(1, requires_grad=True)
+
+    def late(seconds: float) -> tuple[float, bool, int]:
+        time.sleep(seconds)
+        return seconds, (weight * seconds).requires_grad, torch.get_num_threads()
+
+    waits = [0.1, 0.0, 0.05, 0.0]
+    assert list(in_threads(late, iter(waits), 3)) == [(seconds, False, 1) for seconds in waits]
+    assert torch.get_num_threads() == 2
+    with pytest.raises(ZeroDivisionError):
+        list(in_threads(lambda value: 1 // value, [1, 0, 1], 2))
 
 
 @pytest.mark.parametrize("device_type", ["cpu", "cuda"])

@@ -19,10 +19,12 @@ from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, QUARTER_TURNS, Geometry, num_views, viewpoints
 from curio_train.networks.templates.localiser import RANK, Localiser
 from curio_train.networks.templates.network import STEPS, TemplateNetwork
+from curio_train.networks.templates.quick_trunk import QuickTrunk, with_quick_trunk
 from curio_train.networks.templates.rolls import ROLLS_DEG, upright_rolls
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
 from curio_train.scene_code import COLOR
 from curio_train.templates.build import template_network
+from curio_train.templates.drawing import row_sampling
 from curio_train.worlds import build
 from curio_train.worlds.options import CirclesOptions
 
@@ -38,6 +40,28 @@ def test_the_trunk_says_the_same_of_an_image_wherever_it_is_in_a_batch() -> None
     assert coarse.shape == (3, 40, 8, 8)
     torch.testing.assert_close(trunk(images[1:2])[1][0], coarse[1], atol=1e-4, rtol=1e-3)
     assert not any(parameter.requires_grad for parameter in trunk.parameters())
+
+
+def test_the_quick_trunk_says_the_same() -> None:
+    trunk, images = Trunk.pretrained(), torch.rand(5, 3, 160, 128, generator=torch.Generator().manual_seed(0))
+    for found, expected in zip(QuickTrunk(trunk)(images), trunk(images), strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+    network = TemplateNetwork(GEOMETRY)
+    assert isinstance(with_quick_trunk(network).trunk, QuickTrunk)
+    assert not isinstance(network.trunk, QuickTrunk)
+    assert with_quick_trunk(network.localiser) is network.localiser
+
+
+@pytest.mark.parametrize("scale", [0.4, 0.73, 1.0])
+def test_crops_are_drawn_as_they_are_sampled_in_frames(scale: float) -> None:
+    frame_side, side = 120, 96
+    picture = torch.rand(1, 2, frame_side, frame_side, generator=torch.Generator().manual_seed(0))
+    steps = (torch.arange(2 * side) - (2 * side - 1) / 2) * scale / frame_side
+    grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1)[None]
+    sampled = torch.nn.functional.grid_sample(picture, grid, align_corners=False)
+    rows = row_sampling(frame_side, side, scale)
+    expected = torch.nn.functional.avg_pool2d(sampled, 2)
+    torch.testing.assert_close(rows @ picture @ rows.T, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_truncated_weights_are_named(tmp_path: Path) -> None:

@@ -2,16 +2,22 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from curio_train.config import RunConfig
 from curio_train.errors import CurioError, ExportError
 from curio_train.worlds.options import CaptureOptions
 
+if TYPE_CHECKING:
+    from curio_train.export.ahead import TracingAhead
+
 MODELS_FOLDER = "models"
 """In the folder of a run of one's own part: its exported models."""
 
 
-def end(run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None]) -> str:
+def end(
+    run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None], ahead: "TracingAhead | None" = None
+) -> str:
     """Write the report and, of one's own part, the next version of RUN/models/NAME.
 
     Args:
@@ -19,6 +25,7 @@ def end(run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None]) 
         config: Its configuration.
         cache: Where worlds keep their image sets.
         warn: Called with the reason if the report could not be made; the run has succeeded all the same.
+        ahead: Traces the graph of its model, if that was begun before.
 
     Returns:
         How to go on, for the user.
@@ -38,15 +45,15 @@ def end(run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None]) 
             f"to see what it learned: {run / REPORT_FILE}, or curio-view {run}\n"
             f"to serve it: curio-export {run} --out models/, then curio-serve models/"
         )
-    return _exported(run, config.world.camera, verdict)
+    return _exported(run, config.world.camera, verdict, ahead)
 
 
-def _exported(run: Path, camera: Path, verdict: str) -> str:
+def _exported(run: Path, camera: Path, verdict: str, ahead: "TracingAhead | None") -> str:
     from curio_train.export.graph import export
 
     models = run / MODELS_FOLDER
     try:
-        done = export(run, models)
+        done = export(run, models) if ahead is None else export(run, models, ahead=ahead.model)
     except CurioError as exc:
         raise ExportError(
             f"{run} is trained and whole, but no model could be made of it: {exc}. Once that is put right: "

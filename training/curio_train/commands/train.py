@@ -5,6 +5,7 @@ import dataclasses
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NoReturn, get_type_hints
@@ -23,9 +24,11 @@ from curio_train.errors import UsageError, nearest
 from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.worlds import WORLDS
+from curio_train.worlds.options import CaptureOptions
 
 if TYPE_CHECKING:
     from curio_train.capture.structure import Structure
+    from curio_train.export.ahead import TracingAhead
 
 
 @dataclass(frozen=True)
@@ -157,11 +160,19 @@ def _unset(kind: type[WorldOptions]) -> WorldOptions:
     return kind(**dict.fromkeys(required, tyro.MISSING))
 
 
+def _traced_ahead(config: RunConfig, num_threads: int) -> "AbstractContextManager[TracingAhead | None]":
+    """The graph of one's own part, which is exported at once, where a second core can trace it meanwhile."""
+    from curio_train.export.ahead import TracingAhead
+
+    return TracingAhead(config) if num_threads > 1 and isinstance(config.world, CaptureOptions) else nullcontext()
+
+
 def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_serve.files import direct
 
     from curio_train.commands.finish import end
     from curio_train.commands.prepare import prepared, with_kept_meshes
+    from curio_train.learning.hardware import one_thread
     from curio_train.learning.loop import Outcome
     from curio_train.learning.runs.without_training import draw_templates
     from curio_train.learning.session import learn
@@ -176,9 +187,10 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     if not session.resume:
         config = with_kept_meshes(config, path)
     if config.terms.templates:
-        seconds = draw_templates(config, path, session.cache).seconds
-        print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
-        report(end(path, config, session.cache, warn))
+        with one_thread() as num_threads, _traced_ahead(config, num_threads) as ahead:
+            seconds = draw_templates(config, path, session.cache, num_threads).seconds
+            print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
+            report(end(path, config, session.cache, warn, ahead))
         return 0
     report(f"{path}: preparing images and renderer, which takes a minute or so where it was not done before")
     outcome, progress = learn(

@@ -17,6 +17,7 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, from_json
 from curio_train.learning.runs.provenance import run_sessions
 from curio_train.learning.state import TrainState
+from curio_train.networks.templates.quick_trunk import with_quick_trunk
 from curio_train.scene_code import joined
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World
@@ -85,6 +86,8 @@ def _from_run(path: Path) -> Subject:
 
 
 def _reader(network: nn.Module) -> Predict:
+    network = with_quick_trunk(network)
+
     @torch.no_grad()
     def predict(images: Tensor) -> dict[str, Tensor]:
         code: dict[str, Tensor] = network(images.float() / 255)

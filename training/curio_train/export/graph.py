@@ -12,12 +12,13 @@ import numpy as np
 import onnx
 import torch
 import torch.nn.functional as F
+from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve.models.golden import GOLDEN_FILE
 from curio_serve.models.model_folder import MODEL_FILE
 from jaxtyping import Bool
 from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from curio_train.config import RunConfig
 from curio_train.errors import ExportError, UsageError
 from curio_train.export.card import Provenance, card
 from curio_train.export.crop_stage import STAGE_TENSORS, traced
@@ -30,7 +31,10 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
 from curio_train.learning.runs.initial import weights_file
 from curio_train.learning.runs.provenance import run_sessions
+from curio_train.learning.state import TrainingProgress
+from curio_train.networks.layers import fold_batch_norm
 from curio_train.networks.several_objects.network import ObjectsNetwork
+from curio_train.networks.templates.quick_trunk import with_quick_trunk
 from curio_train.networks.templates.trunk import Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import TRANSLATION, joined
@@ -130,6 +134,7 @@ def export(
     half: bool = False,
     fast: bool = False,
     reduce: Reduce | None = None,
+    ahead: Callable[[Graph], onnx.ModelProto | None] = lambda graph: None,
 ) -> Exported:
     """Write the network of a run as the next version of a model.
 
@@ -140,6 +145,7 @@ def export(
         half: Store weights as float16, half as large; they are computed with in float32.
         fast: Let a detector for several objects look at each in one crop a pass.
         reduce: Applied to the float32 graph once that agrees with torch; not together with ``half``.
+        ahead: Gives the traced graph, where it has been traced before; not together with ``half``.
 
     Raises:
         UsageError: The name cannot be a model's, the folder is something else, or the network cannot be faster.
@@ -154,33 +160,30 @@ def export(
     if fast:
         _look_less(state.pose.network, run)
     trained = Graph(state.pose.network, world)
-    deployed = Graph(_deployable(state.pose.network, half), world)
+    deployed = Graph(deployable(state.pose.network, half), world)
     images = check_images(world)
     with torch.no_grad():
-        learned, expected = trained.in_parts(_pixels(images)), deployed.in_parts(_pixels(images))
+        learned = trained.in_parts(_pixels(images))
+        expected = deployed.in_parts(_pixels(images)) if half else learned
     rounding_error = largest_difference(learned, expected) if half else 0.0
 
     shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
     config = triton_config(target.path.name, tuple(images.shape[1:]), shapes)
     target.refuse_other_tensors(config)
-    stable = numerically_stable(deployed if half else trained, images)
+    checked = with_quick_trunk(deployed.network if half else trained.network)
+    stable = numerically_stable(Graph(checked, world), images)
 
-    model = traced(deployed, deployed.network, world.camera, list(expected))
+    model = ahead(deployed) or traced(deployed, deployed.network, world.camera, list(expected))
     if half:
         store_half(model)
-    spec = model_spec(world, target.path.name)
-    spec.recipe = json.dumps(to_portable(folder.config))
     sessions = run_sessions(run)
-    spec.commit, spec.images_seen, spec.training_seconds = (
-        sessions[0].commit,
-        state.progress.all_images,
-        state.progress.all_seconds,
-    )
+    spec = model_spec(world, target.path.name)
+    _describe(spec, folder.config, sessions[0].commit, state.progress)
     put_spec(model, spec)
 
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
     weights = _weights(half, rounding_error)
-    known = deployed.where(stable, expected if half else learned)
+    known = deployed.where(stable, expected)
     parity_error = refuse_disparity(known, deployed.where(stable, found))
     if reduce is not None:
         exact, reduced = found, reduce(world, model)
@@ -201,6 +204,12 @@ def export(
     }
     path = target.add(version, files, config, text)
     return Exported(path, parity_error, rounding_error, model.ByteSize(), weights)
+
+
+def _describe(spec: ModelSpec, config: RunConfig, commit: str, progress: TrainingProgress) -> None:
+    """What a model was made by and from."""
+    spec.recipe, spec.commit = json.dumps(to_portable(config)), commit
+    spec.images_seen, spec.training_seconds = progress.all_images, progress.all_seconds
 
 
 def _look_less(network: nn.Module, run: Path) -> None:
@@ -230,25 +239,16 @@ def _weights(half: bool, rounding_error: float) -> str:
     return f"stored as float16, computed with in float32; outputs differ by at most {rounding_error:.2g} by that"
 
 
-def _deployable(network: nn.Module, half: bool) -> nn.Module:
+def deployable(network: nn.Module, half: bool) -> nn.Module:
     """The network as it is deployed: batch norm folded into the convolutions, weights rounded as they are stored."""
     network = copy.deepcopy(network).eval()
-    for module in network.modules():
-        if isinstance(module, nn.Sequential):
-            _fold(module)
+    fold_batch_norm(network)
     if half:
         for parameter in network.parameters():
             parameter.data = parameter.data.half().float()
             if not parameter.isfinite().all():
                 raise ExportError("a weight is too large for float16; export without --half")
     return network
-
-
-def _fold(layers: nn.Sequential) -> None:
-    for number in range(len(layers) - 1):
-        convolution, norm = layers[number], layers[number + 1]
-        if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
-            layers[number], layers[number + 1] = fuse_conv_bn_eval(convolution, norm), nn.Identity()
 
 
 @torch.no_grad()
@@ -305,11 +305,16 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slot
 def _jittered_layers(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
     """Within the block every layer's output is jittered by about as much as another order of rounding changes it."""
     noise = _LAYER_JITTER * torch.randn(_NUM_NOISE, generator=generator)
+    repeated = noise
 
     def off(_layer: nn.Module, _given: object, output: Tensor) -> Tensor:
+        nonlocal repeated
         first = int(torch.randint(_NUM_NOISE, (1,), generator=generator))
-        repeated = noise.roll(first).repeat(-(-output.numel() // _NUM_NOISE))
-        return torch.addcmul(output, output, repeated[: output.numel()].view_as(output))
+        if len(repeated) < _NUM_NOISE + output.numel():
+            repeated = noise.repeat(1 + -(-output.numel() // _NUM_NOISE))
+        # In the order in which the output's values lie in memory: mixed orders take several times as long.
+        ordered = torch.empty_like(output).stride()
+        return torch.addcmul(output, output, repeated.as_strided(output.shape, ordered, first))
 
     layers = [module for module in network.modules() if module is not network and not list(module.children())]
     hooks = [layer.register_forward_hook(off) for layer in layers]

@@ -25,7 +25,22 @@ _SMALLEST_HALF = 256  # values; below, a Cast costs more than it saves
 
 
 def to_onnx(network: nn.Module, width: int, height: int, outputs: Sequence[str]) -> onnx.ModelProto:
-    """Trace a network into an ONNX model with a free batch.
+    """Trace a network into an ONNX model with a free batch, and simplify it.
+
+    Args:
+        network: See :func:`traced_program`.
+        width: Of the images, pixels.
+        height: Of the images, pixels.
+        outputs: Names of the returned tensors, in order.
+
+    Returns:
+        A model that holds its weights and nothing of the machine it was traced on.
+    """
+    return simplified(traced_program(network, width, height, outputs).model)
+
+
+def traced_program(network: nn.Module, width: int, height: int, outputs: Sequence[str]) -> torch.onnx.ONNXProgram:
+    """Trace a network; weights keep their names in its graph.
 
     Args:
         network: Takes uint8 RGB [batch, height, width, 3], returns a tuple of tensors.
@@ -34,7 +49,7 @@ def to_onnx(network: nn.Module, width: int, height: int, outputs: Sequence[str])
         outputs: Names of the returned tensors, in order.
 
     Returns:
-        A model that holds its weights and nothing of the machine it was traced on.
+        What :func:`simplified` makes a model of.
     """
     example = torch.zeros(2, height, width, 3, dtype=torch.uint8)
     with _quiet():
@@ -51,8 +66,13 @@ def to_onnx(network: nn.Module, width: int, height: int, outputs: Sequence[str])
             optimize=False,
         )
     assert program is not None  # with dynamo there always is one
-    _simplify(program.model)
-    model: onnx.ModelProto = program.model_proto
+    return program
+
+
+def simplified(traced: ir.Model) -> onnx.ModelProto:
+    """A traced graph as it is stored; changes the graph that is given."""
+    _simplify(traced)
+    model: onnx.ModelProto = ir.to_proto(traced)
     _strip(model)
     onnx.checker.check_model(model)
     return model

@@ -5,7 +5,8 @@ other jobs on two cores, two threads ran at a third to a sixth of one thread's s
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -39,6 +40,17 @@ def choose_threads(work: Callable[[], object], *, reserved: int = 0) -> int:
     most = max(1, torch.get_num_threads() - reserved)
     torch.set_num_threads(most if most == 1 else min((1, most), key=lambda count: _seconds(work, count)))
     return torch.get_num_threads()
+
+
+@contextmanager
+def one_thread() -> Iterator[int]:
+    """Within the block torch computes each operation in one thread; gives the number that it may use."""
+    allowed = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield allowed
+    finally:
+        torch.set_num_threads(allowed)
 
 
 def _seconds(work: Callable[[], object], num_threads: int) -> float:

@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 
 def convolution(num_in: int, num_out: int, kernel: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
@@ -23,3 +24,14 @@ class Residual(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Features of the same shape."""
         return torch.relu(features + self.second(self.first(features)))
+
+
+def fold_batch_norm(network: nn.Module) -> None:
+    """Fold batch norm into the convolutions before it, in place: for a network in evaluation mode."""
+    for layers in network.modules():
+        if not isinstance(layers, nn.Sequential):
+            continue
+        for number in range(len(layers) - 1):
+            convolution, norm = layers[number], layers[number + 1]
+            if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+                layers[number], layers[number + 1] = fuse_conv_bn_eval(convolution, norm), nn.Identity()

@@ -21,8 +21,8 @@ from curio_train.networks.templates.geometry import (
 )
 from curio_train.networks.templates.localiser import Localiser
 from curio_train.networks.templates.network import TemplateNetwork
+from curio_train.networks.templates.quick_trunk import QuickTrunk
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
-from curio_train.templates.describe import features as features_of
 from curio_train.templates.describe import low_rank, mean_cosine
 from curio_train.templates.drawing import TemplateRenderer
 from curio_train.templates.fill_bank import filled_bank
@@ -85,8 +85,9 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> Non
     if world.object.unpainted:
         mesh = replace(mesh, vertex_colors_srgb=np.broadcast_to(color, mesh.vertices_m.shape))
         network.color.copy_(torch.tensor(color))
-    _fill_localiser(network.localiser, network.trunk, geometry, mesh, frames)
-    network.reader.banks.put(0, filled_bank(network.trunk, geometry, mesh, _crops(backgrounds, geometry)))
+    trunk = QuickTrunk(network.trunk)
+    _fill_localiser(network.localiser, trunk, geometry, mesh, frames)
+    network.reader.banks.put(0, filled_bank(trunk, geometry, mesh, _crops(backgrounds, geometry)))
 
 
 @torch.no_grad()
@@ -98,8 +99,8 @@ def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Pat
         RendererError: A mesh cannot be rendered.
         DataError: The backgrounds cannot be read.
     """
-    trunk = network.locator.trunk
-    trunk.load_state_dict(Trunk.pretrained().state_dict())
+    network.locator.trunk.load_state_dict(Trunk.pretrained().state_dict())
+    trunk = QuickTrunk(network.locator.trunk)
     backgrounds = world.members[0].backgrounds(cache).split(True)
     for number, (member, geometry) in enumerate(zip(world.members, network.geometries, strict=True)):
         network.reader.banks.put(number, filled_bank(trunk, geometry, member.mesh, _crops(backgrounds, geometry)))
@@ -112,9 +113,9 @@ def _crops(backgrounds: Backgrounds, geometry: Geometry) -> Float[Tensor, "num 3
     return backgrounds.of_crops(least, largest).draw(_NUM_CROPS, CROP_PX, CROP_PX, (_SEED, 1))
 
 
-def _fill_localiser(localiser: Localiser, trunk: Trunk, geometry: Geometry, mesh: Mesh, frames: Tensor) -> None:
+def _fill_localiser(localiser: Localiser, trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, frames: Tensor) -> None:
     """Templates over grey at every distance, whitened by the backgrounds, then their scores there."""
-    background = torch.cat([trunk(F.avg_pool2d(frame[None], FRAME_STRIDE))[1] for frame in frames])
+    background = trunk(F.avg_pool2d(frames, FRAME_STRIDE))[1]
     whitening = localiser.descriptors.whiten(background)
     rotations = geometry.localising_rotations
     features, masks = [], []
@@ -124,7 +125,7 @@ def _fill_localiser(localiser: Localiser, trunk: Trunk, geometry: Geometry, mesh
         renderer = TemplateRenderer(mesh, depth, geometry.focal_px / FRAME_STRIDE, side)
         drawn = [renderer.draw(some) for some in rotations.split(_BATCH)]
         kernel = slice(_PAD_CELLS, _PAD_CELLS + cells)
-        seen = torch.cat([features_of(trunk, some.over(0, torch.tensor(0.5)))[1] for some in drawn])
+        seen = torch.cat([trunk(some.over(0, torch.tensor(0.5)))[1] for some in drawn])
         alpha = torch.cat([some.alpha for some in drawn])
         features.append(seen[:, :, kernel, kernel])
         masks.append(alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE][:, :, kernel, kernel])

@@ -4,6 +4,7 @@ Distances are not calibrated: renderings that are augmented as training images a
 frames 1.9 % too far, so a factor from renderings moves real poses the wrong way (docs/experiments/real_photographs.md).
 """
 
+from collections.abc import Iterator
 from itertools import repeat
 from pathlib import Path
 
@@ -14,8 +15,9 @@ from curio_train.geometry import Pose
 from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.networks.templates.network import TemplateNetwork
-from curio_train.networks.templates.reader import CalibrationFeatures
+from curio_train.networks.templates.quick_trunk import with_quick_trunk
 from curio_train.scene_code import poses
+from curio_train.templates.threads import in_threads
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _NUM_FRAMES, _BATCH_SIZE = 160, 2  # larger batches take longer a frame
@@ -23,7 +25,7 @@ _NUM_POINTS = 500  # vertices that ADD is measured at, about
 
 
 @torch.no_grad()
-def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> None:
+def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, num_threads: int = 1) -> None:
     """Fit the two logits of the confidence on augmented whole frames.
 
     Frames with the object show whether its pose is correct; as many frames without it show its absence.
@@ -31,23 +33,25 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -
     Raises:
         DataError: The backgrounds cannot be read.
     """
+    reader = with_quick_trunk(network)
     source, kind = world.source("validation", 0, with_code=True, cache=cache), world.object.kind
     points = world.object.mesh.vertices_m[:: max(1, len(world.object.mesh.vertices_m) // _NUM_POINTS)]
     steps = _NUM_FRAMES // _BATCH_SIZE
-    found: list[Pose] = []
     true: list[Pose] = []
-    full: list[CalibrationFeatures] = []
-    empty: list[CalibrationFeatures] = []
-    for step in range(steps):
-        batch = source.batch(step, _BATCH_SIZE)
-        assert batch.code is not None
-        code, features = network.read(world.augment(batch.images, (0, step)).clamp(0, 1))
-        found, true = found + poses(code), true + poses(batch.code)
-        full.append(features)
-        behind = source.backgrounds(steps + step, _BATCH_SIZE)
-        assert behind is not None  # these worlds always have some
-        empty.append(network.read(world.augment(behind, (1, step)).clamp(0, 1))[1])
 
+    def frames() -> Iterator[Tensor]:
+        """Batches with the object and without it by turns."""
+        for step in range(steps):
+            batch, behind = source.batch(step, _BATCH_SIZE), source.backgrounds(steps + step, _BATCH_SIZE)
+            assert batch.code is not None
+            assert behind is not None  # these worlds always have some
+            true.extend(poses(batch.code))
+            yield world.augment(batch.images, (0, step)).clamp(0, 1)
+            yield world.augment(behind, (1, step)).clamp(0, 1)
+
+    answers = list(in_threads(reader.read, frames(), num_threads))
+    found = [pose for code, _ in answers[::2] for pose in poses(code)]
+    full, empty = ([features for _, features in some] for some in (answers[::2], answers[1::2]))
     errors_m = map(add_or_add_s_m, found, true, repeat(points), repeat(kind.info))
     right = [error_m < ADD_THRESHOLD * kind.diameter_m for error_m in errors_m]
     network.reader.pose_correct[0] = _fit([features.right[:, 0] for features in full], right)

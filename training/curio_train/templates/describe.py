@@ -1,19 +1,9 @@
-"""Templates out of pictures: features, mean cosines over silhouettes, and their compression."""
+"""Templates out of descriptors: mean cosines over silhouettes, and their compression."""
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
-
-from curio_train.networks.templates.trunk import Trunk
-
-_BATCH = 8  # pictures: larger feature maps are allocated anew each time, which takes five times as long
-
-
-def features(trunk: Trunk, pictures: Tensor) -> tuple[Tensor, Tensor]:
-    """Both feature maps of pictures, a few at a time."""
-    fine, coarse = zip(*(trunk(some) for some in pictures.split(_BATCH)), strict=True)
-    return torch.cat(fine), torch.cat(coarse)
 
 
 def mean_cosine(descriptors: Tensor, mask: Float[Tensor, "templates 1 height width"]) -> Tensor:

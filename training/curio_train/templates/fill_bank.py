@@ -12,9 +12,10 @@ from curio_train.meshes.meshes import Mesh
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
-from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_STRIDE, FINE_WIDTH, Trunk
+from curio_train.networks.templates.quick_trunk import QuickTrunk
+from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_STRIDE, FINE_WIDTH
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
-from curio_train.templates.describe import features, low_rank, mean_cosine
+from curio_train.templates.describe import low_rank, mean_cosine
 from curio_train.templates.drawing import APPEARANCES, CropTemplateRenderer
 from curio_train.templates.outline import outlines
 
@@ -23,7 +24,7 @@ _BATCH = 64  # of drawings
 _INSIDE = 0.98  # of the pixels around a surface point show the object
 
 
-def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> Bank:
+def filled_bank(trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> Bank:
     """The templates of an object: descriptors averaged over lamps and backgrounds, because what changes counts less.
 
     Args:
@@ -45,14 +46,14 @@ def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> 
     for rotations in views.split(_BATCH):
         drawn = renderer.draw(rotations)
         behind = [crops[torch.from_numpy(random.integers(0, len(crops), len(rotations)))] for _ in APPEARANCES]
-        seen = [features(trunk, drawn.over(n, behind[n], exposure)) for n, (_, exposure) in enumerate(APPEARANCES)]
+        seen = [trunk(drawn.over(n, behind[n], exposure)) for n, (_, exposure) in enumerate(APPEARANCES)]
         inside = _inside(drawn.alpha)
         chosen.append(choice(inside))
         of_object.append(seen[0][0].movedim(1, 0)[:, inside])
         fine.append(torch.stack([_at(one, chosen[-1]) for one, _ in seen]))
         coarse.append(torch.stack([one for _, one in seen]))
         covers.append(drawn.alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE].clone())
-    fine_background, coarse_background = features(trunk, crops)
+    fine_background, coarse_background = trunk(crops)
     covered, of_coarse = torch.cat(covers), torch.cat(coarse, dim=1)
     of_crop.compress(of_crop.whiten(coarse_background), of_coarse[0], covered)
     filters, weights = low_rank(mean_cosine(_sum(of_crop(seen) for seen in of_coarse), covered), RANK)

@@ -31,7 +31,7 @@ from curio_train.worlds.base import Split, novel_view
 REPORT_FILE = "report.html"
 _NUM_SAMPLES = 6
 _NUM_PHOTOGRAPHS = 24
-_NUM_COMPARED = 48  # training images whose re-renderings are compared with them
+_NUM_COMPARED = 48  # training images whose re-renderings are compared with them; fewer where nothing was trained
 _LIBRARIES = ("curio-pose", "torch", "mitsuba", "drjit", "numpy")
 
 
@@ -105,7 +105,7 @@ def _page(
 ) -> str:
     world, config = subject.world, subject.config
     source = world.source(split, config.seed, with_code=False, cache=cache)
-    batch = source.batch(0, _NUM_SAMPLES if errors else _NUM_COMPARED)
+    batch = source.batch(0, _NUM_SAMPLES if errors or config.terms.templates else _NUM_COMPARED)
     code = subject.predict((batch.images.clamp(0, 1) * 255).round().byte())
     rendered = world.render(code, batch.backgrounds).clamp(0, 1)
     columns = (batch.images, rendered, novel_view(world, code).clamp(0, 1))

@@ -16,13 +16,14 @@ from curio_train.worlds import build
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 
-def draw_templates(config: RunConfig, path: Path, cache: Path) -> TrainingProgress:
+def draw_templates(config: RunConfig, path: Path, cache: Path, num_threads: int = 1) -> TrainingProgress:
     """Draw an object's templates, calibrate their confidence, and write both as a run.
 
     Args:
         config: Of the object.
         path: The run folder, a new one.
         cache: Where worlds keep the image sets that they render once.
+        num_threads: In how many the calibration reads frames.
 
     Raises:
         CurioError: Any of this package's errors. The folder then holds no checkpoint.
@@ -39,7 +40,7 @@ def draw_templates(config: RunConfig, path: Path, cache: Path) -> TrainingProgre
         record_session(path)
         begin = time.monotonic()
         fill(network, world, cache)
-        calibrate(network, world, cache)
+        calibrate(network, world, cache, num_threads)
         state.progress.seconds = time.monotonic() - begin
         run.save(state)
     return state.progress
