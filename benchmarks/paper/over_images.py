@@ -1,6 +1,6 @@
 """What curiosity does while a network learns: the error over images seen, with image loss alone and with the critic.
 
-    python benchmarks/paper/over_images.py [--world chairs] [--images 16000] [--seeds 0 1 2] [--results FILE]
+    python benchmarks/paper/over_images.py [--world chairs] [--images 16000] [--seeds 0 1 2] [--jobs 2] [--results FILE]
 
 Both methods learn a world with the dense decoder, once a seed, each run with the learning rates of a run of so many
 images. At marks, each twice as many images as the one before, the network reads 200 images of the validation split.
@@ -11,8 +11,11 @@ yaw_deg, position_m   mean error at each mark
 """
 
 import json
+import multiprocessing
+import os
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -47,12 +50,14 @@ class Settings:
         world: One whose objects stand on the ground, or spheres.
         images: Of every run.
         seeds: Of weights and order.
+        jobs: Runs at once, each on one core.
         results: The file of results, by world; pictures lie beside it.
     """
 
     world: Literal["spheres", "chairs", "varied", "multi", "light"] = "chairs"
     images: int = 16_000
     seeds: tuple[int, ...] = (0, 1, 2)
+    jobs: int = min(2, len(os.sched_getaffinity(0)))
     results: Path = Path("docs/results/over_images.json")
 
 
@@ -148,30 +153,36 @@ def draw(
     figure.savefig(file, dpi=70)
 
 
+def learned(settings: Settings, method: Method, seed: int) -> tuple[dict[str, list[float]], list[np.ndarray]]:
+    """One run: its errors at the marks, and the image with what became of it there."""
+    torch.set_num_threads(1)  # small networks
+    learner, found = Learner(settings, method, seed), list[dict[str, float]]()
+    pictures = [learner.image]
+    for mark in marks_of(settings.images):
+        learner.learn(mark)
+        found.append(learner.errors())
+        pictures.append(learner.picture())
+        print(f"{settings.world}, {method}, seed {seed}, {mark:,} images: {found[-1]}", flush=True)
+    return {name: [one[name] for one in found] for name in found[0]}, pictures
+
+
 def main(settings: Settings) -> None:
     """Run both methods with every seed."""
-    torch.set_num_threads(1)  # small networks
-    marks, rows = marks_of(settings.images), dict[Method, list[np.ndarray]]()
-    errors: dict[Method, list[dict[str, list[float]]]] = {method: [] for method in _METHODS}
-    begun = time.monotonic()
-    for number, seed in enumerate(settings.seeds):
-        for method in _METHODS:
-            learner, found = Learner(settings, method, seed), list[dict[str, float]]()
-            pictures = [learner.image]
-            for mark in marks:
-                learner.learn(mark)
-                found.append(learner.errors())
-                pictures.append(learner.picture())
-                print(f"{settings.world}, {method}, seed {seed}, {mark:,} images: {found[-1]}")
-            errors[method].append({name: [one[name] for one in found] for name in found[0]})
-            if number == 0:
-                rows[method] = pictures
+    begun, marks = time.monotonic(), marks_of(settings.images)
+    with ProcessPoolExecutor(settings.jobs, multiprocessing.get_context("spawn")) as processes:
+        runs = {
+            method: [processes.submit(learned, settings, method, seed) for seed in settings.seeds]
+            for method in reversed(_METHODS)  # the critic takes longer
+        }
+        done = {method: [run.result() for run in runs[method]] for method in _METHODS}
+    errors = {method: [found for found, _ in results] for method, results in done.items()}
     made: dict[str, Any] = {"marks": marks, "seeds": list(settings.seeds), "minutes": (time.monotonic() - begun) / 60}
     results = json.loads(settings.results.read_text(encoding="utf-8")) if settings.results.exists() else {}
     results[settings.world] = errors | made | {"machine": machine(), "commit": commit()}
     settings.results.parent.mkdir(parents=True, exist_ok=True)
     settings.results.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    draw(errors, marks, rows, settings.results.with_name(f"over_images-{settings.world}.png"))
+    pictures = {method: results[0][1] for method, results in done.items()}
+    draw(errors, marks, pictures, settings.results.with_name(f"over_images-{settings.world}.png"))
 
 
 if __name__ == "__main__":
