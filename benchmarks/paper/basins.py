@@ -24,16 +24,16 @@ import tyro
 from curio_train.geometry import matrix_from_yaw, rotation_angle_deg
 from curio_train.learning.runs.provenance import commit, machine
 from curio_train.metrics.images import blurred
-from curio_train.scene_code import TRANSLATION, YAW, SceneCode, index
+from curio_train.scene_code import CONFIDENCE, TRANSLATION, YAW, SceneCode, index
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World
+from curio_train.worlds.generated.hypotheses.descent import Descent
 from torch import Tensor
 
 _TURNS_DEG, _MOVES_M = (15, 30, 60, 90, 180), (0.05, 0.1, 0.2, 0.4)
 _BLUR_SIDE_PX = 25  # of the Gaussian filter, 4.1 pixels wide
 _BACK_DEG, _BACK_M = 10.0, 0.03
-_RATES = {TRANSLATION: 0.02, YAW: 0.1}  # Adam's first; metres, and units of the code
-_SLOWER = 0.97  # each step is so much shorter
+_FIRST_STEPS, _SLOWER = {TRANSLATION: 0.02, YAW: 0.1}, 0.97  # see Descent
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Scenes:
     def __init__(self, world: World, count: int, seed: int) -> None:
         self._world, self._count = world, count
         self._code = world.sample(count, (seed, 0))
-        present = self._code.get("confidence", torch.ones(count, world.layout.num_slots, 1))[..., 0]
+        present = self._code.get(CONFIDENCE, torch.ones(count, world.layout.num_slots, 1))[..., 0]
         random = torch.Generator().manual_seed(seed)
         self._slot = torch.multinomial(present, 1, generator=random)[:, 0]
         self._angle = 2 * math.pi * torch.rand(count, generator=random)
@@ -99,20 +99,11 @@ class Scenes:
 
     def descended(self, start: SceneCode, steps: int, side_px: int) -> dict[str, Tensor]:
         """Where the image loss leads from there."""
-        free = {name: start[name].clone().requires_grad_() for name in _RATES}
-        groups = [{"params": [value], "lr": _RATES[name]} for name, value in free.items()]
-        optimizer = torch.optim.Adam(groups, betas=(0.7, 0.9))
-        images = blurred(self._images, side_px)
+        descent, images = Descent(start, _FIRST_STEPS, _SLOWER), blurred(self._images, side_px)
         for _ in range(steps):
-            optimizer.zero_grad()
-            (blurred(self._world.render({**start, **free}), side_px) - images).square().sum().backward()
-            position = free[TRANSLATION].grad
-            assert position is not None
-            position[..., 1] = 0  # objects stand
-            optimizer.step()
-            for group in optimizer.param_groups:
-                group["lr"] *= _SLOWER
-        return {**start, **{name: value.detach() for name, value in free.items()}}
+            rendered = blurred(self._world.render({**start, **descent.free}), side_px)
+            descent.step((rendered - images).square().sum())
+        return {**start, **{name: value.detach() for name, value in descent.free.items()}}
 
     def are_back(self, found: SceneCode, name: str) -> Tensor:
         """Whether the object of each scene is back."""

@@ -23,6 +23,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import tyro
+from curio_train.commands.command_line.running import CACHE
 from curio_train.config import NetworkConfig, RunConfig
 from curio_train.learning.loop import learning_rate_factor
 from curio_train.learning.parallel import Ranks
@@ -37,7 +38,6 @@ from matplotlib.figure import Figure
 Method = Literal["noncur", "our"]
 _METHODS: Sequence[Method] = ("noncur", "our")
 _COLORS = {"noncur": "tab:orange", "our": "tab:blue"}
-_CACHE = Path("~/.cache/curio")
 _FIRST_MARK = 1000  # images
 _NUM_SCORED = 200
 
@@ -70,9 +70,9 @@ class Learner:
         network = NetworkConfig(reading="cells")
         self._config = RunConfig(options, method=method, seed=seed, images=settings.images, network=network)
         self.world: World = build(options)
-        source = self.world.source("train", seed, with_code=False, cache=_CACHE)
+        source = self.world.source("train", seed, with_code=False, cache=CACHE)
         self._trainer = Trainer(self._config, self.world, [source], Ranks(0, 1, torch.device("cpu")))
-        held_out = self.world.source("validation", 0, with_code=True, cache=_CACHE)
+        held_out = self.world.source("validation", 0, with_code=True, cache=CACHE)
         assert isinstance(held_out, StoredImages)
         self._held_out = held_out.subset(_NUM_SCORED / len(held_out))
 

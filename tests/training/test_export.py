@@ -5,6 +5,7 @@ import json
 import resource
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from curio_train.errors import CheckpointError, ExportError, UsageError
 from curio_train.export.ahead import TracingAhead
 from curio_train.export.card import EVALUATION_FILE, Provenance, card, portable
 from curio_train.export.folder import ModelFolder
-from curio_train.export.graph import Exported, check_images, export
+from curio_train.export.graph import Exported, Graph, check_images, export
 from curio_train.export.parity import largest_difference, refuse_disparity
 from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
@@ -26,7 +27,7 @@ from curio_train.learning.state import TrainingProgress
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout
 from curio_train.worlds import build
 from curio_train.worlds.generated.circles import Circles
-from curio_train.worlds.options import CirclesOptions
+from curio_train.worlds.options import CaptureOptions, CirclesOptions
 
 WriteRun = Callable[..., Path]
 
@@ -68,6 +69,13 @@ def test_a_graph_traced_before_there_were_weights_is_the_same(run: Path, single:
     for node in (*found.graph.node, *direct.graph.node):
         node.ClearField("name")  # some are numbered
     assert found.graph == direct.graph
+
+
+def test_a_trace_that_ended_with_an_error_is_no_graph(network: torch.nn.Module, run: Path, tmp_path: Path) -> None:
+    config = RunFolder.open(run).config
+    part = CaptureOptions(mesh=(tmp_path / "missing.stl",), camera=tmp_path / "none.json", photos=tmp_path)
+    with TracingAhead(replace(config, world=part, method="templates")) as ahead:
+        assert ahead.model(Graph(network, build(config.world))) is None
 
 
 @pytest.mark.parametrize("num_images", [1, 2, 7])

@@ -57,7 +57,7 @@ class TracingAhead:
             return None
         try:
             content = self._receiver.recv_bytes()
-        except EOFError:
+        except (EOFError, OSError):  # the second where it was ended while it sent
             return None
         self._process.join()  # where it is ended from here, it leaves a warning of Python's behind
         model = ir.from_proto(onnx.load_from_string(content))

@@ -1,6 +1,7 @@
 """Scenes that descend the gradient of the image loss: places and yaws lie between those of the hypotheses."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Float, UInt8
@@ -32,27 +33,48 @@ def descended(
     return joined([found for found, _ in parts]), torch.cat([losses for _, losses in parts])
 
 
-@torch.enable_grad()
-def _descended(world: MeshWorld, code: dict[str, Tensor], images: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-    free = {name: code[name].clone().requires_grad_() for name in _FIRST_STEPS if name in code}
-    groups = [{"params": [value], "lr": _FIRST_STEPS[name]} for name, value in free.items()]
-    optimizer = torch.optim.Adam(groups, betas=(0.7, 0.9))
-    best, lowest = code, torch.full((len(images),), math.inf)
-    for _ in range(_NUM_STEPS):
-        losses = _losses(world, {**code, **free}, images)
-        better = losses.detach() < lowest
-        best = best | {name: _chosen(better, value.detach(), best[name]) for name, value in free.items()}
-        lowest = torch.minimum(lowest, losses.detach())
-        optimizer.zero_grad()
-        losses.sum().backward()
-        position = free[TRANSLATION].grad
+class Descent:
+    """Adam on entries of scene codes whose objects stand on the ground, by steps that become shorter."""
+
+    free: dict[str, Tensor]
+    """The entries that move, by name."""
+
+    def __init__(self, code: SceneCode, first_steps: Mapping[str, float], slower: float) -> None:
+        """Begin with copies of a code's entries.
+
+        Args:
+            code: Where to begin.
+            first_steps: Length of the first step by entry, metres and units of the code.
+            slower: Each step is so much shorter than the one before.
+        """
+        self.free = {name: code[name].clone().requires_grad_() for name in first_steps if name in code}
+        groups = [{"params": [value], "lr": first_steps[name]} for name, value in self.free.items()]
+        self._optimizer, self._slower = torch.optim.Adam(groups, betas=(0.7, 0.9)), slower
+
+    def step(self, loss: Float[Tensor, ""]) -> None:
+        """One step along the gradient of a loss."""
+        self._optimizer.zero_grad()
+        loss.backward()
+        position = self.free[TRANSLATION].grad
         assert position is not None
         position[..., 1] = 0  # objects stand
-        optimizer.step()
-        for group in optimizer.param_groups:
-            group["lr"] *= _SLOWER
-        if COLOR in free:
-            free[COLOR].data.clamp_(*COLOR_RANGE)
+        self._optimizer.step()
+        for group in self._optimizer.param_groups:
+            group["lr"] *= self._slower
+        if COLOR in self.free:
+            self.free[COLOR].data.clamp_(*COLOR_RANGE)
+
+
+@torch.enable_grad()
+def _descended(world: MeshWorld, code: dict[str, Tensor], images: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+    descent = Descent(code, _FIRST_STEPS, _SLOWER)
+    best, lowest = code, torch.full((len(images),), math.inf)
+    for _ in range(_NUM_STEPS):
+        losses = _losses(world, {**code, **descent.free}, images)
+        better = losses.detach() < lowest
+        best = best | {name: _chosen(better, value.detach(), best[name]) for name, value in descent.free.items()}
+        lowest = torch.minimum(lowest, losses.detach())
+        descent.step(losses.sum())
     return best, lowest
 
 
