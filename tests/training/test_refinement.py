@@ -82,7 +82,7 @@ def test_most_estimates_come_most_of_the_way_to_the_truth(
     """One of six may end in another pose that explains as much: the search is a local one."""
     images, _, true = scenes
     estimate = off(true)
-    found = refinement.refine(images, estimate)[0]
+    found = refinement.refine(images, estimate).code
     before, after = errors(estimate, true), errors(found, true)
     assert before.min() > 0.1
     assert np.median(after) < 0.15 * np.median(before), (before, after)
@@ -102,7 +102,7 @@ def test_objects_half_hidden_are_not_lost(
     for number, column in enumerate((K[0, 0] * place[:, 0] / place[:, 2] + K[0, 2] + 8).int().tolist()):
         hidden[number, :, :, column:] = behind[number].flip(1)[:, :, column:]
     estimate = off(true)
-    before, after = errors(estimate, true), errors(refinement.refine(hidden, estimate)[0], true)
+    before, after = errors(estimate, true), errors(refinement.refine(hidden, estimate).code, true)
     assert (after < before + 0.02).sum() >= NUM - 1, (before, after)
 
 
@@ -113,7 +113,7 @@ def test_where_there_is_nothing_estimates_stand(
     estimate = off(true)
     flat = torch.full_like(behind, 128)
     for images in (behind, flat):
-        found = refinement.refine(images, estimate)[0]
+        found = refinement.refine(images, estimate).code
         assert all(torch.equal(found[name], estimate[name]) for name in estimate)
 
 
@@ -123,7 +123,7 @@ def test_objects_out_of_the_picture_give_numbers(
     images, _, true = scenes
     lost = dict(true) | {TRANSLATION: true[TRANSLATION] + torch.tensor([3.0, 0.0, 0.0])}
     lost[TRANSLATION][0] = torch.tensor([0.0, 0.0, 1e-3])
-    found = refinement.refine(images, lost)[0]
+    found = refinement.refine(images, lost).code
     assert all(value.isfinite().all() for value in found.values())
 
 
@@ -162,7 +162,7 @@ def test_each_of_several_objects_is_refined_and_takes_the_mean_of_both_depths(wo
     found = with_refinement(lambda _: estimate, several, "sleep")(images)
     for slot, member in enumerate(members):
         alone = RenderAndCompare(member.mesh, several.camera, member.kind.diameter_m)
-        refined, accepted = alone.refine(images, of_slot(estimate, slot))
+        refined, accepted, *_ = alone.refine(images, of_slot(estimate, slot))
         assert accepted.all()
         expected = (refined[TRANSLATION][..., 2:] * estimate[TRANSLATION][:, slot : slot + 1, 2:]).sqrt()
         expected = refined[TRANSLATION] * expected / refined[TRANSLATION][..., 2:]

@@ -41,6 +41,11 @@ class Method:
         return self.image or self.curiosity or self.label or self.hypotheses
 
     @property
+    def renders_predictions(self) -> bool:
+        """Whether predictions for training images are rendered and compared with them."""
+        return self.image or self.curiosity
+
+    @property
     def perturbs_predictions(self) -> bool:
         """Whether the scene codes of ``sleep`` are drawn around predictions for training images."""
         return self.sleep and self.reads_images
@@ -249,8 +254,6 @@ class RunConfig:
             raise UsageError(
                 f"--labels {self.labels} with --method {self.method}, which uses none; expected --method super"
             )
-        if self.terms.hypotheses and self.network.reading != "cells":
-            raise UsageError("--method hypotheses teaches the dense decoder alone; add --reading cells")
         if self.stop_below and not self.terms.image:
             raise UsageError(f"--stop-below watches the image loss, which --method {self.method} does not have")
         for name in ("minutes", "images"):

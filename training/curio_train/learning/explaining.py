@@ -3,54 +3,123 @@
 The search takes minutes to an hour, so what is found is kept in the run folder, some images a file, and a run that was
 stopped goes on with the images that are left::
 
-    RUN/found/00000.npz     the scene codes found for the first images of the set
+    RUN/found/00000.npz     the scene codes found for the first images of the set, and the seconds that it took
 """
 
 import sys
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from curio_train.config import DecoderKind
 from curio_train.errors import CheckpointError, UsageError
+from curio_train.refinement.found_frames import FrameExplainer, TrainingFrames, stage_sources, template_reader
 from curio_train.scene_code import joined
 from curio_train.worlds.base import Explainer, HypothesisWorld, ImageSource, World
 from curio_train.worlds.image_sets import StoredImages, load_arrays, save_arrays
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 _FOLDER = "found"
 _A_FILE = 100  # images
 
 
+_SECONDS = "seconds"
+
+
+class Found(NamedTuple):
+    """What a search found."""
+
+    sources: Sequence[ImageSource]
+    """Images with scenes for each of the world's stages."""
+    seconds: float
+    """That the search took, over all sessions."""
+
+
+class Images(Protocol):
+    """Images that are searched, uint8 [3, height, width] each."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, rows: slice, /) -> Tensor:
+        """Neighbouring ones, [num, 3, height, width]."""
+
+
+def search_of(world: World, reading: DecoderKind | None, seed: int, cache: Path) -> Callable[[Path], Found]:
+    """What finds, given the run folder, the scenes of training images.
+
+    Args:
+        world: That the images are of.
+        reading: The decoder that is to learn from them.
+        seed: Of the shuffling and all draws.
+        cache: Folder of the image sets that worlds draw once.
+
+    Raises:
+        UsageError: Scenes of this world cannot be found, or this decoder cannot learn from them.
+        DataError: The backgrounds cannot be read. The search itself raises it, too, for damaged files of found scenes,
+            and CheckpointError if the run folder cannot be written or weights of pretrained features are missing.
+    """
+    if isinstance(world, TwoStageWorld):
+        frames, finder = TrainingFrames(world, seed, cache), FrameExplainer(world, template_reader(world, cache))
+
+        def search_frames(run: Path) -> Found:
+            code, seconds = explained(finder, frames, run)
+            return Found(stage_sources(world, frames, code, seed), seconds)
+
+        return search_frames
+    explainer = explainer_of(world)
+    if reading != "cells":
+        raise UsageError("--method hypotheses teaches the dense decoder alone; add --reading cells")
+    source = world.source("train", seed, with_code=False, cache=cache)
+    assert isinstance(source, StoredImages)  # worlds with hypotheses have those
+
+    def search_images(run: Path) -> Found:
+        code, seconds = explained(explainer, source.images, run)
+        return Found([source.with_code(code)], seconds)
+
+    return search_images
+
+
 def explainer_of(world: World) -> Explainer:
-    """What finds the scenes of a world's images.
+    """What finds the scenes of a generated world's images.
 
     Raises:
         UsageError: The world has no hypotheses, or scenes of this world cannot be found so.
     """
     if not isinstance(world, HypothesisWorld):
-        raise UsageError(f"--method hypotheses: {world.name} has no hypotheses; expected chairs, multi or light")
+        raise UsageError(
+            f"--method hypotheses: {world.name} has no hypotheses here; expected chairs, multi, light, or linemod with "
+            "one class in two stages"
+        )
     return world.explainer()
 
 
-def explained(explainer: Explainer, source: ImageSource, run: Path) -> StoredImages:
-    """The images with the scenes found for them.
+def explained(explainer: Explainer, images: Images, run: Path) -> tuple[dict[str, Tensor], float]:
+    """The scenes found for images, and the seconds that it took, over all sessions.
 
     Raises:
         CheckpointError: The run folder cannot be written.
         DataError: A file of found scenes is damaged.
     """
-    assert isinstance(source, StoredImages)  # worlds with hypotheses have those
-    parts = list[dict[str, Tensor]]()
-    for first in range(0, len(source), _A_FILE):
+    parts, seconds = list[dict[str, Tensor]](), 0.0
+    for first in range(0, len(images), _A_FILE):
         file = run / _FOLDER / f"{first:05d}.npz"
         if not file.exists():
-            print(f"{run}: scenes found for {first:,} of {len(source):,} images", file=sys.stderr)
-            found = explainer.explain(source.images[first : first + _A_FILE])
+            print(f"{run}: scenes found for {first:,} of {len(images):,} images", file=sys.stderr)
+            begin = time.monotonic()
+            found = explainer.explain(images[first : first + _A_FILE])
+            arrays = {name: value.numpy() for name, value in found.items()}
             try:
-                save_arrays(file, {name: value.numpy() for name, value in found.items()})
+                save_arrays(file, arrays | {_SECONDS: np.array(time.monotonic() - begin)})
             except OSError as exc:
                 raise CheckpointError(
                     f"cannot write {file}: {exc.strerror}; make room, then continue with --resume {run}"
                 ) from exc
-        parts.append({name: torch.from_numpy(value) for name, value in load_arrays(file).items()})
-    return source.with_code(joined(parts))
+        arrays = load_arrays(file)
+        seconds += float(arrays.pop(_SECONDS, 0.0))
+        parts.append({name: torch.from_numpy(value) for name, value in arrays.items()})
+    return joined(parts), seconds

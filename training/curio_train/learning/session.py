@@ -1,12 +1,13 @@
 """One session of training: from a configuration to a run folder, new or resumed."""
 
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Literal
 
 from curio_train.config import RunConfig
-from curio_train.learning.explaining import explained, explainer_of
+from curio_train.learning.explaining import Found, search_of
 from curio_train.learning.hardware import choose_threads
 from curio_train.learning.loop import Outcome, train
 from curio_train.learning.parallel import ranks
@@ -20,7 +21,7 @@ from curio_train.learning.trainer import Trainer
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.templates.build import fill_objects
 from curio_train.worlds import build
-from curio_train.worlds.base import stages_of
+from curio_train.worlds.base import World, stages_of
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
 
@@ -31,6 +32,17 @@ def _draw_templates(trainer: Trainer, cache: Path) -> None:
         begin = time.monotonic()
         fill_objects(network, world, cache)
         trainer.state.progress.seconds += time.monotonic() - begin
+
+
+def _training_images(config: RunConfig, world: World, cache: Path) -> Callable[[Path], Found]:
+    """What gives the training images of a world's stages, once there is a run folder."""
+    if config.terms.hypotheses:
+        return search_of(world, config.network.reading, config.seed, cache)
+    labels = config.terms.label
+    sources = [stage.source("train", config.seed, with_code=labels, cache=cache) for stage in stages_of(world)]
+    if config.labels < 1:
+        sources = [source.subset(config.labels) for source in sources]
+    return lambda _: Found(sources, seconds=0.0)
 
 
 def learn(
@@ -63,20 +75,14 @@ def learn(
     with ranks(device) as here, ExitStack() as own:
         # The world comes first, so that an error in its data leaves no run folder behind.
         world = build(config.world)
-        sources = [
-            stage.source("train", config.seed, with_code=config.terms.label, cache=cache) for stage in stages_of(world)
-        ]
-        explainer = explainer_of(world) if config.terms.hypotheses else None
-        if config.labels < 1:
-            sources = [source.subset(config.labels) for source in sources]
+        training_images = _training_images(config, world, cache)
         run = RunFolder(path, config)
         if here.leads:
             own.enter_context(run.lock())
             run.write_config(new=not resume)
             record_session(path)
-        if explainer is not None:
-            sources = [explained(explainer, source, path) for source in sources]
-        trainer = Trainer(config, world, sources, here)
+        found = training_images(path)
+        trainer = Trainer(config, world, found.sources, here)
         if here.device.type == "cpu":
             # The thread that renders synthetic batches ahead needs a core of its own.
             choose_threads(trainer.warm_up, reserved=int(not config.terms.reads_images))
@@ -85,6 +91,7 @@ def learn(
         else:
             if config.init is not None:
                 begin_with(trainer.state, config.init)
+            trainer.state.progress.seconds_before += found.seconds
             _draw_templates(trainer, cache)
 
         with reporting(path, trainer.state.progress) if here.leads else nullcontext() as reporter:

@@ -91,7 +91,8 @@ class TrainingProgress:
     images_before: int = 0
     """Images shown before this run, where it began with trained weights (``--init``)."""
     seconds_before: float = 0.0
-    """Time spent training before this run."""
+    """Time spent before this run's first step: on training the weights that it began with, and on searching for the
+    scenes of its training images (``--method hypotheses``)."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that no run can reach.
@@ -109,7 +110,7 @@ class TrainingProgress:
 
     @property
     def all_seconds(self) -> float:
-        """Time spent training the network since it had random weights."""
+        """Time spent on the network since it had random weights."""
         return self.seconds_before + self.seconds
 
 

@@ -65,10 +65,10 @@ class Trainer:
         Raises:
             UsageError: The method cannot train this world, or its network.
         """
-        if len(stages_of(world)) > 1 and config.terms.reads_images:
+        if len(stages_of(world)) > 1 and config.terms.renders_predictions:
             raise UsageError(
                 f"--method {config.method} needs whole-scene images, and this model trains on crops: "
-                "use --method sleep (or, with linemod, --one-stage)"
+                "use --method sleep or hypotheses (or, with linemod, --one-stage)"
             )
         self.config, self.world, self.ranks = config, world, ranks
         self.state = TrainState(config, world, ranks.device)

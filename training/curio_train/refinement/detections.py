@@ -86,7 +86,7 @@ class DetectionRefiner:
         image = torch.from_numpy(np.ascontiguousarray(crop.image)).permute(2, 0, 1)[None]
         code = _code(detections, light, crop.canonical_from_cam)
         with self._lock:
-            refined, accepted = refiner.refine(image.expand(len(detections), -1, -1, -1), code)
+            refined, accepted, *_ = refiner.refine(image.expand(len(detections), -1, -1, -1), code)
             self.num_detections += len(detections)
             self.num_refined += int(accepted.sum())
         for detection, pose, is_better in zip(detections, poses(refined), accepted.tolist(), strict=True):

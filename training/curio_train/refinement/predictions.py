@@ -29,7 +29,7 @@ def with_refinement(
 
     def refined(images: Tensor) -> dict[str, Tensor]:
         code = predict(images)
-        slots = [refiner.refine(images, of_slot(code, slot))[0] for slot, refiner in enumerate(refiners)]
+        slots = [refiner.refine(images, of_slot(code, slot)).code for slot, refiner in enumerate(refiners)]
         return dict(code) | {
             name: torch.cat([one[name] for one in slots], dim=1) for name in (TRANSLATION, ROTATION_6D)
         }

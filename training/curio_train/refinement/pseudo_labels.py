@@ -14,13 +14,13 @@ from typing import Self
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from curio_train.data.photographs import CameraPoses, read_frames
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.metrics.poses import symmetry_poses
-from curio_train.networks.crop_camera import cut_crops
+from curio_train.networks.crop_camera import about_axis, cut_crops
 from curio_train.refinement.multi_view import Estimates, consensus_poses
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, index, joined
@@ -35,6 +35,7 @@ MIN_CONSENSUS = 10
 _BATCH_SIZE = 20
 _PASSES = 2  # of render-and-compare over each photograph
 _GAINS = (0.8, 1.25)  # on crops: only the light varies, all else is the camera's own
+_DRAWN = 4  # times as many pairs of photographs as crops are wanted that show no object
 
 
 class PseudoLabels:
@@ -115,9 +116,21 @@ class PseudoLabels:
         """Number of photographs."""
         return len(self._frames)
 
+    @property
+    def given(self) -> tuple[str, ...]:
+        """Entries of the crops' codes that are known of every image."""
+        return self._stage.given
+
     @torch.no_grad()
-    def draw(self, count: int, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:
+    def draw(
+        self, count: int, seed: tuple[int, ...], largest_roll_deg: float = 0.0
+    ) -> tuple[dict[str, Tensor], Tensor]:
         """Crops of random photographs, as the errors of the localisation stage leave them.
+
+        Args:
+            count: How many.
+            seed: Decides every draw.
+            largest_roll_deg: By which the crops' cameras are rolled, to either side.
 
         Returns:
             Codes of the crop-pose stage, and images [count, 3, CROP_PX, CROP_PX] in [0, 1].
@@ -128,15 +141,42 @@ class PseudoLabels:
         position_m = code[TRANSLATION][:, 0]
         localised_m = self._stage.perturbed(position_m, random)
         assumed_depth_m = localised_m.norm(dim=1)
-        focal_px = FILL * CROP_PX * assumed_depth_m / self._stage.object.kind.diameter_m
-        crops, crop_from_cam = cut_crops(
-            self._frames[chosen].float() / 255, self._matrix, localised_m[:, None], focal_px, CROP_PX
-        )
+        gain = torch.from_numpy(random.uniform(*_GAINS, (count, 1, 1, 1))).float()
+        roll = torch.from_numpy(np.radians(random.uniform(-largest_roll_deg, largest_roll_deg, count))).float()
+        crops, crop_from_cam = self._crops(chosen, localised_m, about_axis(torch.stack([roll.cos(), roll.sin()], 1)))
         rotation = crop_from_cam @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
         in_crop, code[LIGHT] = ((crop_from_cam @ vector[..., None])[..., 0] for vector in (position_m, code[LIGHT]))
-        gain = torch.from_numpy(random.uniform(*_GAINS, (count, 1, 1, 1))).float()
         labels = self._stage.label_crops(code, in_crop, rotation, assumed_depth_m[:, None])
         return labels, (gain * crops).clamp(0, 1)
+
+    @torch.no_grad()
+    def elsewhere(self, count: int, seed: tuple[int, ...]) -> Float[Tensor, "count 3 side side"]:
+        """Crops of random photographs where others show the object and they do not; in [0, 1]."""
+        random = np.random.default_rng(seed)
+        position_m, diameter_m = self._code[TRANSLATION][:, 0], self._stage.object.kind.diameter_m
+        chosen, others = torch.from_numpy(random.integers(len(self), size=(2, _DRAWN * count)))
+        slopes = position_m[:, :2] / position_m[:, 2:]
+        apart = (slopes[chosen] - slopes[others]).norm(dim=1)
+        farthest = (apart * position_m[chosen, 2] / diameter_m).argsort(descending=True)[:count]
+        no_roll = torch.eye(3).expand(count, 3, 3)
+        return self._crops(chosen[farthest], position_m[others[farthest]], no_roll)[0]
+
+    def _crops(self, chosen: Tensor, position_m: Tensor, roll: Tensor) -> tuple[Tensor, Tensor]:
+        """Crops of photographs around positions, and crop_from_cam; one after the other, as whole frames are large."""
+        focal_px = FILL * CROP_PX * position_m.norm(dim=1) / self._stage.object.kind.diameter_m
+        parts = [
+            cut_crops(
+                self._frames[number][None].float() / 255,
+                self._matrix,
+                position_m[None, row : row + 1],
+                focal_px[row : row + 1],
+                CROP_PX,
+                roll=roll[row : row + 1],
+            )
+            for row, number in enumerate(chosen)
+        ]
+        crops, crop_from_cam = zip(*parts, strict=True)
+        return torch.cat(crops), torch.cat(crop_from_cam)
 
 
 def _affordable(
@@ -167,4 +207,4 @@ def _refined(
     """Refined poses, and where they were accepted."""
     batches = [slice(first, first + _BATCH_SIZE) for first in range(0, len(frames), _BATCH_SIZE)]
     parts = [refiner.refine(frames[batch], index(code, batch)) for batch in batches]
-    return joined([part for part, _ in parts]), torch.cat([accepted for _, accepted in parts])
+    return joined([part.code for part in parts]), torch.cat([part.accepted for part in parts])

@@ -67,6 +67,19 @@ DEFAULT_LIGHT = 0.0, -0.4, -0.5  # from above the camera, for poses that are not
 _BATCH_SIZE = 32  # of poses that are not optimised
 
 
+class Refined(NamedTuple):
+    """Poses after the optimisation."""
+
+    code: dict[str, Tensor]
+    """Refined positions and rotations where the result was accepted, everything else as it was."""
+    accepted: Bool[Tensor, " batch"]
+    """Where it was."""
+    residual: Float[Tensor, " batch"]
+    """Mean robust residual of the optimised poses, accepted or not, inside and around their silhouettes, 0 to 1."""
+    light: Float[Tensor, "batch 3"]
+    """That the optimised poses are rendered in; the code keeps the estimate's."""
+
+
 class RenderAndCompare:
     """Refines poses of one object in frames of one camera."""
 
@@ -103,24 +116,21 @@ class RenderAndCompare:
         object_ = world.object.without_scan_excess() if from_templates else world.object
         return cls(object_.mesh, world.camera, object_.kind.diameter_m, from_templates=from_templates)
 
-    def refine(self, images: Tensor, code: SceneCode) -> tuple[dict[str, Tensor], Bool[Tensor, " batch"]]:
+    def refine(self, images: Tensor, code: SceneCode) -> Refined:
         """Refine the poses of a batch, all at once.
 
         Args:
             images: uint8 sRGB [batch, 3, height, width].
             code: Estimates for them; metres and 6D rotation in the camera frame.
-
-        Returns:
-            The code with refined positions and rotations where the result was accepted, everything else as it was; and
-            where it was accepted.
         """
-        *_, (result, _) = self.steps(images, code)
+        *_, (result, residual) = self.steps(images, code)
         accepted = self._accepted(images, code, result)
         refined = {
             name: torch.where(accepted[:, None, None], result[name], code[name]) for name in (TRANSLATION, ROTATION_6D)
         }
         found = dict(code) | refined
-        return (with_mean_depth(code, found) if self._from_templates else found), accepted
+        code = with_mean_depth(code, found) if self._from_templates else found
+        return Refined(code, accepted, residual, result[LIGHT])
 
     def steps(self, images: Tensor, code: SceneCode) -> Iterator[tuple[dict[str, Tensor], Float[Tensor, " batch"]]]:
         """The code after each step of the optimisation, and the mean residual before the step, 0 to 1.

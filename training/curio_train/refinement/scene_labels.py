@@ -13,19 +13,18 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS, VirtualCamera
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from curio_train.data.photographs import read_frames
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.networks.templates.geometry import FRAME_STRIDE
 from curio_train.refinement.scene_poses import Reads, scene_poses
+from curio_train.refinement.turned_frames import in_view, random_camera, seen_by
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, SceneCode, joined
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
 _CAMERAS = VIRTUAL_CAMERAS[:3]  # that photographs are read through
-_LARGEST_ROLL_DEG, _LARGEST_PAN_DEG, _LARGEST_TILT_DEG = 20.0, 6.0, 5.0  # of cameras that training images are seen by
-_LARGEST_LOG_ZOOM = 0.18
 _ELSEWHERE_M = (0.0, 0.0, 1.0)  # where objects are said to be whose place nobody knows
 
 _log = logging.getLogger(__name__)
@@ -107,29 +106,18 @@ class SceneLabels:
         """
         random = np.random.default_rng(seed)
         chosen = random.integers(len(self.frames), size=count)
-        images, positions = zip(*(self._seen_by(_random_camera(random), number) for number in chosen), strict=True)
-        position_m = np.stack(positions)
-        known, inside = np.isfinite(position_m).all(axis=2), self._in_view(position_m)
+        seen = [
+            seen_by(random_camera(random), self.frames[number], self._matrix, self._position_m[number])
+            for number in chosen
+        ]
+        position_m = np.stack([positions for _, positions in seen])
+        height, width = self.frames.shape[2:]
+        known, inside = np.isfinite(position_m).all(axis=2), in_view(position_m, self._matrix, width, height)
         confidence = np.where(known, inside, np.nan)[..., None]
         position_m[~(known & inside)] = _ELSEWHERE_M
         code = {TRANSLATION: torch.from_numpy(position_m).float(), CONFIDENCE: torch.from_numpy(confidence).float()}
-        small = F.avg_pool2d(torch.stack(images), FRAME_STRIDE)
+        small = F.avg_pool2d(torch.stack([image for image, _ in seen]), FRAME_STRIDE)
         return code, self._stage.augment(small, seed).clamp(0, 1)
-
-    def _seen_by(
-        self, camera: VirtualCamera, number: int
-    ) -> tuple[Float[Tensor, "3 height width"], Float[np.ndarray, "objects 3"]]:
-        """A photograph, and where it shows the objects."""
-        pixels = camera.image(self.frames[number].permute(1, 2, 0).numpy(), self._matrix)
-        position_m = self._position_m[number] @ camera.virtual_from_cam.T / (1.0, 1.0, camera.zoom)
-        return torch.from_numpy(pixels).permute(2, 0, 1).float() / 255, position_m
-
-    def _in_view(self, position_m: Float[np.ndarray, "count objects 3"]) -> np.ndarray:
-        pixels = position_m @ self._matrix.T
-        with np.errstate(invalid="ignore", divide="ignore"):
-            pixels = pixels[..., :2] / pixels[..., 2:]
-        size = self.frames.shape[:1:-1]  # width, height
-        return ((pixels > 0) & (pixels < size)).all(axis=2) & (position_m[..., 2] > 0)
 
 
 def read_often(frames: UInt8[Tensor, "num 3 height width"], matrix: np.ndarray, predict: Predict) -> Reads:
@@ -167,12 +155,3 @@ def _brought_back(code: SceneCode, camera: VirtualCamera) -> dict[str, Tensor]:
         TRANSLATION: torch.from_numpy(np.stack(position_m)).float()[None],
         CONFIDENCE: code[CONFIDENCE],
     }
-
-
-def _random_camera(random: np.random.Generator) -> VirtualCamera:
-    return VirtualCamera(
-        roll_deg=random.uniform(-_LARGEST_ROLL_DEG, _LARGEST_ROLL_DEG),
-        zoom=float(np.exp(random.uniform(-_LARGEST_LOG_ZOOM, _LARGEST_LOG_ZOOM))),
-        pan_deg=random.uniform(-_LARGEST_PAN_DEG, _LARGEST_PAN_DEG),
-        tilt_deg=random.uniform(-_LARGEST_TILT_DEG, _LARGEST_TILT_DEG),
-    )

@@ -1,0 +1,50 @@
+"""Frames as cameras see them that are turned and zoomed a little, so that a network learns each from many sides."""
+
+import numpy as np
+import torch
+from curio_serve.imaging.virtual_cameras import VirtualCamera
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+_LARGEST_ROLL_DEG, _LARGEST_PAN_DEG, _LARGEST_TILT_DEG = 20.0, 6.0, 5.0
+_LARGEST_LOG_ZOOM = 0.18
+
+
+def random_camera(random: np.random.Generator) -> VirtualCamera:
+    """A camera at the place of the real one."""
+    return VirtualCamera(
+        roll_deg=random.uniform(-_LARGEST_ROLL_DEG, _LARGEST_ROLL_DEG),
+        zoom=float(np.exp(random.uniform(-_LARGEST_LOG_ZOOM, _LARGEST_LOG_ZOOM))),
+        pan_deg=random.uniform(-_LARGEST_PAN_DEG, _LARGEST_PAN_DEG),
+        tilt_deg=random.uniform(-_LARGEST_TILT_DEG, _LARGEST_TILT_DEG),
+    )
+
+
+def seen_by(
+    camera: VirtualCamera,
+    frame: UInt8[Tensor, "3 height width"],
+    matrix: Float[np.ndarray, "3 3"],
+    position_m: Float[np.ndarray, "objects 3"],
+) -> tuple[Float[Tensor, "3 height width"], Float[np.ndarray, "objects 3"]]:
+    """A frame, in [0, 1], and where it shows objects, in metres and in that camera's frame.
+
+    Args:
+        camera: That sees.
+        frame: Of the real camera.
+        matrix: K of both.
+        position_m: Of the objects in the real camera's frame; NaN stays NaN.
+    """
+    pixels = camera.image(frame.permute(1, 2, 0).numpy(), matrix)
+    turned_m = position_m @ camera.virtual_from_cam.T / (1.0, 1.0, camera.zoom)
+    return torch.from_numpy(pixels).permute(2, 0, 1).float() / 255, turned_m
+
+
+def in_view(
+    position_m: Float[np.ndarray, "*batch 3"], matrix: Float[np.ndarray, "3 3"], width: int, height: int
+) -> Bool[np.ndarray, "*batch"]:
+    """Whether positions project into the frame; false where they are NaN."""
+    pixels = position_m @ matrix.T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        pixels = pixels[..., :2] / pixels[..., 2:]
+    inside: np.ndarray = ((pixels > 0) & (pixels < (width, height))).all(axis=-1) & (position_m[..., 2] > 0)
+    return inside
