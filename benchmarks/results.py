@@ -10,7 +10,7 @@ of a run, too. Every method of a world sees as many images.
 
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -32,8 +32,10 @@ SEVERAL_SEEDS = {
     "chairs": {"noncur_cells", "our_cells"},
     "varied": {"noncur_cells", "our_cells"},
 }
-# Objects that stand on the ground are found among hypotheses.
-_HYPOTHESES = "hypotheses_cells"
+# Objects that stand on the ground are found among hypotheses; the paper's loss then begins as what learned them, and
+# each sees half of the images.
+_HYPOTHESES = ("hypotheses_cells", "our_found_cells")
+_FOUND = "_found"
 _STANDING = {"chairs", "multi", "light"}
 # Not in Circles: one thing alone needs no cells.
 _CELLS = ("sleep_cells", "super_1.0_cells", "noncur_cells", "our_cells")
@@ -86,19 +88,24 @@ def plan(settings: Settings) -> list[QueuedRun]:
 
 def _rows_of(world: str) -> tuple[str, ...]:
     rows = (*_METHODS, *_ABLATIONS) if world in _ABLATED else _METHODS
-    rows = (*rows, _HYPOTHESES) if world in _STANDING else rows
+    rows = (*rows, *_HYPOTHESES) if world in _STANDING else rows
     return tuple(row for row in rows if row not in _CELLS or world != "circles")
 
 
 def _run(settings: Settings, world: str, method: str, seed: int) -> QueuedRun:
     own = BUDGETS[world] if settings.preset == "laptop" else PRESETS["paper"].budget_images
     images = settings.images or own
-    folder = settings.runs / f"{world}-{settings.preset}-{images}" / f"{method.replace('.', '_')}-{seed}"
     name = method.removesuffix("_cells")
-    learned = ["super", "--labels", name.removeprefix("super_")] if name.startswith("super") else [name]
     reading = [] if name == method else ["--reading", "cells"]
+    before, own_images = None, images
+    if name.endswith(_FOUND):
+        name, own_images = name.removesuffix(_FOUND), images // 2
+        before = _run(replace(settings, images=images - own_images), world, "hypotheses_cells", seed)
+    folder = settings.runs / f"{world}-{settings.preset}-{images}" / f"{method.replace('.', '_')}-{seed}"
+    learned = ["super", "--labels", name.removeprefix("super_")] if name.startswith("super") else [name]
     flags = ["--method", *learned, *reading, "--preset", settings.preset, "--seed", str(seed)]
-    return QueuedRun(f"{world} {method} seed {seed}, {images:,} images", folder, world, images, flags)
+    said = f"{world} {method} seed {seed}, {images:,} images"
+    return QueuedRun(said, folder, world, own_images, flags, before=before)
 
 
 def write(settings: Settings, runs: list[QueuedRun]) -> None:

@@ -35,6 +35,7 @@ ORDER: Sequence[str] = (
     "noncur_cells",
     "our_cells",
     "hypotheses_cells",
+    "our_found_cells",
     "sleep_cells",
 )
 """Of the methods in tables: the paper's, then what goes beyond it."""
@@ -45,9 +46,13 @@ _PARAMETERS = ("color_mse", "rotation_deg", "confidence_mse", "light_deg")
 _M_PER_MM = 1e-3
 
 
-def method_name(method: str, labels: float, reading: str) -> str:
-    """The name of a row: of supervision with its share of labels, of images read by the dense decoder with those."""
+def method_name(method: str, labels: float, reading: str, before: str | None) -> str:
+    """The name of a row: of supervision with its share of labels, of images read by the dense decoder with those.
+
+    Where a run began as one of ``hypotheses``, its row says so.
+    """
     of_method = f"super_{labels:g}" if labels not in (0, 1) else REFERENCE if method == "super" else method
+    of_method = f"{of_method}_found" if before == "hypotheses" else of_method
     return of_method if reading == "whole" else f"{of_method}_{reading}"
 
 
@@ -59,7 +64,7 @@ def collect(evaluations: Iterable[Mapping[str, Any]]) -> Results:
     """
     runs: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for found in evaluations:
-        name = method_name(found["method"], found["labels"], found["reading"])
+        name = method_name(found["method"], found["labels"], found["reading"], found.get("method_before"))
         runs.setdefault((found["world"], name), []).append(found)
     results: Results = {}
     for (world, method), of_row in runs.items():

@@ -27,10 +27,20 @@ _COLOURS: Mapping[str, str] = {
     "noncur_cells": "#b98900",
     "our_cells": "#1e6b35",
     "hypotheses_cells": "#1f6f8b",
+    "our_found_cells": "#0b3d91",
     "sleep_cells": "#5f3b9e",
 }
 _CELLS = "_cells"
-_UNLABELLED = ("noncur", "our", "sleep", "noncur_cells", "our_cells", "hypotheses_cells", "sleep_cells")
+_UNLABELLED = (
+    "noncur",
+    "our",
+    "sleep",
+    "noncur_cells",
+    "our_cells",
+    "hypotheses_cells",
+    "our_found_cells",
+    "sleep_cells",
+)
 _NOTHING = "–"
 Figures = Mapping[str, Sequence[float]]
 
@@ -47,7 +57,7 @@ def markdown(results: Results, command: str) -> str:
         " drawn from the world's known range, synthetic labels in the sense of the paper's LineMOD table. Rows of"
         " `…_cells` have another network, which reads images cell by cell (`--reading cells`): full supervision, image"
         " loss alone, the paper's loss, hypotheses (image loss minimised over rendered hypotheses of each image before"
-        " training), and sleep.",
+        " training), the paper's loss begun as a run of those (half of the images each), and sleep.",
         "![Ratios by world](worlds.png)",
         "## Table 2: Img",
         _ratios(results, others, lambda row: row["img_ratio"], paper.IMG),

@@ -30,6 +30,7 @@ class QueuedRun:
         images: Its budget.
         flags: What else it is started with.
         scoring: What else ``curio-eval`` is called with.
+        before: The run whose network it begins as; trained, too, where it is not yet.
         process: What it is doing now, if anything.
     """
 
@@ -39,6 +40,7 @@ class QueuedRun:
     images: int
     flags: Sequence[str]
     scoring: Sequence[str] = ()
+    before: "QueuedRun | None" = None
     process: subprocess.Popen[bytes] | None = field(default=None)
 
     @property
@@ -60,11 +62,14 @@ class QueuedRun:
     def commands(self) -> Iterator[list[str]]:
         """What is left to do."""
         here = Path(sys.executable).parent
+        begin = ["--init", str(self.before.folder)] if self.before else []
+        if self.before and not self.before.done:
+            yield from self.before.commands()
         train = [str(here / "curio-train"), self.world, "--images", str(self.images)]
         if (self.folder / CONFIG_FILE).exists():
             yield [*train, "--resume", str(self.folder)]
         else:
-            yield [*train, *self.flags, "--out", str(self.folder)]
+            yield [*train, *self.flags, *begin, "--out", str(self.folder)]
         yield [str(here / "curio-eval"), str(self.folder), *self.scoring]
 
     def carry_out(self, threads: int) -> int:

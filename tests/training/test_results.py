@@ -165,6 +165,26 @@ def test_the_command_fills_the_table_and_goes_on_where_it_stopped(tmp_path: Path
     assert (busy.parent / "noncur-0" / "report.html").exists()
 
 
+def test_what_begins_as_another_run_is_a_row_of_its_own() -> None:
+    found = evaluation("our", reading="cells", method_before="hypotheses")
+    assert list(collect([found, evaluation("our", reading="cells", method_before="our")])["spheres"]) == [
+        "our_found_cells",
+        "our_cells",
+    ]
+
+
+def test_a_run_that_begins_as_another_shares_its_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = benchmark_module("results", monkeypatch)
+    settings = module.Settings(only=("chairs",), methods=("our_found_cells",), seeds=(0,), images=600, runs=tmp_path)
+    (run,) = module.plan(settings)
+    first, _, second, _ = run.commands()
+    assert first[1:4] == ["chairs", "--images", "300"]
+    assert second[1:4] == ["chairs", "--images", "300"]
+    assert "hypotheses" in first
+    assert second[second.index("--init") + 1] == first[first.index("--out") + 1]
+    assert run.folder != run.before.folder
+
+
 def test_an_unknown_row_is_refused(tmp_path: Path) -> None:
     done = command(tmp_path, "--methods", "ours")
     assert done.returncode == 2

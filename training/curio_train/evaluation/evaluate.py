@@ -19,7 +19,7 @@ from curio_train.evaluation.subject import Predict, Subject, load_subject
 from curio_train.evaluation.unlabelled.photographed import Judgement, judge
 from curio_train.export.card import EVALUATION_FILE
 from curio_train.learning.runs.configuration import CONFIG_FILE, world_name
-from curio_train.learning.runs.initial import uses_synthetic_labels
+from curio_train.learning.runs.initial import method_before, uses_synthetic_labels
 from curio_train.learning.runs.provenance import machine
 from curio_train.metrics.calibration import auroc, calibration_error, reliability_bins
 from curio_train.metrics.poses import ADD_THRESHOLD
@@ -203,6 +203,7 @@ def _origin(path: Path, subject: Subject) -> dict[str, Any]:
         "world": world_name(config),
         "objects": [kind.name for kind in subject.world.objects],
         "method": config.method,
+        "method_before": method_before(config),
         "reading": config.network.reading or "whole",
         "labels": config.labels if config.terms.label else 0.0,
         "labels_real": False,  # images with true codes are renderings in every world

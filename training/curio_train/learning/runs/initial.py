@@ -98,6 +98,13 @@ def uses_synthetic_labels(config: RunConfig) -> bool:
         return True
 
 
+def method_before(config: RunConfig) -> str | None:
+    """The method that trained the run which this one began as; None where it began as no run, or that is gone."""
+    if config.init is None or not _is_run(config.init):
+        return None
+    return load_config(config.init).method
+
+
 def _learned(network: nn.Module) -> dict[str, Tensor]:
     """The state of a network without its templates, which are drawn anew."""
     drawn = ObjectsNetwork.DRAWN if isinstance(network, ObjectsNetwork) else ()
