@@ -41,6 +41,11 @@ class Method:
         return self.image or self.curiosity or self.label or self.hypotheses
 
     @property
+    def knows_codes(self) -> bool:
+        """Whether true scene codes are used at all, of training images or of renderings."""
+        return self.sleep or self.label
+
+    @property
     def renders_predictions(self) -> bool:
         """Whether predictions for training images are rendered and compared with them."""
         return self.image or self.curiosity

@@ -38,6 +38,8 @@ def _training_images(config: RunConfig, world: World, cache: Path) -> Callable[[
     """What gives the training images of a world's stages, once there is a run folder."""
     if config.terms.hypotheses:
         return search_of(world, config.network.reading, config.seed, cache)
+    if len(stages_of(world)) > 1 and config.terms.renders_predictions:
+        return lambda _: Found([world.source("train", config.seed, with_code=False, cache=cache)], seconds=0.0)
     labels = config.terms.label
     sources = [stage.source("train", config.seed, with_code=labels, cache=cache) for stage in stages_of(world)]
     if config.labels < 1:
@@ -101,6 +103,6 @@ def learn(
                 interruption,
                 reporter,
                 checkpoint_minutes,
-                finish=lambda: trainer.self_training.finish(cache),
+                finish=lambda: trainer.self_training.finish(cache) if config.terms.knows_codes else None,
             )
         return outcome, trainer.state.progress

@@ -1,13 +1,13 @@
 """All that changes while a run learns: what a checkpoint holds."""
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
-from curio_train.config import RunConfig
+from curio_train.config import ConvStack, RunConfig
 from curio_train.errors import UsageError
 from curio_train.learning.muon import Muon
 from curio_train.networks.base import StageNetwork
@@ -152,7 +152,7 @@ class TrainState:
         self.pose = Learner(network.to(device), recipe.learning_rate, recipe.matrix_learning_rate)
         self.critic = None
         if config.terms.curiosity:
-            critic = Critic(config.network.critic, config.network.critic_normalisation).to(device)
+            critic = Critic(_critic_stack(config, world), config.network.critic_normalisation).to(device)
             self.critic = Learner(critic, config.recipe.critic_learning_rate)
 
     @property
@@ -173,6 +173,18 @@ class TrainState:
         for who, learner in self.learners.items():
             learner.load(under(f"{who}.", tensors))
         self.progress = progress
+
+
+def _critic_stack(config: RunConfig, world: World) -> ConvStack:
+    """The critic's layers; of crops, which have half the paper's side, the second has half the stride.
+
+    With the paper's strides only one pixel would reach its last two layers.
+    """
+    stack = config.network.critic
+    if len(stages_of(world)) == 1:
+        return stack
+    first, second, *others = stack.strides
+    return replace(stack, strides=(first, second // 2, *others))
 
 
 def under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -23,11 +23,28 @@ from curio_train.learning.sleep import SyntheticBatches, scheduled_stage
 from curio_train.learning.state import TrainState
 from curio_train.metrics.images import blurred
 from curio_train.networks.base import StageNetwork
-from curio_train.worlds.base import Batch, ImageSource, World, stages_of
+from curio_train.refinement.own_crops import OwnCrops
+from curio_train.scene_code import SceneCode
+from curio_train.worlds.base import Batch, ExposedWorld, ImageSource, World, stages_of
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 _SMOOTHING = 0.98  # of the image loss that convergence is judged by: a memory of about 50 steps
 _NUM_PAIRS = 8
 _NUM_WARM_UP = 32
+
+
+def _refuse_to_render(config: RunConfig) -> None:
+    """Refuse a detector in stages whose first stage is not trained, or what its crops cannot teach."""
+    if config.terms.sleep:
+        raise UsageError(
+            f"--method {config.method} needs whole-scene images, and this model trains on crops: "
+            "use --method sleep (or, with linemod, --one-stage)"
+        )
+    if config.init is None:
+        raise UsageError(
+            f"--method {config.method} teaches the second stage on crops around the first one's answers, which must be "
+            "trained: add --init RUN, of --method hypotheses or sleep (or, with linemod, --one-stage)"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,21 +76,20 @@ class Trainer:
         Args:
             config: What to learn and how.
             world: Draws and renders scenes.
-            sources: Images for each of the world's stages.
+            sources: Images for each of the world's stages; where predictions are rendered, whole frames.
             ranks: This process among those that train together.
 
         Raises:
             UsageError: The method cannot train this world, or its network.
         """
         if len(stages_of(world)) > 1 and config.terms.renders_predictions:
-            raise UsageError(
-                f"--method {config.method} needs whole-scene images, and this model trains on crops: "
-                "use --method sleep or hypotheses (or, with linemod, --one-stage)"
-            )
+            _refuse_to_render(config)
         self.config, self.world, self.ranks = config, world, ranks
         self.state = TrainState(config, world, ranks.device)
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
         self._micro_batches = ranks.micro_batches(self._num_micro)
+        if isinstance(world, TwoStageWorld) and config.terms.renders_predictions:
+            sources = [sources[0], OwnCrops(world, self.state.stages[0], sources[0], config.seed)]
         self._stages = [Stage(*parts) for parts in zip(stages_of(world), self.state.stages, sources, strict=True)]
         network, fraction = self.state.pose.network, config.recipe.self_training
         self.self_training = SelfTraining(
@@ -94,7 +110,9 @@ class Trainer:
             TrainingError: A loss or a gradient is not finite. The networks are then left as they were.
         """
         terms, critic = self.config.terms, self.state.critic
-        stage = self._stages[scheduled_stage(self.world, self.state.progress.step)]
+        # An image loss teaches the last stage alone, on crops around the answers of the one before.
+        number = -1 if terms.renders_predictions else scheduled_stage(self.world, self.state.progress.step)
+        stage = self._stages[number]
         world, network = stage.world, stage.network
         sums: Counter[str] = Counter()
         for learner in self.state.learners.values():
@@ -108,8 +126,11 @@ class Trainer:
             if terms.reads_images:
                 batch = self._training_batch(stage, number)
                 raw, code = self._predict(network, batch.images)
-            if terms.image or terms.curiosity:
-                rendered = blurred(world.render(code, batch.backgrounds), world.comparison_blur_px)
+            if terms.renders_predictions:
+                shown: SceneCode = {**batch.given, **code}
+                if isinstance(world, ExposedWorld):
+                    shown = world.exposed(shown, batch.images)
+                rendered = blurred(world.render(shown, batch.backgrounds), world.comparison_blur_px)
                 images = blurred(batch.images, world.comparison_blur_px)
             if terms.image:
                 losses["image"] = image_loss(rendered, images)

@@ -1,7 +1,7 @@
 """What every world is: a scene code, a distribution of scenes, and a differentiable renderer.
 
 What only some worlds can do stands in small protocols: :class:`StagedWorld`, :class:`AugmentedWorld`,
-:class:`HypothesisWorld` and :class:`NovelViewWorld`.
+:class:`HypothesisWorld`, :class:`ExposedWorld` and :class:`NovelViewWorld`.
 """
 
 from abc import ABC, abstractmethod
@@ -264,6 +264,14 @@ class HypothesisWorld(Protocol):
         Raises:
             UsageError: Scenes of this world cannot be found so.
         """
+
+
+@runtime_checkable
+class ExposedWorld(Protocol):
+    """A world whose images are brighter or darker, channel by channel, than its scene codes say."""
+
+    def exposed(self, code: SceneCode, images: Tensor) -> SceneCode:
+        """The code with the exposure that makes its rendering as bright as the images are, without a gradient."""
 
 
 @runtime_checkable

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from curio_train.color import linear_from_srgb, srgb_from_linear
 from curio_train.config import NetworkConfig
 from curio_train.data.backgrounds import Backgrounds
 from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES, OBJECT_COORDINATES_STRIDE, CropPoseNetwork
@@ -24,13 +25,16 @@ from curio_train.worlds.base import Camera
 from curio_train.worlds.single_object.crop_pose_loss import ASSUMED_DEPTH, CropPoseLoss, position_in_metres
 from curio_train.worlds.single_object.localisation_stage import camera_grid
 from curio_train.worlds.single_object.viewpoints import allocentric_to_egocentric
-from curio_train.worlds.single_object.world import Object, SingleObjectWorld, pose_code, pose_layout
+from curio_train.worlds.single_object.world import EXPOSURE, Object, SingleObjectWorld, pose_code, pose_layout
 
 CROP_PX, FILL = 64, 0.6
 MAX_OFFSET, MAX_LOG_SCALE = 0.25, 0.25
 """Errors of the localisation stage, in diameters and in logarithms of the depth."""
 ABSENT_FRACTION = 1 / 7
 
+_LEAST_SEEN_THROUGH = 0.01  # of a pixel that is not inside the object
+_LEAST_LIGHT = 1e-3
+_DARKEST = 0.01  # linear
 _POSITION_MARGIN = 1.5  # of the position field's range over these errors
 
 
@@ -117,6 +121,20 @@ class CropPoseStage(SingleObjectWorld):
         """The object in each crop camera; the code must have ``assumed_depth_m``."""
         position_m = self._in_metres(code[TRANSLATION][:, 0].float(), code[ASSUMED_DEPTH].float())
         return self._render(code, position_m[:, None], self._matrices(code, CROP_PX), backgrounds)
+
+    @torch.no_grad()
+    def exposed(self, code: SceneCode, images: Tensor) -> SceneCode:
+        """The code with the exposure that makes the object as bright, channel by channel, as the crops are inside it.
+
+        Exposures are no part of the code, and without one the image loss would mend brightness by wrong poses.
+        """
+        plain = {name: value.detach() for name, value in code.items() if name != CONFIDENCE}
+        black = torch.zeros_like(images)
+        over_black, over_white = (self.render(plain, background) for background in (black, black + 1))
+        inside = (over_white - over_black).mean(1, keepdim=True) < _LEAST_SEEN_THROUGH
+        seen, rendered = ((linear_from_srgb(image.clamp(0, 1)) * inside).sum((2, 3)) for image in (images, over_black))
+        factor = (seen / rendered.clamp(min=_LEAST_LIGHT)).clamp(min=_DARKEST)
+        return dict(code) | {EXPOSURE: srgb_from_linear(factor)[:, None]}
 
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
         """See :class:`~curio_train.worlds.single_object.crop_pose_loss.CropPoseLoss`."""

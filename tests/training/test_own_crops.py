@@ -1,0 +1,92 @@
+"""Crops around a detector's own first answers, and image loss and critic on them."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from curio_train.config import Recipe, RunConfig
+from curio_train.errors import UsageError
+from curio_train.learning.parallel import Ranks
+from curio_train.learning.trainer import Trainer
+from curio_train.networks.base import StageNetwork
+from curio_train.refinement.own_crops import OwnCrops
+from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
+from curio_train.worlds.options import LinemodOptions
+from curio_train.worlds.single_object.crop_pose_loss import ASSUMED_DEPTH
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.world import EXPOSURE
+from torch import Tensor
+
+CONFIG = RunConfig(
+    LinemodOptions("brick"),
+    method="our",
+    init=Path("runs/found"),
+    recipe=Recipe(batch_size=8, micro_batch_size=8, learning_rate=1e-3, critic_learning_rate=1e-4, critic_weight=0.1),
+)
+
+
+class Knowing(StageNetwork):
+    """Answers with positions that it was given, one frame after the other."""
+
+    def __init__(self, position_m: Tensor) -> None:
+        super().__init__()
+        self.encoder = torch.nn.Sequential()
+        self.position_m, self.asked = position_m, 0
+
+    def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        self.asked += len(features)
+        return {}, {TRANSLATION: self.position_m[self.asked - len(features) : self.asked]}
+
+
+def test_crops_lie_around_first_answers(brick_world: TwoStageWorld, tmp_path: Path) -> None:
+    frames = brick_world.source("train", 0, with_code=True, cache=tmp_path)
+    true = [frames.batch(number, 1).code for number in range(4)]
+    position_m = torch.cat([code[TRANSLATION] for code in true if code is not None])
+    source = OwnCrops(brick_world, Knowing(position_m), frames, 0, num_frames=4)
+    batch = source.batch(0, 16)
+    assert batch.code is None
+    assert batch.backgrounds is not None
+    assert batch.images.shape == batch.backgrounds.shape == (16, 3, 64, 64)
+    object_pixels = ((batch.images - batch.backgrounds).abs().amax(1) > 0.02).float().mean((1, 2))
+    assert object_pixels.median() > 0.05  # the object's diameter spans 0.6 of the side
+    assert (batch.given[ASSUMED_DEPTH] > 0.3).all()
+    assert torch.equal(source.batch(0, 16).images, batch.images)
+
+
+@pytest.mark.parametrize("method", ["our", "noncur"])
+def test_image_loss_teaches_the_second_stage_alone(
+    brick_world: TwoStageWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    monkeypatch.setattr("curio_train.learning.trainer.OwnCrops", partial(OwnCrops, num_frames=2))
+    frames = brick_world.source("train", 0, with_code=False, cache=tmp_path)
+    trainer = Trainer(replace(CONFIG, method=method), brick_world, [frames], Ranks(0, 1, torch.device("cpu")))
+    before = [[value.clone() for value in stage.parameters()] for stage in trainer.state.stages]
+    losses = trainer.step(1.0)
+    assert ("critic, crop pose" in losses) == (method == "our")
+    changed = [
+        any(not torch.equal(*pair) for pair in zip(old, stage.parameters(), strict=True))
+        for old, stage in zip(before, trainer.state.stages, strict=True)
+    ]
+    assert changed == [False, True]
+
+
+def test_a_detector_whose_first_stage_is_not_trained_is_refused(brick_world: TwoStageWorld, tmp_path: Path) -> None:
+    frames = brick_world.source("train", 0, with_code=False, cache=tmp_path)
+    with pytest.raises(UsageError, match="add --init RUN, of --method hypotheses or sleep"):
+        Trainer(replace(CONFIG, init=None), brick_world, [frames], Ranks(0, 1, torch.device("cpu")))
+    with pytest.raises(UsageError, match="use --method sleep"):
+        Trainer(replace(CONFIG, method="wake_sleep"), brick_world, [frames], Ranks(0, 1, torch.device("cpu")))
+
+
+def test_the_exposure_of_crops_is_found(brick_world: TwoStageWorld) -> None:
+    stage = brick_world.stages[1]
+    code = stage.sample(6, (0,))
+    code[CONFIDENCE] = torch.ones(6, 1, 1)
+    code[EXPOSURE] = torch.rand(6, 1, 3, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.3
+    code[LIGHT] = torch.tensor([0.0, 0.0, -0.5]).expand(6, 3)
+    images = stage.render(code)
+    said = {name: code[name] for name in (TRANSLATION, ROTATION_6D, LIGHT, CONFIDENCE, ASSUMED_DEPTH)}
+    found = stage.exposed(said, images)
+    torch.testing.assert_close(found[EXPOSURE], code[EXPOSURE], atol=0.02, rtol=0)
