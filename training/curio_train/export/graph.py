@@ -29,7 +29,7 @@ from curio_train.export.spec import model_spec
 from curio_train.exported_model import WEIGHTS_FILE, ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable
-from curio_train.learning.runs.initial import weights_file
+from curio_train.learning.runs.initial import method_before, weights_file
 from curio_train.learning.runs.provenance import run_sessions
 from curio_train.learning.state import TrainingProgress
 from curio_train.networks.layers import fold_batch_norm
@@ -40,6 +40,7 @@ from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import TRANSLATION, joined
 from curio_train.worlds import build
 from curio_train.worlds.base import World
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 NUM_JITTERED = 12
 """Rounds of jitter in the check of numerical stability; it misses a tie once in 2 to the power of this."""
@@ -194,7 +195,7 @@ def export(
     spec.parity_max_abs_error = parity_error if reduce is None else rounding_error
     put_spec(model, spec)
     version = target.next_version()
-    pretrained = any(isinstance(module, Trunk) for module in state.pose.network.modules())
+    pretrained = _uses_pretrained(state.pose.network, world, folder.config)
     made = Provenance(run, folder.config, sessions, state.progress, weights + _FAST * fast, pretrained)
     text = card(version, spec, shapes, world.objects, made)
     files = {
@@ -204,6 +205,12 @@ def export(
     }
     path = target.add(version, files, config, text)
     return Exported(path, parity_error, rounding_error, model.ByteSize(), weights)
+
+
+def _uses_pretrained(network: nn.Module, world: World, config: RunConfig) -> bool:
+    """Whether a trunk that others trained reads images in a network, or found the poses that it learned from."""
+    searched = "hypotheses" in (config.method, method_before(config)) and isinstance(world, TwoStageWorld)
+    return searched or any(isinstance(module, Trunk) for module in network.modules())
 
 
 def _describe(spec: ModelSpec, config: RunConfig, commit: str, progress: TrainingProgress) -> None:
