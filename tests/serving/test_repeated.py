@@ -20,7 +20,7 @@ from curio_serve.imaging.rotation import from_rotation_vector
 from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS, VirtualCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
-from curio_serve.models.repeated import RepeatedReader
+from curio_serve.models.repeated import AGREEMENT_POWER, RepeatedReader
 
 K = np.array([[110.0, 0, 50.0], [0, 112.0, 30.0], [0, 0, 1]])
 POSITION_M = np.array([0.06, -0.03, 0.8])
@@ -99,14 +99,14 @@ def test_reads_that_agree_are_averaged() -> None:
     np.testing.assert_allclose(found["rotation"][0, 0], ROTATION, atol=5e-3)
     np.testing.assert_allclose(found["rotation_6d"][0, 0], found["rotation"][0, 0].T[:2].ravel(), atol=1e-6)
     np.testing.assert_allclose(found["light"][0], [0, -1, 0], atol=1e-6)
-    assert found["confidence"][0, 0] == pytest.approx(0.6)
+    assert found["confidence"][0, 0] == pytest.approx(0.6**AGREEMENT_POWER)
 
 
 def test_the_surest_read_is_outvoted_by_two_that_agree() -> None:
     turn = from_rotation_vector(np.array([0, 2.0, 0]))
     found = reader(3, (0, turn, 0.9))(IMAGE)
     np.testing.assert_allclose(found["rotation"][0, 0], ROTATION, atol=1e-6)
-    assert found["confidence"][0, 0] == pytest.approx((0.6 + 0.6) / 3)
+    assert found["confidence"][0, 0] == pytest.approx(((0.6 + 0.6) / 3) ** AGREEMENT_POWER)
 
 
 def test_symmetric_poses_agree() -> None:
@@ -115,8 +115,8 @@ def test_symmetric_poses_agree() -> None:
     matrix[:3, :3] = half
     wrong = (1, half, 0.6)
     alike = reader(3, wrong, kind=spec(Symmetry(transform=matrix.ravel())))(IMAGE)
-    assert alike["confidence"][0, 0] == pytest.approx(0.6)
-    assert reader(3, wrong)(IMAGE)["confidence"][0, 0] == pytest.approx(0.4)
+    assert alike["confidence"][0, 0] == pytest.approx(0.6**AGREEMENT_POWER)
+    assert reader(3, wrong)(IMAGE)["confidence"][0, 0] == pytest.approx(0.4**AGREEMENT_POWER)
 
 
 @pytest.mark.parametrize(("num_reads", "kind"), [(0, spec()), (10, spec()), (3, spec(slots=(0, 1))), (3, ModelSpec())])

@@ -18,6 +18,11 @@ from curio_train.worlds.options import LinemodOptions
 SELF_TRAINED = ", self-trained"
 """What follows the method's name where real frames without labels were learned from."""
 
+TWO_STAGES = ", two stages"
+"""What follows the name of one of the paper's methods where it trained the two-stage detector."""
+
+ONE_STAGE_METHODS = ("our", "noncur", "super")
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -28,7 +33,8 @@ class Candidate:
     name: str
     """The class."""
     method: str
-    """That trained it; ``, self-trained`` follows where unlabelled real frames took part."""
+    """That trained it; ``, two stages`` follows where it is one of the paper's and the network is not, ``, self-trained``
+    where unlabelled real frames took part."""
     weights_sha256: str
     """Of the last checkpoint's tensors, or of the model file."""
 
@@ -78,8 +84,10 @@ def _found(folder: Path) -> Iterator[Candidate]:
 
 
 def _method(provenance: Mapping[str, Any]) -> str:
-    """Models that are older than self-training say nothing of it."""
-    return str(provenance["method"]) + (SELF_TRAINED if provenance["recipe"].get("self_training") else "")
+    """Models that are older than self-training, or than the two stages, say nothing of it."""
+    name = str(provenance["method"])
+    two_stages = name in ONE_STAGE_METHODS and provenance["world"].get("gaze", False)
+    return name + TWO_STAGES * two_stages + SELF_TRAINED * bool(provenance["recipe"].get("self_training"))
 
 
 def files_sha256(*files: Path) -> str:
