@@ -33,8 +33,8 @@ class Candidate:
     name: str
     """The class."""
     method: str
-    """That trained it; ``, two stages`` follows where it is one of the paper's and the network is not, ``, self-trained``
-    where unlabelled real frames took part."""
+    """That trained it; ``, two stages`` follows where it is one of the paper's and the network is not,
+    ``, self-trained`` where unlabelled real frames took part."""
     weights_sha256: str
     """Of the last checkpoint's tensors, or of the model file."""
 
