@@ -23,7 +23,7 @@ AGREEMENT_POWER = 0.65
 """Of the share that reads which agree have in the confidence of all.
 
 That share is lower than the probability that the mean of those is right, because a read that disagrees may be wrong
-alone. Measured on renderings: 0.65 for two to five reads, 0.6 for seven and nine
+alone. Measured on renderings: 0.75 for two reads, 0.7 for three and five, 0.6 for seven and nine
 (``benchmarks/shipped_models/reads.py``)."""
 
 

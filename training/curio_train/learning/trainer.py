@@ -178,7 +178,8 @@ class Trainer:
         return loss
 
     def _loss_name(self, name: str, stage: Stage) -> str:
-        return f"{name}, {stage.world.name}" if len(self._stages) > 1 else name
+        only_one = len(self._stages) == 1 or self.config.terms.renders_predictions
+        return name if only_one else f"{name}, {stage.world.name}"
 
     @torch.no_grad()
     def warm_up(self) -> None:
