@@ -57,7 +57,7 @@ def markdown(results: Results, command: str) -> str:
         " drawn from the world's known range, synthetic labels in the sense of the paper's LineMOD table. Rows of"
         " `…_cells` have another network, which reads images cell by cell (`--reading cells`): full supervision, image"
         " loss alone, the paper's loss, hypotheses (image loss minimised over rendered hypotheses of each image before"
-        " training), the paper's loss begun as a run of those (half of the images each), and sleep.",
+        " training), the paper's loss begun as a run of those (so it has seen twice as many images), and sleep.",
         "![Ratios by world](worlds.png)",
         "## Table 2: Img",
         _ratios(results, others, lambda row: row["img_ratio"], paper.IMG),

@@ -173,16 +173,18 @@ def test_what_begins_as_another_run_is_a_row_of_its_own() -> None:
     ]
 
 
-def test_a_run_that_begins_as_another_shares_its_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_begins_as_another_run_sees_as_many_images_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = benchmark_module("results", monkeypatch)
-    settings = module.Settings(only=("chairs",), methods=("our_found_cells",), seeds=(0,), images=600, runs=tmp_path)
-    (run,) = module.plan(settings)
+    methods = ("hypotheses_cells", "our_found_cells")
+    settings = module.Settings(only=("chairs",), methods=methods, seeds=(0,), images=600, runs=tmp_path)
+    before, run = module.plan(settings)
     first, _, second, _ = run.commands()
-    assert first[1:4] == ["chairs", "--images", "300"]
-    assert second[1:4] == ["chairs", "--images", "300"]
+    assert first[1:4] == second[1:4] == ["chairs", "--images", "600"]
     assert "hypotheses" in first
-    assert second[second.index("--init") + 1] == first[first.index("--out") + 1]
-    assert run.folder != run.before.folder
+    assert second[second.index("--init") + 1] == first[first.index("--out") + 1] == str(before.folder)
+    old = merge({}, collect([evaluation("super"), evaluation("our", reading="cells")]))
+    found = evaluation("our", reading="cells", method_before="hypotheses", images_seen=1280)
+    assert list(merge(old, collect([found]))["spheres"]) == ["super_1.0", "our_cells", "our_found_cells"]
 
 
 def test_an_unknown_row_is_refused(tmp_path: Path) -> None:
