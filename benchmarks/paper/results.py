@@ -6,7 +6,8 @@
                       seeds, images_seen, seconds, machine, commit, label_free, synthetic_labels}}}
 
 ``img`` is DSSIM from the novel view, ``para`` is Eq. 1; ``super_1.0`` is the reference of all ratios, and all rows of
-a world have seen as many images, but what begins as another run has seen as many again. Figures are means over the seeds; ``by_seed`` has each seed's.
+a world have seen as many images, but what begins as another run has seen as many again. Figures are means over the
+seeds; ``by_seed`` has each seed's.
 """
 
 import json

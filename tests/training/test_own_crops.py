@@ -88,5 +88,6 @@ def test_the_exposure_of_crops_is_found(brick_world: TwoStageWorld) -> None:
     code[LIGHT] = torch.tensor([0.0, 0.0, -0.5]).expand(6, 3)
     images = stage.render(code)
     said = {name: code[name] for name in (TRANSLATION, ROTATION_6D, LIGHT, CONFIDENCE, ASSUMED_DEPTH)}
-    found = stage.exposed(said, images)
+    found = stage.comparable(said | {CONFIDENCE: torch.full((6, 1, 1), 0.3)}, images)
+    assert CONFIDENCE not in found  # it is no transparency
     torch.testing.assert_close(found[EXPOSURE], code[EXPOSURE], atol=0.02, rtol=0)

@@ -1,7 +1,7 @@
 """What every world is: a scene code, a distribution of scenes, and a differentiable renderer.
 
 What only some worlds can do stands in small protocols: :class:`StagedWorld`, :class:`AugmentedWorld`,
-:class:`HypothesisWorld`, :class:`ExposedWorld` and :class:`NovelViewWorld`.
+:class:`HypothesisWorld`, :class:`UnlikeWorld` and :class:`NovelViewWorld`.
 """
 
 from abc import ABC, abstractmethod
@@ -267,11 +267,11 @@ class HypothesisWorld(Protocol):
 
 
 @runtime_checkable
-class ExposedWorld(Protocol):
-    """A world whose images are brighter or darker, channel by channel, than its scene codes say."""
+class UnlikeWorld(Protocol):
+    """A world whose renderings of scene codes differ from its images in more than the codes say."""
 
-    def exposed(self, code: SceneCode, images: Tensor) -> SceneCode:
-        """The code with the exposure that makes its rendering as bright as the images are, without a gradient."""
+    def comparable(self, code: SceneCode, images: Tensor) -> SceneCode:
+        """The code as it has to be rendered for the comparison with images; what is added has no gradient."""
 
 
 @runtime_checkable

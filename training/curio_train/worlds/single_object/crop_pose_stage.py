@@ -123,18 +123,22 @@ class CropPoseStage(SingleObjectWorld):
         return self._render(code, position_m[:, None], self._matrices(code, CROP_PX), backgrounds)
 
     @torch.no_grad()
-    def exposed(self, code: SceneCode, images: Tensor) -> SceneCode:
-        """The code with the exposure that makes the object as bright, channel by channel, as the crops are inside it.
-
-        Exposures are no part of the code, and without one the image loss would mend brightness by wrong poses.
-        """
-        plain = {name: value.detach() for name, value in code.items() if name != CONFIDENCE}
+    def _exposure(self, code: SceneCode, images: Tensor) -> Float[Tensor, "batch 1 3"]:
+        """That makes the object, channel by channel, as bright as crops are inside it."""
         black = torch.zeros_like(images)
-        over_black, over_white = (self.render(plain, background) for background in (black, black + 1))
+        over_black, over_white = (self.render(code, background) for background in (black, black + 1))
         inside = (over_white - over_black).mean(1, keepdim=True) < _LEAST_SEEN_THROUGH
         seen, rendered = ((linear_from_srgb(image.clamp(0, 1)) * inside).sum((2, 3)) for image in (images, over_black))
-        factor = (seen / rendered.clamp(min=_LEAST_LIGHT)).clamp(min=_DARKEST)
-        return dict(code) | {EXPOSURE: srgb_from_linear(factor)[:, None]}
+        return srgb_from_linear((seen / rendered.clamp(min=_LEAST_LIGHT)).clamp(min=_DARKEST))[:, None]
+
+    def comparable(self, code: SceneCode, images: Tensor) -> SceneCode:
+        """The code, opaque and with the exposure of the crops.
+
+        Exposures are no part of codes, and without one the image loss would mend brightness by wrong poses. The
+        confidence says whether a pose is right, which is no transparency.
+        """
+        opaque = {name: value for name, value in code.items() if name != CONFIDENCE}
+        return opaque | {EXPOSURE: self._exposure(opaque, images)}
 
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
         """See :class:`~curio_train.worlds.single_object.crop_pose_loss.CropPoseLoss`."""
