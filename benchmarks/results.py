@@ -34,7 +34,7 @@ SEVERAL_SEEDS = {
 }
 _HYPOTHESES, _FOUND = ("hypotheses_cells", "our_found_cells"), "_found"  # of objects that stand on the ground
 _STANDING = {"chairs", "multi", "light"}
-# Not in Circles: one thing alone needs no cells.
+_RATES = ("--learning-rate", "1e-4", "--critic-learning-rate", "1e-6")  # the paper's; higher ones leave found scenes
 _CELLS = ("sleep_cells", "super_1.0_cells", "noncur_cells", "our_cells")
 # Quick ones first, so that a reference is there early.
 _METHODS = ("super_1.0", "sleep", *_CELLS, "noncur", "super_0.1", "super_0.05", "our")
@@ -86,7 +86,7 @@ def plan(settings: Settings) -> list[QueuedRun]:
 def _rows_of(world: str) -> tuple[str, ...]:
     rows = (*_METHODS, *_ABLATIONS) if world in _ABLATED else _METHODS
     rows = (*rows, *_HYPOTHESES) if world in _STANDING else rows
-    return tuple(row for row in rows if row not in _CELLS or world != "circles")
+    return tuple(row for row in rows if row not in _CELLS or world != "circles")  # one thing alone needs no cells
 
 
 def _run(settings: Settings, world: str, method: str, seed: int) -> QueuedRun:
@@ -96,8 +96,8 @@ def _run(settings: Settings, world: str, method: str, seed: int) -> QueuedRun:
     before = None if _FOUND not in method else _run(settings, world, "hypotheses_cells", seed)
     folder = settings.runs / f"{world}-{settings.preset}-{images}" / f"{method.replace('.', '_')}-{seed}"
     learned = ["super", "--labels", name.removeprefix("super_")] if name.startswith("super") else [name]
-    reading = ["--reading", "cells"] if method.endswith("_cells") else []
-    flags = ["--method", *learned, *reading, "--preset", settings.preset, "--seed", str(seed)]
+    others = ["--reading", "cells"] * method.endswith("_cells") + list(_RATES) * bool(before)
+    flags = ["--method", *learned, *others, "--preset", settings.preset, "--seed", str(seed)]
     return QueuedRun(f"{world} {method} seed {seed}, {images:,} images", folder, world, images, flags, before=before)
 
 
