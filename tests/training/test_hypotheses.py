@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from curio_train.config import NetworkConfig, Recipe, RunConfig
+from curio_train.config import METHODS, NetworkConfig, Recipe, RunConfig
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.learning.explaining import explained, explainer_of, search_of
 from curio_train.learning.parallel import Ranks
@@ -15,6 +15,8 @@ from curio_train.worlds import WORLDS, build
 from curio_train.worlds.generated.generated_world import GeneratedWorld
 from curio_train.worlds.generated.hypotheses.descent import image_losses
 from curio_train.worlds.image_sets import StoredImages
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.world import Object
 from torch import Tensor
 
 CELLS = NetworkConfig(reading="cells")
@@ -89,6 +91,20 @@ def test_worlds_without_a_ground_are_refused(name: str) -> None:
 def test_worlds_without_hypotheses_are_refused() -> None:
     with pytest.raises(UsageError, match="circles has no hypotheses here; expected chairs, multi, light, or linemod"):
         explainer_of(build(WORLDS["circles"]()))
+
+
+def test_captures_are_refused(brick: Object, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"capture has no hypotheses here; expected .*linemod with one class"):
+        search_of(TwoStageWorld("capture", brick), None, 0, tmp_path)
+
+
+def test_only_methods_that_know_codes_calibrate_confidences_with_them() -> None:
+    assert {name for name, terms in METHODS.items() if terms.knows_codes} == {
+        "super",
+        "sleep",
+        "wake_sleep",
+        "wake_sleep_critic",
+    }
 
 
 def test_other_decoders_are_refused(tmp_path: Path) -> None:

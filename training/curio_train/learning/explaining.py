@@ -63,7 +63,7 @@ def search_of(world: World, reading: DecoderKind | None, seed: int, cache: Path)
         DataError: The backgrounds cannot be read. The search itself raises it, too, for damaged files of found scenes,
             and CheckpointError if the run folder cannot be written or weights of pretrained features are missing.
     """
-    if isinstance(world, TwoStageWorld):
+    if isinstance(world, TwoStageWorld) and world.name == "linemod":  # captures have photographs to learn from
         frames, finder = TrainingFrames(world, seed, cache), FrameExplainer(world, template_reader(world, cache))
 
         def search_frames(run: Path) -> Found:
