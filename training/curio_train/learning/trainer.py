@@ -231,6 +231,7 @@ class Trainer:
             images=batch.images.to(device),
             backgrounds=None if batch.backgrounds is None else batch.backgrounds.to(device),
             code=None if batch.code is None else {name: value.to(device) for name, value in batch.code.items()},
+            given={name: value.to(device) for name, value in batch.given.items()},
         )
 
     def _sum_over_ranks(self, sums: Counter[str]) -> dict[str, float]:

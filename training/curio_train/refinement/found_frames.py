@@ -22,7 +22,7 @@ from curio_train.errors import TrainingError
 from curio_train.networks.templates.network import TemplateNetwork
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.refinement.render_and_compare import RenderAndCompare
-from curio_train.refinement.turned_frames import in_view, random_camera, seen_by
+from curio_train.refinement.turned_frames import LARGEST_ROLL_DEG, in_view, random_camera, seen_by
 from curio_train.scene_code import CONFIDENCE, LIGHT, TRANSLATION, SceneCode, index, joined
 from curio_train.templates.build import fill, template_network
 from curio_train.worlds.base import Batch, ImageSource
@@ -37,7 +37,6 @@ residual, and 96 % of these poses were right by ADD < 0.1 d (docs/experiments/li
 
 _BATCH = 20
 _HALVED = 2  # frames are turned at half their size: localisation sees a quarter
-_LARGEST_ROLL_DEG = 20.0
 
 
 class TrainingFrames:
@@ -182,7 +181,7 @@ class FoundCrops(ImageSource):
 
     def batch(self, step: int, size: int) -> Batch:
         """Random crops."""
-        code, images = self._labels.draw(size, (self._seed, step), _LARGEST_ROLL_DEG)
+        code, images = self._labels.draw(size, (self._seed, step), LARGEST_ROLL_DEG)
         absent = round(ABSENT_FRACTION * size)
         images[:absent] = self._labels.elsewhere(absent, (self._seed, step, 1))
         code[CONFIDENCE][:absent] = 0

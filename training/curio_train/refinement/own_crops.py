@@ -15,8 +15,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from curio_train.networks.base import StageNetwork
-from curio_train.networks.crop_camera import about_axis, cut_crops
+from curio_train.networks.crop_camera import cut_crops
 from curio_train.refinement.found_frames import NUM_FRAMES
+from curio_train.refinement.turned_frames import random_rolls
 from curio_train.scene_code import TRANSLATION
 from curio_train.worlds.base import Batch, ImageSource
 from curio_train.worlds.single_object.crop_pose_loss import ASSUMED_DEPTH
@@ -26,8 +27,6 @@ from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 _A_FRAME = 8
 """Crops of each frame, around answers as wrong again as the crop-pose stage has to bear."""
-
-_LARGEST_ROLL_DEG = 20.0
 
 
 class _Crops(NamedTuple):
@@ -73,7 +72,7 @@ class OwnCrops(ImageSource):
 
     @cached_property
     def _crops(self) -> _Crops:
-        localise = copy.deepcopy(self._localise).eval()  # batch norm of the one that is trained stays as it is
+        localise = copy.deepcopy(self._localise).cpu().eval()  # frames are cut there, and its batch norm stays as it is
         with torch.no_grad():
             parts = [self._of_frame(number, localise) for number in range(self._num_frames)]
         return _Crops(*(torch.cat(values) for values in zip(*parts, strict=True)))
@@ -85,8 +84,7 @@ class OwnCrops(ImageSource):
         looked_at_m = self._stage.perturbed(answer_m.expand(_A_FRAME, 3), random)
         depth_m = looked_at_m.norm(dim=1).clamp(min=self._near_m)
         focal_px = FILL * CROP_PX * depth_m / self._stage.object.kind.diameter_m
-        roll = torch.from_numpy(np.radians(random.uniform(-_LARGEST_ROLL_DEG, _LARGEST_ROLL_DEG, _A_FRAME))).float()
-        turn = about_axis(torch.stack([roll.cos(), roll.sin()], dim=1))
+        turn = random_rolls(_A_FRAME, random)
         seen, behind = (
             (cut_crops(images, self._matrix, looked_at_m[None], focal_px, CROP_PX, roll=turn)[0].clamp(0, 1) * 255)
             for images in (frame.images, frame.backgrounds)

@@ -20,9 +20,10 @@ from torch import Tensor
 from curio_train.data.photographs import CameraPoses, read_frames
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.metrics.poses import symmetry_poses
-from curio_train.networks.crop_camera import about_axis, cut_crops
+from curio_train.networks.crop_camera import cut_crops
 from curio_train.refinement.multi_view import Estimates, consensus_poses
 from curio_train.refinement.render_and_compare import RenderAndCompare
+from curio_train.refinement.turned_frames import random_rolls
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, index, joined
 from curio_train.worlds.base import World
 from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
@@ -142,8 +143,7 @@ class PseudoLabels:
         localised_m = self._stage.perturbed(position_m, random)
         assumed_depth_m = localised_m.norm(dim=1)
         gain = torch.from_numpy(random.uniform(*_GAINS, (count, 1, 1, 1))).float()
-        roll = torch.from_numpy(np.radians(random.uniform(-largest_roll_deg, largest_roll_deg, count))).float()
-        crops, crop_from_cam = self._crops(chosen, localised_m, about_axis(torch.stack([roll.cos(), roll.sin()], 1)))
+        crops, crop_from_cam = self._crops(chosen, localised_m, random_rolls(count, random, largest_roll_deg))
         rotation = crop_from_cam @ matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
         in_crop, code[LIGHT] = ((crop_from_cam @ vector[..., None])[..., 0] for vector in (position_m, code[LIGHT]))
         labels = self._stage.label_crops(code, in_crop, rotation, assumed_depth_m[:, None])

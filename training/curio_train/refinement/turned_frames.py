@@ -6,18 +6,31 @@ from curio_serve.imaging.virtual_cameras import VirtualCamera
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-_LARGEST_ROLL_DEG, _LARGEST_PAN_DEG, _LARGEST_TILT_DEG = 20.0, 6.0, 5.0
+from curio_train.networks.crop_camera import about_axis
+
+LARGEST_ROLL_DEG = 20.0
+"""By which cameras are rolled, to either side."""
+
+_LARGEST_PAN_DEG, _LARGEST_TILT_DEG = 6.0, 5.0
 _LARGEST_LOG_ZOOM = 0.18
 
 
 def random_camera(random: np.random.Generator) -> VirtualCamera:
     """A camera at the place of the real one."""
     return VirtualCamera(
-        roll_deg=random.uniform(-_LARGEST_ROLL_DEG, _LARGEST_ROLL_DEG),
+        roll_deg=random.uniform(-LARGEST_ROLL_DEG, LARGEST_ROLL_DEG),
         zoom=float(np.exp(random.uniform(-_LARGEST_LOG_ZOOM, _LARGEST_LOG_ZOOM))),
         pan_deg=random.uniform(-_LARGEST_PAN_DEG, _LARGEST_PAN_DEG),
         tilt_deg=random.uniform(-_LARGEST_TILT_DEG, _LARGEST_TILT_DEG),
     )
+
+
+def random_rolls(
+    count: int, random: np.random.Generator, largest_deg: float = LARGEST_ROLL_DEG
+) -> Float[Tensor, "count 3 3"]:
+    """What cameras of crops turn what they see by."""
+    roll = torch.from_numpy(np.radians(random.uniform(-largest_deg, largest_deg, count))).float()
+    return about_axis(torch.stack([roll.cos(), roll.sin()], dim=1))
 
 
 def seen_by(
