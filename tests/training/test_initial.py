@@ -14,7 +14,7 @@ from curio_train.export.card import EVALUATION_FILE
 from curio_train.export.graph import Exported, export
 from curio_train.exported_model import ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
-from curio_train.learning.runs.initial import begin_with, uses_synthetic_labels
+from curio_train.learning.runs.initial import begin_with, method_before, uses_synthetic_labels
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.session import learn
 from curio_train.learning.state import TrainState
@@ -45,6 +45,14 @@ def begun(path: Path, config: RunConfig = CONFIG) -> TrainState:
 
 def network(state: TrainState) -> dict[str, Tensor]:
     return state.pose.network.state_dict()
+
+
+def test_the_method_before_is_that_of_a_run_that_can_be_read(run: Path, model: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged"
+    shutil.copytree(run, damaged)
+    (damaged / "config.json").write_text("{")
+    found = {path: method_before(replace(CONFIG, method="our", init=path)) for path in (run, model, damaged, None)}
+    assert found == {run: "noncur", model: None, damaged: None, None: None}
 
 
 def test_a_model_gives_the_network_that_it_was_exported_from(run: Path, model: Path) -> None:

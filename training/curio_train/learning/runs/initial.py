@@ -99,10 +99,13 @@ def uses_synthetic_labels(config: RunConfig) -> bool:
 
 
 def method_before(config: RunConfig) -> str | None:
-    """The method that trained the run which this one began as; None where it began as no run, or that is gone."""
+    """The method that trained the run which this one began as; None where it began as no run that can be read."""
     if config.init is None or not _is_run(config.init):
         return None
-    return load_config(config.init).method
+    try:
+        return load_config(config.init).method
+    except CurioError:
+        return None
 
 
 def _learned(network: nn.Module) -> dict[str, Tensor]:
