@@ -59,17 +59,24 @@ def test_what_costs_more_than_a_point_is_refused_with_both_figures(
     """The network has learned nothing, so an accuracy that falls is made by demanding that it rises."""
     monkeypatch.setattr(reduction, "LARGEST_LOSS", -0.01)
     before = sorted(models.rglob("*"))
-    words = r"in int8, 0\.0% in float32: int8 costs more than -1 point; nothing was written\. Export with --half"
+    words = r"in int8, 0\.0% in float32: int8 costs more than -1 point; nothing was written\. Export without --int8"
     with pytest.raises(ExportError, match=words):
-        export(circles_run, models, reduce=reduction.int8(tmp_path / "cache"))
+        export(circles_run, models, reduce=reduction.int8(tmp_path / "cache", half=False))
     assert sorted(models.rglob("*")) == before
 
 
-def test_half_and_int8_exclude_each_other(circles_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as exit_:
-        export_command.export([str(circles_run), "--half", "--int8"])
-    assert exit_.value.code == 2
-    assert "give one of them" in capsys.readouterr().err
+def test_what_is_not_quantised_can_be_stored_as_half(circles_run: Path, models: Path, tmp_path: Path) -> None:
+    cache = str(tmp_path / "cache")
+    for half in ([], ["--half"]):
+        with pytest.raises(SystemExit) as exit_:
+            export_command.export([str(circles_run), "--out", str(models), "--int8", *half, "--cache", cache])
+        assert not exit_.value.code
+    graphs = [onnx.load(models / "circles" / number / "model.onnx").graph for number in ("3", "4")]
+    assert [any(one.data_type == onnx.TensorProto.FLOAT16 for one in of.initializer) for of in graphs] == [False, True]
+    assert "int8 convolutions, else float16" in (models / "circles" / "CARD.md").read_text()
+    images = np.random.default_rng(0).integers(0, 256, (4, 128, 128, 3), dtype=np.uint8)
+    answers = [load_version(models / "circles", number).run(images)[TRANSLATION] for number in (3, 4)]
+    assert 0 < np.abs(answers[1] - answers[0]).max() < 0.05
 
 
 class _Linear(torch.nn.Module):

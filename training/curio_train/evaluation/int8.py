@@ -18,11 +18,12 @@ LARGEST_LOSS = 0.01
 """Of the accuracy, a fraction of all objects."""
 
 
-def int8(cache: Path) -> Reduce:
+def int8(cache: Path, *, half: bool) -> Reduce:
     """The reduction to int8, calibrated on renderings of the validation split and judged on those of the test split.
 
     Args:
         cache: Where worlds keep their image sets.
+        half: Whether weights that are not reduced will be stored as float16, for the card.
     """
 
     def reduce(world: World, model: onnx.ModelProto) -> Reduced:
@@ -35,9 +36,9 @@ def int8(cache: Path) -> Reduce:
         if after < before - LARGEST_LOSS:
             raise ExportError(
                 f"{figures}: int8 costs more than {100 * LARGEST_LOSS:g} point; nothing was written. "
-                "Export with --half, or without either"
+                "Export without --int8"
             )
-        return Reduced(quantised, f"int8 convolutions, else float32; {figures}")
+        return Reduced(quantised, f"int8 convolutions, else {'float16' if half else 'float32'}; {figures}")
 
     return reduce
 

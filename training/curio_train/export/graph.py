@@ -145,7 +145,7 @@ def export(
         name: Of the model; the world's choice unless given (a LineMOD model is named after its class).
         half: Store weights as float16, half as large; they are computed with in float32.
         fast: Let a detector for several objects look at each in one crop a pass.
-        reduce: Applied to the float32 graph once that agrees with torch; not together with ``half``.
+        reduce: Applied to the float32 graph once that agrees with torch.
         ahead: Gives the traced graph, where it has been traced before; not together with ``half``.
 
     Raises:
@@ -175,7 +175,7 @@ def export(
     stable = numerically_stable(Graph(checked, world), images)
 
     model = ahead(deployed) or traced(deployed, deployed.network, world.camera, list(expected))
-    if half:
+    if half and reduce is None:
         store_half(model)
     sessions = run_sessions(run)
     spec = model_spec(world, target.path.name)
@@ -187,11 +187,13 @@ def export(
     known = deployed.where(stable, expected)
     parity_error = refuse_disparity(known, deployed.where(stable, found))
     if reduce is not None:
-        exact, reduced = found, reduce(world, model)
+        reduced = reduce(world, model)
         model, weights = reduced.model, reduced.weights
+        if half:
+            store_half(model)
         put_spec(model, spec)
         found = ExportedModel(model.SerializeToString(), "the reduced graph")(images)
-        rounding_error = largest_difference(deployed.where(stable, exact), deployed.where(stable, found))
+        rounding_error = largest_difference(deployed.where(stable, learned), deployed.where(stable, found))
     spec.parity_max_abs_error = parity_error if reduce is None else rounding_error
     put_spec(model, spec)
     version = target.next_version()

@@ -1,7 +1,8 @@
 """Quantises an exported graph: int8 convolutions by onnxruntime's own quantiser, as QDQ nodes.
 
 Weights have a scale a channel and seven bits, so that sums never saturate and processors with and without VNNI compute
-the same. Convolutions whose output is no activation's input give the answer itself and stay in float32, as all else.
+the same. Activations and sums of residual blocks stay in int8 between convolutions. Convolutions whose output is the
+input of no activation and no other convolution give the answer itself and stay in float32, as all else.
 """
 
 import logging
@@ -19,6 +20,8 @@ from torch import Tensor
 from curio_train.errors import ExportError
 
 _NUM_A_RUN = 8
+_ACTIVATIONS = ("Relu", "Clip")
+_BETWEEN = (*_ACTIVATIONS, "Add")  # that stay in int8 after a convolution
 
 
 def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
@@ -34,8 +37,8 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
     load_onnxruntime()  # first, because it turns telemetry off
     from onnxruntime import quantization
 
-    kept = _answering(model)
-    if len(kept) == sum(node.op_type == "Conv" for node in model.graph.node):
+    kept = _kept(model.graph)
+    if not any(node.op_type == "Conv" and node.name not in kept for node in model.graph.node):
         raise ExportError("the network has no convolution before an activation to quantise; export without --int8")
 
     class Reader(quantization.CalibrationDataReader):
@@ -55,8 +58,8 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
             target,
             Reader(),
             quant_format=quantization.QuantFormat.QDQ,
-            op_types_to_quantize=["Conv"],
-            nodes_to_exclude=kept,
+            op_types_to_quantize=["Conv", *_BETWEEN],
+            nodes_to_exclude=sorted(kept),
             per_channel=True,
             reduce_range=True,
             activation_type=quantization.QuantType.QUInt8,
@@ -67,13 +70,29 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
     return quantised
 
 
-def _answering(model: onnx.ModelProto) -> list[str]:
-    """Names of the convolutions that no rectifier follows, at once or after the sum of a residual block."""
-    rectified: set[str] = set()
-    for node in reversed(model.graph.node):  # which are in the order of computation
-        if node.op_type == "Relu" or (node.op_type == "Add" and node.output[0] in rectified):
-            rectified.update(node.input)
-    return [node.name for node in model.graph.node if node.op_type == "Conv" and node.output[0] not in rectified]
+def _kept(graph: onnx.GraphProto) -> set[str]:
+    """Names of the nodes that stay in float32.
+
+    Those are convolutions that no activation and no other convolution follows, at once or after the sum of a residual
+    block, or whose weights the graph computes; and activations and sums that follow no quantised convolution.
+    """
+    constant = {tensor.name for tensor in graph.initializer}
+    followed: set[str] = set()
+    for node in reversed(graph.node):  # which are in the order of computation
+        if node.op_type in _ACTIVATIONS or (node.op_type == "Add" and node.output[0] in followed):
+            followed.update(node.input)
+        elif node.op_type == "Conv":
+            followed.add(node.input[0])
+    kept, quantised = set[str](), set[str]()
+    for node in graph.node:
+        is_inner = node.output[0] in followed and set(node.input[1:]) <= constant
+        if node.op_type == "Conv" and not is_inner:
+            kept.add(node.name)
+        elif node.op_type in _BETWEEN and quantised.isdisjoint(node.input):
+            kept.add(node.name)
+        elif node.op_type == "Conv":
+            quantised.add(node.output[0])
+    return kept
 
 
 @contextmanager

@@ -83,8 +83,9 @@ def crop_camera_at(
 def sampling_grid(
     crop: CropCamera, matrix: Float[Tensor, "batch 3 3"], size: int, frame_width: int, frame_height: int
 ) -> Float[Tensor, "batch {size} {size} 2"]:
-    """The grid with which ``grid_sample(frame, grid, align_corners=False)`` makes the crop.
+    """The grid with which ``grid_sample(frame, grid, align_corners=False)`` makes the crop; no place is outside the frame.
 
+    ``padding_mode="border"`` would find the border, too, but onnxruntime computes it three times slower.
     ``align_corners=False`` puts -1 and 1 at the image's borders, which lie half a pixel outside the pixel centres. The
     inverse homography K Rᵀ K_crop⁻¹ is written out: no solver then enters an exported graph.
     """
@@ -94,9 +95,11 @@ def sampling_grid(
         [[2 / frame_width, 0, 1 / frame_width - 1], [0, 2 / frame_height, 1 / frame_height - 1], [0, 0, 1]]
     )
     x, y, depth = (border @ matrix @ crop.rotation.transpose(1, 2) @ inverse(crop.matrix) @ pixels).unbind(1)
-    # Behind the frame's camera there is nothing to see: such pixels are sent far outside instead of mirrored into it.
+    # Behind the frame's camera there is nothing to see: such pixels are sent to the border instead of mirrored.
     scale = 1 / depth.clamp(min=1e-6)
-    return torch.stack([x * scale, y * scale], dim=-1).unflatten(1, (size, size))
+    right, bottom = 1 - 1 / frame_width, 1 - 1 / frame_height  # the centres of the last pixels
+    places = torch.stack([(x * scale).clamp(-right, right), (y * scale).clamp(-bottom, bottom)], dim=-1)
+    return places.unflatten(1, (size, size))
 
 
 def cut_crops(
@@ -128,8 +131,7 @@ def cut_crops(
     if roll is not None:
         camera = camera._replace(rotation=roll @ camera.rotation)
     grid = sampling_grid(camera, matrices, fine_side, images.shape[3], images.shape[2])
-    # The crops of an image in one tall grid: no image is copied.
-    tall = grid.view(-1, num * fine_side, fine_side, 2)
-    fine = F.grid_sample(images, tall, padding_mode="border", align_corners=False)
-    crops = fine.unflatten(2, (num, fine_side)).transpose(1, 2).flatten(0, 1)
+    # One crop of all images after the other: no image is copied, and what a crop needs stays in a core's cache.
+    of_images = grid.unflatten(0, (-1, num)).unbind(1)
+    crops = torch.stack([F.grid_sample(images, one, align_corners=False) for one in of_images], dim=1).flatten(0, 1)
     return (F.avg_pool2d(crops, oversampling) if oversampling > 1 else crops), camera.rotation

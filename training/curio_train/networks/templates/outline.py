@@ -69,8 +69,9 @@ def _edges(
     reach = _REACH_PX + _WIDTH_PX
     offsets = torch.arange(-reach, reach + 1, device=pictures.device, dtype=pictures.dtype)
     places = pixels[:, :, None] + offsets[:, None] * across[:, :, None]
-    grid = (2 * places + 1) / pictures.shape[-1] - 1
-    colors = F.grid_sample(pictures, grid, padding_mode="border", align_corners=False)  # [rows, 3, points, offsets]
+    border = 1 - 1 / pictures.shape[-1]
+    grid = ((2 * places + 1) / pictures.shape[-1] - 1).clamp(-border, border)  # as the grids of crop cameras
+    colors = F.grid_sample(pictures, grid, align_corners=False)  # [rows, 3, points, offsets]
     strips = F.avg_pool2d(colors, (1, _WIDTH_PX), stride=1)
     difference = (strips[..., _WIDTH_PX + 1 :] - strips[..., : -_WIDTH_PX - 1]).square().sum(dim=1)
     return difference / (difference + _CLEAR)
