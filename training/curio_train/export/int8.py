@@ -19,7 +19,6 @@ from torch import Tensor
 
 from curio_train.errors import ExportError
 
-_NUM_A_RUN = 8
 _ACTIVATIONS = ("Relu", "Clip")
 _BETWEEN = (*_ACTIVATIONS, "Add")  # that stay in int8 after a convolution
 
@@ -43,8 +42,8 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
 
     class Reader(quantization.CalibrationDataReader):
         def __init__(self) -> None:
-            pixels = images.permute(0, 2, 3, 1).contiguous().numpy()
-            self._feeds = iter(np.array_split(pixels, -(-len(pixels) // _NUM_A_RUN)))
+            # One at a time: eight images of eight objects take more memory than most machines have.
+            self._feeds = iter(images.permute(0, 2, 3, 1).contiguous().numpy()[:, None])
 
         def get_next(self) -> dict[str, np.ndarray] | None:
             batch = next(self._feeds, None)
