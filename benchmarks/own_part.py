@@ -1,7 +1,7 @@
 """The README's section "Your own part" as a user would type it, timed and scored.
 
-    python benchmarks/own_part.py [--method templates] [--minutes 26.5] [--photos 200] [--tests 50] [--step]
-                                  [--commands BIN] [--json]
+    python benchmarks/own_part.py [--method templates] [--minutes 26.5] [--init MODEL] [--seed 0] [--photos 200]
+                                  [--tests 50] [--step] [--commands BIN] [--json]
 
 An unpainted STL, 200 path traced photographs of it on a table, a background image and a camera file, calibrated from
 photographs of a chessboard, are made first (see ``benchmarks/make_captures.py``); what is there already is kept. Then
@@ -43,6 +43,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--method", choices=("sleep", "templates"), default="sleep", help="of curio-train capture")
     parser.add_argument("--minutes", type=float, default=26.5, help="of training")
+    parser.add_argument("--init", type=Path, help="network of another object that training begins with: models/ape")
+    parser.add_argument("--seed", type=int, default=0, help="of training")
     parser.add_argument("--photos", type=int, default=200, help="unlabelled")
     parser.add_argument("--tests", type=int, default=50, help="photographs that nothing has seen")
     parser.add_argument(
@@ -67,13 +69,15 @@ def main() -> None:
         write_bracket(files / "meshes" / "bracket.step")
     commands = arguments.commands.absolute()
     learning = ["--minutes", str(arguments.minutes)] if arguments.method == "sleep" else ["--method", "templates"]
+    learning += ["--seed", str(arguments.seed), *(["--init", str(arguments.init)] if arguments.init else [])]
     seconds = _as_typed(commands, given, files, out, learning)
     seconds["serve"] = _served(commands, files, out)
     seconds["total"] = round(sum(seconds.values()), 1)
     scored = _score(files, out / "poses.jsonl") | {"served_as": _difference(out)}
     scored["reads_9"] = _score(files, out / "poses-9.jsonl")
     machine = json.loads((out / "run" / "sittings.jsonl").read_text(encoding="utf-8").splitlines()[0])["machine"]
-    budget = {"method": arguments.method, "photos": arguments.photos}
+    budget = {"method": arguments.method, "photos": arguments.photos, "seed": arguments.seed}
+    budget |= {"init": str(arguments.init)} if arguments.init else {}
     if arguments.method == "sleep":
         budget["minutes"] = arguments.minutes
     result = scored | {"seconds": seconds, "machine": machine} | budget

@@ -12,9 +12,11 @@ from curio_train.commands import export as export_command
 from curio_train.errors import ExportError
 from curio_train.evaluation import int8 as reduction
 from curio_train.evaluation.scores import accuracy
+from curio_train.export import int8
 from curio_train.export.graph import Exported, Graph, export
-from curio_train.export.int8 import to_int8
 from curio_train.export.onnx import to_onnx
+from curio_train.export.parity import LARGEST_PARITY_ERROR
+from curio_train.exported_model import ExportedModel
 from curio_train.scene_code import TRANSLATION
 from curio_train.worlds.generated.circles import Circles
 
@@ -93,7 +95,7 @@ class _Linear(torch.nn.Module):
 def test_a_network_without_anything_to_quantise_is_refused() -> None:
     model = to_onnx(Graph(_Linear(), Circles()), 128, 128, [TRANSLATION])
     with pytest.raises(ExportError, match="no convolution before an activation"):
-        to_int8(model, torch.zeros(2, 3, 128, 128, dtype=torch.uint8))
+        int8.to_int8(model, torch.zeros(2, 3, 128, 128, dtype=torch.uint8))
 
 
 @pytest.mark.parametrize(("off", "expected"), [(0.0, 1.0), (0.019, 1.0), (0.021, 0.75), (1.0, 0.75)])
@@ -103,3 +105,22 @@ def test_accuracy_is_the_share_within_a_tenth_of_the_diameter(off: float, expect
     predicted = {name: values.clone() for name, values in true.items()}
     predicted[TRANSLATION][0, 0, 0] += off
     assert accuracy(world, predicted, true) == expected
+
+
+def test_stored_answers_do_not_hang_on_how_float32_is_rounded(
+    circles_run: Path, models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pixels become 0 to 1 in float32 before they are quantised, so their last digits can move whole steps."""
+    reduce = reduction.int8(tmp_path / "cache", half=False)
+    path = export(circles_run, models, reduce=reduce).path
+    golden = np.load(path / "golden.npz")
+    stored = golden[TRANSLATION]
+    others = list(int8.rounded_otherwise(onnx.load(path / "model.onnx")))
+    assert len(others) == 6
+    for other in others:
+        found = ExportedModel(other.SerializeToString(), "rounded otherwise")(torch.from_numpy(golden["image"][None]))
+        assert np.nanmax(np.abs(found[TRANSLATION][0].numpy() - stored)) <= LARGEST_PARITY_ERROR
+
+    monkeypatch.setattr(int8, "_ROUNDING", (-1.0,))  # all that is quantised is 0
+    with pytest.raises(ExportError, match="every answer to check images hangs on rounding"):
+        export(circles_run, models, reduce=reduce)

@@ -23,6 +23,7 @@ from curio_train.errors import ExportError, UsageError
 from curio_train.export.card import Provenance, card
 from curio_train.export.crop_stage import STAGE_TENSORS, traced
 from curio_train.export.folder import ModelFolder, triton_config
+from curio_train.export.int8 import rounded_otherwise
 from curio_train.export.onnx import put_spec, store_half
 from curio_train.export.parity import LARGEST_PARITY_ERROR, largest_difference, refuse_disparity
 from curio_train.export.spec import model_spec
@@ -122,6 +123,15 @@ class Graph(nn.Module):
         whole = stable.all(dim=1)
         return {name: values[whole if name in self.of_scene else stable] for name, values in outputs.items()}
 
+    def unmoved(self, outputs: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> Bool[Tensor, "batch slots"]:
+        """Which answers are the same in both, up to the largest parity error; what a scene has once moves all."""
+        same = torch.ones(outputs[TRANSLATION].shape[:2], dtype=torch.bool)
+        for name, values in outputs.items():
+            kept = 1 if name in self.of_scene else 2
+            moved = (values - others[name]).abs().reshape(*values.shape[:kept], -1).amax(dim=-1)
+            same &= moved.reshape(len(same), -1) <= LARGEST_PARITY_ERROR
+        return same
+
 
 def _pixels(image: Tensor) -> Tensor:
     return image.permute(0, 3, 1, 2).float() / 255
@@ -193,6 +203,10 @@ def export(
             store_half(model)
         put_spec(model, spec)
         found = ExportedModel(model.SerializeToString(), "the reduced graph")(images)
+        for rounded in rounded_otherwise(model):
+            stable &= deployed.unmoved(found, ExportedModel(rounded.SerializeToString(), "its check")(images))
+        if not stable.any():
+            raise ExportError("in int8 every answer to check images hangs on rounding; export without --int8")
         rounding_error = largest_difference(deployed.where(stable, learned), deployed.where(stable, found))
     spec.parity_max_abs_error = parity_error if reduce is None else rounding_error
     put_spec(model, spec)
@@ -298,10 +312,7 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slot
     with _jittered_layers(graph.network, generator):
         for _ in range(NUM_JITTERED):
             jittered = graph.in_parts(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
-            for name, values in answers.items():
-                kept = 1 if name in graph.of_scene else 2
-                moved = (values - jittered[name]).abs().reshape(*values.shape[:kept], -1).amax(dim=-1)
-                stable &= moved.reshape(len(images), -1) <= LARGEST_PARITY_ERROR
+            stable &= graph.unmoved(answers, jittered)
     if stable.float().mean() < _LEAST_STABLE:
         raise ExportError(
             f"{int((~stable).sum())} of the network's {stable.numel()} answers to check images change with the images' "

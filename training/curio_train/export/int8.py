@@ -15,12 +15,15 @@ import numpy as np
 import onnx
 from curio_serve.models.model import INPUT
 from curio_serve.models.runtime import load_onnxruntime
+from onnx import helper, numpy_helper
 from torch import Tensor
 
 from curio_train.errors import ExportError
 
 _ACTIVATIONS = ("Relu", "Clip")
 _BETWEEN = (*_ACTIVATIONS, "Add")  # that stay in int8 after a convolution
+_FACTOR = "rounding"
+_ROUNDING = (1e-7, -1e-7, 3e-7, -3e-7, 1e-6, -1e-6)  # relative, about that of float32 in some operations
 
 
 def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
@@ -69,6 +72,31 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
     return quantised
 
 
+def rounded_otherwise(model: onnx.ModelProto) -> Iterator[onnx.ModelProto]:
+    """A quantised model as it computes on processors that round float32 in another way.
+
+    A value between two steps of eight bits falls to either by its last digit, and what follows differs by a whole step.
+    So what float32 operations compute is made larger or smaller by about their rounding before it is quantised.
+    """
+    for fraction in _ROUNDING:
+        other = onnx.ModelProto()
+        other.CopyFrom(model)
+        graph, nodes, rounded = other.graph, list[onnx.NodeProto](), set[str]()
+        made_by = {name: node.op_type for node in graph.node for name in node.output}
+        graph.initializer.append(numpy_helper.from_array(np.array(1 + fraction, np.float32), _FACTOR))
+        for node in graph.node:
+            exact = node.input[0] if node.op_type == "QuantizeLinear" else ""
+            if exact and made_by.get(exact) not in ("Conv", *_BETWEEN):
+                node.input[0] = f"{exact}_rounded"
+                if exact not in rounded:
+                    nodes.append(helper.make_node("Mul", [exact, _FACTOR], [node.input[0]], name=f"{exact}_rounding"))
+                    rounded.add(exact)
+            nodes.append(node)
+        del graph.node[:]
+        graph.node.extend(nodes)
+        yield other
+
+
 def _kept(graph: onnx.GraphProto) -> set[str]:
     """Names of the nodes that stay in float32.
 
@@ -84,13 +112,10 @@ def _kept(graph: onnx.GraphProto) -> set[str]:
             followed.add(node.input[0])
     kept, quantised = set[str](), set[str]()
     for node in graph.node:
-        is_inner = node.output[0] in followed and set(node.input[1:]) <= constant
-        if node.op_type == "Conv" and not is_inner:
-            kept.add(node.name)
-        elif node.op_type in _BETWEEN and quantised.isdisjoint(node.input):
-            kept.add(node.name)
-        elif node.op_type == "Conv":
+        if node.op_type == "Conv" and node.output[0] in followed and set(node.input[1:]) <= constant:
             quantised.add(node.output[0])
+        elif node.op_type == "Conv" or (node.op_type in _BETWEEN and quantised.isdisjoint(node.input)):
+            kept.add(node.name)
     return kept
 
 

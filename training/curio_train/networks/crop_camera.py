@@ -83,9 +83,9 @@ def crop_camera_at(
 def sampling_grid(
     crop: CropCamera, matrix: Float[Tensor, "batch 3 3"], size: int, frame_width: int, frame_height: int
 ) -> Float[Tensor, "batch {size} {size} 2"]:
-    """The grid with which ``grid_sample(frame, grid, align_corners=False)`` makes the crop; no place is outside the frame.
+    """The grid with which ``grid_sample(frame, grid, align_corners=False)`` makes the crop.
 
-    ``padding_mode="border"`` would find the border, too, but onnxruntime computes it three times slower.
+    No place is outside the frame: ``padding_mode="border"`` would do that, too, but takes onnxruntime twice as long.
     ``align_corners=False`` puts -1 and 1 at the image's borders, which lie half a pixel outside the pixel centres. The
     inverse homography K Rᵀ K_crop⁻¹ is written out: no solver then enters an exported graph.
     """
