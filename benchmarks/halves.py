@@ -6,7 +6,7 @@ Every second frame of the data set's scene is learned from and the others are sc
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
 10c6bff; models/lmo/3 has seen them), and no label of a frame is opened in training. What is finished is kept, a run
 that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, by one read, by
-nine, and by one and three of the model that ``curio-export --fast --int8`` makes; as served, and refined by
+nine, and by one and three of the model that ``curio-export --fast`` makes; as served, and refined by
 render-and-compare.
 """
 
@@ -90,7 +90,7 @@ def _fast(run: Path, models: Path) -> Path:
     """The run as a model that looks at each object in one crop a pass."""
     model = models / "lmo"
     if not model.exists():
-        _call("curio-export", run, "--out", models, "--name", "lmo", "--half", "--fast", "--int8")
+        _call("curio-export", run, "--out", models, "--name", "lmo", "--half", "--fast")
     return model
 
 

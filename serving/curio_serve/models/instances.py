@@ -82,7 +82,7 @@ class InstanceSearch:
         return True
 
     def outputs(self) -> Values:
-        """One output of each name with a row an instance; of what is one a scene, that of the first."""
+        """Outputs by name, with a row for each instance; what a scene has once is that of the first reading."""
         first = self.readings[0]
         rows = {name: [values[name][0] for values in self.readings] for name in first if name != _OF_SCENE}
         return {name: rows.get(name, value) for name, value in first.items()}

@@ -1,4 +1,4 @@
-"""Something that reads each image several times, as ``curio-detect --reads`` does."""
+"""Evaluates a network that reads each image several times, as ``curio-detect --reads`` does."""
 
 from dataclasses import replace
 

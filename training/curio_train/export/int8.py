@@ -2,7 +2,8 @@
 
 Weights have a scale a channel and seven bits, so that sums never saturate and processors with and without VNNI compute
 the same. Activations and sums of residual blocks stay in int8 between convolutions. Convolutions whose output is the
-input of no activation and no other convolution give the answer itself and stay in float32, as all else.
+input of no activation and no other convolution give the answer itself and stay in float32, as the first ones do, and
+all else.
 """
 
 import logging
@@ -23,7 +24,7 @@ from curio_train.errors import ExportError
 _ACTIVATIONS = ("Relu", "Clip")
 _BETWEEN = (*_ACTIVATIONS, "Add")  # that stay in int8 after a convolution
 _FACTOR = "rounding"
-_ROUNDING = (1e-7, -1e-7, 3e-7, -3e-7, 1e-6, -1e-6)  # relative, about that of float32 in some operations
+_ROUNDING = (1e-7, -1e-7, 2e-7, -2e-7, 3e-7, -3e-7)  # relative: that of float32 in a few operations
 
 
 def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
@@ -82,11 +83,12 @@ def rounded_otherwise(model: onnx.ModelProto) -> Iterator[onnx.ModelProto]:
         other = onnx.ModelProto()
         other.CopyFrom(model)
         graph, nodes, rounded = other.graph, list[onnx.NodeProto](), set[str]()
-        made_by = {name: node.op_type for node in graph.node for name in node.output}
+        in_int8 = {name for node in graph.node if node.op_type == "DequantizeLinear" for name in node.output}
+        made_by = {name: node for node in graph.node for name in node.output}
         graph.initializer.append(numpy_helper.from_array(np.array(1 + fraction, np.float32), _FACTOR))
         for node in graph.node:
             exact = node.input[0] if node.op_type == "QuantizeLinear" else ""
-            if exact and made_by.get(exact) not in ("Conv", *_BETWEEN):
+            if exact in made_by and in_int8.isdisjoint(made_by[exact].input):
                 node.input[0] = f"{exact}_rounded"
                 if exact not in rounded:
                     nodes.append(helper.make_node("Mul", [exact, _FACTOR], [node.input[0]], name=f"{exact}_rounding"))
@@ -100,7 +102,8 @@ def rounded_otherwise(model: onnx.ModelProto) -> Iterator[onnx.ModelProto]:
 def _kept(graph: onnx.GraphProto) -> set[str]:
     """Names of the nodes that stay in float32.
 
-    Those are convolutions that no activation and no other convolution follows, at once or after the sum of a residual
+    Those are the first convolutions, because many pixels lie right between two steps of eight bits, where rounding
+    decides; convolutions that no activation and no other convolution follows, at once or after the sum of a residual
     block, or whose weights the graph computes; and activations and sums that follow no quantised convolution.
     """
     constant = {tensor.name for tensor in graph.initializer}
@@ -110,12 +113,15 @@ def _kept(graph: onnx.GraphProto) -> set[str]:
             followed.update(node.input)
         elif node.op_type == "Conv":
             followed.add(node.input[0])
-    kept, quantised = set[str](), set[str]()
+    kept, quantised, convolved = set[str](), set[str](), set[str]()
     for node in graph.node:
-        if node.op_type == "Conv" and node.output[0] in followed and set(node.input[1:]) <= constant:
+        is_inner = node.input and node.input[0] in convolved and node.output[0] in followed
+        if node.op_type == "Conv" and is_inner and set(node.input[1:]) <= constant:
             quantised.add(node.output[0])
         elif node.op_type == "Conv" or (node.op_type in _BETWEEN and quantised.isdisjoint(node.input)):
             kept.add(node.name)
+        if node.op_type == "Conv" or (node.op_type in _BETWEEN and not convolved.isdisjoint(node.input)):
+            convolved.add(node.output[0])
     return kept
 
 

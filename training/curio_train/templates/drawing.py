@@ -35,7 +35,7 @@ class TemplateRenderer:
     """Draws an object on the optical axis of a camera whose principal point is the picture's middle."""
 
     def __init__(self, mesh: Mesh, depth_m: float, focal_px: float, side: int) -> None:
-        """Choose distance and camera.
+        """Build a renderer for one distance and one camera.
 
         Raises:
             RendererError: The mesh cannot be rendered.

@@ -31,7 +31,7 @@ class Outlines(NamedTuple):
 
 
 def outlines(mesh: Mesh, geometry: Geometry) -> Outlines:
-    """Outlines in all directions, each at random places; where an outline is short, some are twice.
+    """Points of the outline in each viewing direction, drawn at random; of a short outline some are drawn twice.
 
     Raises:
         RendererError: The mesh cannot be rendered.
