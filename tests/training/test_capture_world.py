@@ -11,7 +11,7 @@ import torch
 import trimesh
 from curio_train.camera import Intrinsics
 from curio_train.commands import train as train_command
-from curio_train.config import NetworkConfig
+from curio_train.config import NetworkConfig, RunConfig
 from curio_train.data import backgrounds
 from curio_train.data.background_image import BackgroundImages, MixedBackgrounds
 from curio_train.data.photographs import NUM_JUDGED
@@ -19,8 +19,11 @@ from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, MeshError, UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.subject import load_subject
+from curio_train.exported_model import find_model
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.initial import begin_with
+from curio_train.learning.state import TrainState
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
@@ -28,6 +31,7 @@ from curio_train.worlds.base import World
 from curio_train.worlds.capture import CapturePhotographs
 from curio_train.worlds.options import CaptureOptions
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from safetensors.torch import load_file
 from torch import Tensor
 
 WIDTH, HEIGHT = 160, 120
@@ -323,3 +327,15 @@ def test_project_files_that_cannot_be_used(folder: Path, tmp_path: Path, capsys:
             file.write_text(content)
         assert call("--project", file) == 2
         assert expected in capsys.readouterr().err
+
+
+def test_training_begins_with_the_network_of_another_object(folder: Path, world: TwoStageWorld) -> None:
+    """An unpainted part's colour is read, too, so the last layer has another size than that of a painted object."""
+    shipped = Path(__file__).parents[2] / "models" / "ape"
+    weights = load_file(find_model(shipped).with_name("weights.safetensors"))
+    state = TrainState(RunConfig(options(folder), method="sleep"), world, torch.device("cpu"))
+    begin_with(state, shipped)
+    begun = state.pose.network.state_dict()
+    others = {name for name, value in weights.items() if not torch.equal(begun[name].float(), value.float())}
+    assert others == {"second.cells.2.weight", "second.cells.2.bias"}
+    assert len(begun["second.cells.2.bias"]) == len(weights["second.cells.2.bias"]) + 3

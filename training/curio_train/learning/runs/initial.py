@@ -4,6 +4,7 @@ A model's ONNX file cannot be trained further: batch norm is folded into the con
 shares constants. So each version also stores the network as it was trained, in ``weights.safetensors``.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from curio_serve.files import check_regular
@@ -18,12 +19,15 @@ from curio_train.learning.runs.checkpoint import MAX_TENSOR_BYTES, RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, load_config
 from curio_train.learning.state import TrainState, under
 from curio_train.networks.several_objects.network import ObjectsNetwork
+from curio_train.networks.two_stage.network import TwoStageNetwork
 
 _IMAGES, _SECONDS, _SYNTHETIC_LABELS = "images_seen", "training_seconds", "synthetic_labels"
 
 
 def begin_with(state: TrainState, path: Path) -> None:
     """Load a trained network into ``state``; optimisers and budget start anew.
+
+    The last layer of a crop-pose stage begins with random weights where the other one reads other things of its object.
 
     Args:
         state: Of the new run.
@@ -43,9 +47,8 @@ def begin_with(state: TrainState, path: Path) -> None:
         except ValueError as exc:
             raise CheckpointError(f"{path}: its {WEIGHTS_FILE} says {notes}; export the model anew") from exc
     network = state.pose.network
-    drawn = {name: value for name, value in network.state_dict().items() if name not in _learned(network)}
     try:
-        network.load_state_dict(tensors | drawn)
+        network.load_state_dict(tensors | _kept(network, tensors))
     except RuntimeError as exc:
         raise UsageError(
             f"--init {path}: its network does not fit this world ({str(exc).splitlines()[-1].strip()}); "
@@ -112,6 +115,16 @@ def _learned(network: nn.Module) -> dict[str, Tensor]:
     """The state of a network without its templates, which are drawn anew."""
     drawn = ObjectsNetwork.DRAWN if isinstance(network, ObjectsNetwork) else ()
     return {name: value for name, value in network.state_dict().items() if not name.startswith(drawn)}
+
+
+def _kept(network: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What a network does not take from another: templates, and a last layer of another size."""
+    own = network.state_dict()
+    last = TwoStageNetwork.LAST if isinstance(network, TwoStageNetwork) else ()
+    kept = {
+        name for name in own if name.startswith(last) and name in tensors and own[name].shape != tensors[name].shape
+    }
+    return {name: own[name] for name in kept | (own.keys() - _learned(network).keys())}
 
 
 def _is_run(path: Path) -> bool:

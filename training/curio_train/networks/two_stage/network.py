@@ -1,7 +1,7 @@
 """The two-stage detector as one network: positions from the whole frame, then pose and light from crops around them."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -61,6 +61,8 @@ class TwoStageNetwork(nn.Module):
     Their errors are nearly independent, so the final position is their mean.
     """
 
+    LAST: Final = ("second.cells.2.",)
+    """Beginnings of the names of the layer whose size depends on what is read of an object, such as its colour."""
     first: StageNetwork
     """The localisation stage, on frames at low resolution."""
     second: StageNetwork
