@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from curio_serve.client import PoseClient
+from curio_serve.models.model_folder import versions
 from curio_train.errors import ExportError, UsageError
 
 hub_module = pytest.importorskip("curio_train.export.hub", reason="huggingface_hub is not installed: extra `hub`")
@@ -19,6 +20,7 @@ Push = Callable[..., str]
 ROOT = Path(__file__).parents[3]
 FRAME, CAMERA = ROOT / "samples" / "00.jpg", ROOT / "samples" / "camera.json"
 NAME = "acme/ape"
+(VERSION,) = versions(ROOT / "models" / "ape")
 ADDRESS = f"hf://{NAME}"
 
 
@@ -97,12 +99,12 @@ def test_a_model_is_fetched_once_and_then_serves_offline(
 ) -> None:
     found, expected = (json.loads(detect(model)) for model in (ADDRESS, ROOT / "models" / "ape"))
     assert {**found, "milliseconds": None} == {**expected, "milliseconds": None}
-    files = ("1/golden.npz", "1/model.onnx", "1/reliability.json", "CARD.md", "SHA256SUMS", "config.pbtxt")
-    assert sorted(hub.downloads) == [f"ape/{name}" for name in files]
+    of_version = [f"{VERSION}/{name}" for name in ("golden.npz", "model.onnx", "reliability.json")]
+    assert sorted(hub.downloads) == [f"ape/{name}" for name in (*of_version, "CARD.md", "SHA256SUMS", "config.pbtxt")]
     hub.downloads.clear()
     offline = environment(hub, tmp_path) | {"HF_HUB_OFFLINE": "1"}
     with serving(ADDRESS, offline) as address, PoseClient(address) as client:
-        assert [(model.name, list(model.versions)) for model in client.list_models()] == [("ape", [1])]
+        assert [(model.name, list(model.versions)) for model in client.list_models()] == [("ape", [VERSION])]
     assert hub.downloads == []
 
 
@@ -119,7 +121,7 @@ def test_the_cache_stands_in_for_a_hub_that_is_out_of_order(
 def test_a_revision_is_named(held: Any, detect: Callable[..., str]) -> None:
     held.tags["first"] = 1
     held.commits.append({"README.md": b"emptied"})
-    assert json.loads(detect(f"{ADDRESS}@first"))["model"] == {"name": "ape", "version": 1}
+    assert json.loads(detect(f"{ADDRESS}@first"))["model"] == {"name": "ape", "version": VERSION}
     assert f"{ADDRESS}@second: the repository has no such revision" in detect(f"{ADDRESS}@second", status=2)
 
 
@@ -131,7 +133,7 @@ def test_what_cannot_be_fetched_is_said(hub: Any, held: Any, detect: Callable[..
     hub.repositories["acme/text"].commits.append({"README.md": b"", "onnx/model.onnx": b"0" * 1000})
     assert "holds no model of curio's" in detect("hf://acme/text", 1)
     assert hub.downloads == []
-    held.commits[-1]["ape/1/model.onnx"] += b"0"
+    held.commits[-1][f"ape/{VERSION}/model.onnx"] += b"0"
     assert "but SHA256SUMS says" in detect(ADDRESS, 1)
 
 
@@ -146,8 +148,8 @@ def test_a_hub_that_does_not_answer(at_hub: Call) -> None:
 def test_a_push_over_another_model_or_version_is_refused(held: Any, push: Push, folder: Path) -> None:
     with pytest.raises(UsageError, match="holds the model ape; push cat"):
         push(ROOT / "models" / "cat")
-    held.commits[-1]["ape/SHA256SUMS"] += b"0" * 64 + b"  2/model.onnx\n"
-    with pytest.raises(ExportError, match="its version 2 is missing or another one"):
+    held.commits[-1]["ape/SHA256SUMS"] += b"0" * 64 + b"  100/model.onnx\n"
+    with pytest.raises(ExportError, match="its version 100 is missing or another one"):
         push(folder)
     assert len(held.commits) == 2
 
