@@ -47,9 +47,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of training")
     parser.add_argument("--photos", type=int, default=200, help="unlabelled")
     parser.add_argument("--tests", type=int, default=50, help="photographs that nothing has seen")
-    parser.add_argument(
-        "--out", type=Path, default=Path("runs/own_part"), help="what an earlier call trained is replaced"
-    )
+    parser.add_argument("--out", type=Path, default=Path("runs/own_part"), help="an earlier run in it is replaced")
     parser.add_argument("--step", action="store_true", help="the mesh as a STEP file (package cadquery-ocp-novtk)")
     parser.add_argument(
         "--commands", type=Path, default=Path(sys.executable).parent, help="folder of the installed commands"
@@ -76,10 +74,8 @@ def main() -> None:
     scored = _score(files, out / "poses.jsonl") | {"served_as": _difference(out)}
     scored["reads_9"] = _score(files, out / "poses-9.jsonl")
     machine = json.loads((out / "run" / "sittings.jsonl").read_text(encoding="utf-8").splitlines()[0])["machine"]
-    budget = {"method": arguments.method, "photos": arguments.photos, "seed": arguments.seed}
-    budget |= {"init": str(arguments.init)} if arguments.init else {}
-    if arguments.method == "sleep":
-        budget["minutes"] = arguments.minutes
+    budget = {name: vars(arguments)[name] for name in ("method", "photos", "seed")} | {"init": str(arguments.init)}
+    budget |= {"minutes": arguments.minutes} if arguments.method == "sleep" else {}
     result = scored | {"seconds": seconds, "machine": machine} | budget
     (out / "own_part.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     print(json.dumps(result) if arguments.json else result)

@@ -10,6 +10,7 @@ from curio_train.evaluation.scores import accuracy
 from curio_train.evaluation.subject import Predict, model_reader
 from curio_train.export.graph import Reduce, Reduced
 from curio_train.export.int8 import to_int8
+from curio_train.export.onnx import store_half
 from curio_train.exported_model import ExportedModel
 from curio_train.worlds.base import World
 
@@ -23,7 +24,7 @@ def int8(cache: Path, *, half: bool) -> Reduce:
 
     Args:
         cache: Where worlds keep their image sets.
-        half: Whether weights that are not reduced will be stored as float16, for the card.
+        half: Whether to store weights that are not reduced as float16.
     """
 
     def reduce(world: World, model: onnx.ModelProto) -> Reduced:
@@ -38,6 +39,8 @@ def int8(cache: Path, *, half: bool) -> Reduce:
                 f"{figures}: int8 costs more than {100 * LARGEST_LOSS:g} point; nothing was written. "
                 "Export without --int8"
             )
+        if half:
+            store_half(quantised)
         return Reduced(quantised, f"int8 convolutions, else {'float16' if half else 'float32'}; {figures}")
 
     return reduce

@@ -158,7 +158,7 @@ def export(
         name: Of the model; the world's choice unless given (a LineMOD model is named after its class).
         half: Store weights as float16, half as large; they are computed with in float32.
         fast: Let a detector for several objects look at each in one crop a pass.
-        reduce: Applied to the float32 graph once that agrees with torch.
+        reduce: Applied to the float32 graph once that agrees with torch; stores the rest as ``half`` says.
         ahead: Gives the traced graph, where it has been traced before; not together with ``half``.
 
     Raises:
@@ -197,20 +197,13 @@ def export(
 
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
     weights = _weights(half, rounding_error)
-    known = deployed.where(stable, expected)
-    parity_error = refuse_disparity(known, deployed.where(stable, found))
+    parity_error = refuse_disparity(deployed.where(stable, expected), deployed.where(stable, found))
     if reduce is not None:
         reduced = reduce(world, model)
         model, weights = reduced.model, reduced.weights
-        if half:
-            store_half(model)
         put_spec(model, spec)
         found = ExportedModel(model.SerializeToString(), "the reduced graph")(images)
-        for rounded in rounded_otherwise(model):
-            other = ExportedModel(rounded.SerializeToString(), "its check")(images)
-            stable &= deployed.unmoved(found, other, _LARGEST_STEP)
-        if not stable.any():
-            raise ExportError("in int8 every answer to check images hangs on rounding; export without --int8")
+        stable &= _unmoved_by_rounding(deployed, model, images, found)
         rounding_error = largest_difference(deployed.where(stable, learned), deployed.where(stable, found))
     spec.parity_max_abs_error = parity_error if reduce is None else rounding_error
     put_spec(model, spec)
@@ -223,8 +216,16 @@ def export(
         GOLDEN_FILE: _golden(images, deployed, stable, found),
         WEIGHTS_FILE: weights_file(state, folder.config, half=half),
     }
-    path = target.add(version, files, config, text)
-    return Exported(path, parity_error, rounding_error, model.ByteSize(), weights)
+    return Exported(target.add(version, files, config, text), parity_error, rounding_error, model.ByteSize(), weights)
+
+
+def _unmoved_by_rounding(graph: Graph, model: onnx.ModelProto, images: Tensor, found: Mapping[str, Tensor]) -> Tensor:
+    """Which answers of a reduced graph stay where processors round in another way, [batch, slots]."""
+    others = [ExportedModel(other.SerializeToString(), "its check")(images) for other in rounded_otherwise(model)]
+    unmoved = torch.stack([graph.unmoved(found, other, _LARGEST_STEP) for other in others]).all(dim=0)
+    if not unmoved.any():
+        raise ExportError("in int8 every answer to check images hangs on rounding; export without --int8")
+    return unmoved
 
 
 def _uses_pretrained(network: nn.Module, world: World, config: RunConfig) -> bool:
