@@ -43,7 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--method", choices=("sleep", "templates"), default="sleep", help="of curio-train capture")
     parser.add_argument("--minutes", type=float, default=26.5, help="of training")
-    parser.add_argument("--init", type=Path, help="network of another object that training begins with: models/ape")
+    parser.add_argument("--init", help="network of another object that training begins with: models/ape")
     parser.add_argument("--seed", type=int, default=0, help="of training")
     parser.add_argument("--photos", type=int, default=200, help="unlabelled")
     parser.add_argument("--tests", type=int, default=50, help="photographs that nothing has seen")
@@ -67,14 +67,14 @@ def main() -> None:
         write_bracket(files / "meshes" / "bracket.step")
     commands = arguments.commands.absolute()
     learning = ["--minutes", str(arguments.minutes)] if arguments.method == "sleep" else ["--method", "templates"]
-    learning += ["--seed", str(arguments.seed), *(["--init", str(arguments.init)] if arguments.init else [])]
+    learning += ["--seed", str(arguments.seed), *(["--init", arguments.init] if arguments.init else [])]
     seconds = _as_typed(commands, given, files, out, learning)
     seconds["serve"] = _served(commands, files, out)
     seconds["total"] = round(sum(seconds.values()), 1)
     scored = _score(files, out / "poses.jsonl") | {"served_as": _difference(out)}
     scored["reads_9"] = _score(files, out / "poses-9.jsonl")
     machine = json.loads((out / "run" / "sittings.jsonl").read_text(encoding="utf-8").splitlines()[0])["machine"]
-    budget = {name: vars(arguments)[name] for name in ("method", "photos", "seed")} | {"init": str(arguments.init)}
+    budget = {name: vars(arguments)[name] for name in ("method", "photos", "seed", "init")}
     budget |= {"minutes": arguments.minutes} if arguments.method == "sleep" else {}
     result = scored | {"seconds": seconds, "machine": machine} | budget
     (out / "own_part.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
