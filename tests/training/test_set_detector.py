@@ -203,11 +203,18 @@ def test_image_loss_trains_the_heat_map_in_worlds_of_fixed_numbers(worlds: dict[
     assert CONFIDENCE not in network.eval()(images)
 
 
-def test_methods_and_worlds_without_the_dense_decoder_are_refused(worlds: dict[str, MeshWorld], tmp_path: Path) -> None:
+def test_wake_sleep_of_the_dense_decoder_draws_from_the_range(worlds: dict[str, MeshWorld], tmp_path: Path) -> None:
     source = worlds["spheres"].source("test", 0, with_code=False, cache=tmp_path)
-    config = RunConfig(WORLDS["spheres"](), method="wake_sleep", network=CELLS)
-    with pytest.raises(UsageError, match=r"perturbs the network's raw outputs.*--reading whole"):
-        Trainer(config, worlds["spheres"], [source], CPU)
+    recipe = Recipe(batch_size=4, micro_batch_size=4)
+    config = RunConfig(WORLDS["spheres"](), method="wake_sleep", network=CELLS, recipe=recipe)
+    trainer = Trainer(config, worlds["spheres"], [source], CPU)
+    first = trainer.synthetic.take(0)[0]
+    assert torch.equal(first[TRANSLATION], worlds["spheres"].sample(4, (config.seed, 0, 1))[TRANSLATION])
+    assert set(trainer.step(1.0)) == {"image", "sleep"}
+
+
+def test_worlds_without_the_dense_decoder_refuse_it(worlds: dict[str, MeshWorld], tmp_path: Path) -> None:
+    source = worlds["spheres"].source("test", 0, with_code=False, cache=tmp_path)
     circles = build(WORLDS["circles"]())
     with pytest.raises(UsageError, match="--reading cells: circles has no such decoder"):
         Trainer(RunConfig(WORLDS["circles"](), method="noncur", network=CELLS), circles, [source], CPU)

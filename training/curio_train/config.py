@@ -52,7 +52,7 @@ class Method:
 
     @property
     def perturbs_predictions(self) -> bool:
-        """Whether the scene codes of ``sleep`` are drawn around predictions for training images."""
+        """Whether ``sleep`` draws scene codes around predictions, where the network has raw values."""
         return self.sleep and self.reads_images
 
 
@@ -106,7 +106,7 @@ class NetworkConfig:
     """Decoder for images of generated worlds and of parts on a plane. whole: the paper's global decoder, which predicts
     all slots of a scene from one latent code. cells: a dense decoder, which predicts an object at every grid cell and
     fills the slots from the surest cells. Unless given, parts on a plane use cells (but not with preset paper, nor with
-    wake–sleep, which needs whole), all else uses whole."""
+    wake–sleep, which draws codes around whole's raw values), all else uses whole."""
     row: int = 32
     """Values each object slot gets from the shared trunk."""
     hidden: int = 64
@@ -161,7 +161,7 @@ class Recipe:
     the result is a scene of the same world."""
     sleep_drawn: float = 0.5
     """Fraction of wake–sleep's scene codes that is drawn from the world's known range instead of around predictions;
-    --method sleep draws all of them."""
+    --method sleep draws all of them, and so does wake–sleep where the decoder is dense or reads crops."""
     self_training: float = 0.0
     """Fraction of the crop-pose stage's images that are crops of photographs. Their pseudo-labels are the network's own
     poses, refined by render-and-compare. Mixed in during the last two fifths of a run with --method sleep, or the last

@@ -38,10 +38,10 @@ def _training_images(config: RunConfig, world: World, cache: Path) -> Callable[[
     """What gives the training images of a world's stages, once there is a run folder."""
     if config.terms.hypotheses:
         return search_of(world, config.network.reading, config.seed, cache)
-    if len(stages_of(world)) > 1 and config.terms.renders_predictions:
-        return lambda _: Found([world.source("train", config.seed, with_code=False, cache=cache)], seconds=0.0)
-    labels = config.terms.label
-    sources = [stage.source("train", config.seed, with_code=labels, cache=cache) for stage in stages_of(world)]
+    # Where predictions are rendered, crops are cut from whole frames around the first stage's answers.
+    first, *others = stages_of(world)
+    shown = [world if config.terms.renders_predictions else first, *others]
+    sources = [one.source("train", config.seed, with_code=config.terms.label, cache=cache) for one in shown]
     if config.labels < 1:
         sources = [source.subset(config.labels) for source in sources]
     return lambda _: Found(sources, seconds=0.0)

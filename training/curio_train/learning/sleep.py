@@ -1,8 +1,9 @@
 """Synthetic batches: renderings of known scene codes, the "sleep" phase of wake–sleep (Hinton et al. 1995).
 
 The paper has no such term. The network learns to predict the codes of renderings. A run with ``--method sleep`` draws
-all codes from the range that the world declares; wake–sleep draws half of them around the network's own predictions for
-training images. Neither uses labels of the data.
+all codes from the range that the world declares. Wake–sleep draws half of them around the network's own predictions for
+training images, and all of them from the range where the network has no raw values to draw around. Neither uses labels
+of the data.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,9 +27,14 @@ SyntheticBatch = tuple[dict[str, Tensor], Tensor]
 """Scene codes, and augmented renderings of them [batch, 3, height, width]."""
 
 
-def scheduled_stage(world: World, step: int) -> int:
+def trained_stage(config: RunConfig, world: World, step: int) -> int:
     """Which of the world's stages a step trains."""
-    return world.stage_schedule[step % len(world.stage_schedule)] if isinstance(world, StagedWorld) else 0
+    if not isinstance(world, StagedWorld):
+        return 0
+    if config.terms.renders_predictions:
+        # An image loss teaches the last stage alone, on crops around the answers of the one before.
+        return len(world.stages) - 1
+    return world.stage_schedule[step % len(world.stage_schedule)]
 
 
 class SyntheticBatches:
@@ -47,7 +53,7 @@ class SyntheticBatches:
         Args:
             config: Seed, batch size and noise.
             world: Draws and renders scenes.
-            sources: Give the backgrounds of each of the world's stages.
+            sources: Give the backgrounds of renderings, for each of the world's stages.
             ranks: This process among those that train together.
             self_training: Gives crops of photographs for the last stage.
         """
@@ -96,7 +102,8 @@ class SyntheticBatches:
 
     @torch.no_grad()
     def _draw(self, number: int) -> SyntheticBatch:
-        stage, size = scheduled_stage(self._world, number // self._num_micro), self._config.recipe.micro_batch_size
+        stage = trained_stage(self._config, self._world, number // self._num_micro)
+        size = self._config.recipe.micro_batch_size
         world, device = stages_of(self._world)[stage], self._ranks.device
         seed = self._config.seed, number
         backgrounds = self._sources[stage].backgrounds(number, size)

@@ -130,7 +130,7 @@ class TrainState:
         """Everything before the first step.
 
         Raises:
-            UsageError: The world has no such decoder, or the method cannot train it.
+            UsageError: The world has no such decoder.
         """
         decoder = config.network.reading
         if decoder is not None and decoder not in world.decoders:
@@ -139,11 +139,6 @@ class TrainState:
         self.progress = TrainingProgress()
         templates = config.terms.templates
         self.stages = [] if templates else [stage.network(config.network) for stage in stages_of(world)]
-        if config.terms.perturbs_predictions and not self.stages[0].has_raw_values:
-            raise UsageError(
-                f"--method {config.method} perturbs the network's raw outputs, and the dense decoder has none: "
-                "use --method sleep, or --reading whole"
-            )
         recipe = config.recipe
         if templates:
             network: nn.Module = template_network(world)

@@ -19,7 +19,7 @@ from curio_train.learning.losses import critic_loss, curiosity_loss, frozen, gra
 from curio_train.learning.parallel import Ranks
 from curio_train.learning.recoloring import recolored
 from curio_train.learning.self_training import SelfTraining
-from curio_train.learning.sleep import SyntheticBatches, scheduled_stage
+from curio_train.learning.sleep import SyntheticBatches, trained_stage
 from curio_train.learning.state import TrainState
 from curio_train.metrics.images import blurred
 from curio_train.networks.base import StageNetwork
@@ -33,13 +33,8 @@ _NUM_PAIRS = 8
 _NUM_WARM_UP = 32
 
 
-def _refuse_to_render(config: RunConfig) -> None:
-    """Refuse a detector in stages whose first stage is not trained, or what its crops cannot teach."""
-    if config.terms.sleep:
-        raise UsageError(
-            f"--method {config.method} needs whole-scene images, and this model trains on crops: "
-            "use --method sleep (or, with linemod, --one-stage)"
-        )
+def _refuse_untrained(config: RunConfig) -> None:
+    """Refuse to render the answers of a detector in stages whose first stage is not trained."""
     if config.init is None:
         raise UsageError(
             f"--method {config.method} teaches the second stage on crops around the first one's answers, which must be "
@@ -76,21 +71,22 @@ class Trainer:
         Args:
             config: What to learn and how.
             world: Draws and renders scenes.
-            sources: Images for each of the world's stages; where predictions are rendered, whole frames.
+            sources: Images for each of the world's stages; where predictions are rendered, whole frames for the first.
             ranks: This process among those that train together.
 
         Raises:
             UsageError: The method cannot train this world, or its network.
         """
         if len(stages_of(world)) > 1 and config.terms.renders_predictions:
-            _refuse_to_render(config)
+            _refuse_untrained(config)
         self.config, self.world, self.ranks = config, world, ranks
         self.state = TrainState(config, world, ranks.device)
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
         self._micro_batches = ranks.micro_batches(self._num_micro)
+        seen = sources
         if isinstance(world, TwoStageWorld) and config.terms.renders_predictions:
-            sources = [sources[0], OwnCrops(world, self.state.stages[0], sources[0], config.seed)]
-        self._stages = [Stage(*parts) for parts in zip(stages_of(world), self.state.stages, sources, strict=True)]
+            seen = [sources[0], OwnCrops(world, self.state.stages[0], sources[0], config.seed)]
+        self._stages = [Stage(*parts) for parts in zip(stages_of(world), self.state.stages, seen, strict=True)]
         network, fraction = self.state.pose.network, config.recipe.self_training
         self.self_training = SelfTraining(
             network, world, fraction, ranks.device, pretrained=config.init is not None, minutes=config.minutes
@@ -110,9 +106,7 @@ class Trainer:
             TrainingError: A loss or a gradient is not finite. The networks are then left as they were.
         """
         terms, critic = self.config.terms, self.state.critic
-        # An image loss teaches the last stage alone, on crops around the answers of the one before.
-        number = -1 if terms.renders_predictions else scheduled_stage(self.world, self.state.progress.step)
-        stage = self._stages[number]
+        stage = self._stages[trained_stage(self.config, self.world, self.state.progress.step)]
         world, network = stage.world, stage.network
         sums: Counter[str] = Counter()
         for learner in self.state.learners.values():
@@ -143,7 +137,7 @@ class Trainer:
                 losses["hypotheses"] = world.code_loss(code, batch.code)
 
             # Sleep: render known codes, predict them.
-            if terms.perturbs_predictions:
+            if terms.perturbs_predictions and network.has_raw_values:
                 true, synthetic = self.synthetic.around(raw, batch.backgrounds, number)
             elif terms.sleep:
                 true, synthetic = self.synthetic.take(number)

@@ -12,7 +12,7 @@ class StageNetwork(nn.Module, ABC):
     encoder: nn.Module
     """Image to features: convolutions, which take most of the time."""
     has_raw_values = True
-    """Whether :meth:`decode` returns raw values, which wake–sleep perturbs."""
+    """Whether :meth:`decode` returns raw values, around which wake–sleep draws scene codes."""
 
     @abstractmethod
     def decode(self, features: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
