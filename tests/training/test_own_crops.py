@@ -14,9 +14,10 @@ from curio_train.networks.base import StageNetwork
 from curio_train.refinement.own_crops import OwnCrops
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds.options import LinemodOptions
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.crop_pose_loss import ASSUMED_DEPTH
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
-from curio_train.worlds.single_object.world import EXPOSURE
+from curio_train.worlds.single_object.world import EXPOSURE, Object
 from torch import Tensor
 
 CONFIG = RunConfig(
@@ -80,6 +81,12 @@ def test_a_detector_whose_first_stage_is_not_trained_is_refused(brick_world: Two
     frames = brick_world.source("train", 0, with_code=False, cache=tmp_path)
     with pytest.raises(UsageError, match="add --init RUN, of --method hypotheses or sleep"):
         Trainer(replace(CONFIG, init=None), brick_world, [frames], Ranks(0, 1, torch.device("cpu")))
+
+
+def test_a_detector_whose_poses_are_those_of_templates_is_refused(brick: Object) -> None:
+    world = SeveralObjectsWorld("bricks", [brick])
+    with pytest.raises(UsageError, match=r"--method our .*templates: use --method sleep"):
+        Trainer(CONFIG, world, [], Ranks(0, 1, torch.device("cpu")))
 
 
 def test_the_exposure_of_crops_is_found(brick_world: TwoStageWorld) -> None:

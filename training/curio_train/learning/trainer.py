@@ -25,7 +25,7 @@ from curio_train.metrics.images import blurred
 from curio_train.networks.base import StageNetwork
 from curio_train.refinement.own_crops import OwnCrops
 from curio_train.scene_code import SceneCode
-from curio_train.worlds.base import Batch, ImageSource, UnlikeWorld, World, stages_of
+from curio_train.worlds.base import Batch, ImageSource, StagedWorld, UnlikeWorld, World, stages_of
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 _SMOOTHING = 0.98  # of the image loss that convergence is judged by: a memory of about 50 steps
@@ -33,8 +33,17 @@ _NUM_PAIRS = 8
 _NUM_WARM_UP = 32
 
 
-def _refuse_untrained(config: RunConfig) -> None:
-    """Refuse to render the answers of a detector in stages whose first stage is not trained."""
+def _check_rendered_stages(config: RunConfig, world: World) -> None:
+    """Refuse detectors in stages whose answers are no poses yet, because an image loss could not teach them.
+
+    Raises:
+        UsageError: Its poses are those of templates, or its first stage is not trained.
+    """
+    if not isinstance(world, TwoStageWorld):
+        raise UsageError(
+            f"--method {config.method} teaches how poses are read, and a detector for several objects reads them by "
+            "templates: use --method sleep, or train one object"
+        )
     if config.init is None:
         raise UsageError(
             f"--method {config.method} teaches the second stage on crops around the first one's answers, which must be "
@@ -77,8 +86,8 @@ class Trainer:
         Raises:
             UsageError: The method cannot train this world, or its network.
         """
-        if len(stages_of(world)) > 1 and config.terms.renders_predictions:
-            _refuse_untrained(config)
+        if isinstance(world, StagedWorld) and config.terms.renders_predictions:
+            _check_rendered_stages(config, world)
         self.config, self.world, self.ranks = config, world, ranks
         self.state = TrainState(config, world, ranks.device)
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
