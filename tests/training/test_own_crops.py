@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from curio_train.config import Recipe, RunConfig
+from curio_train.data.photographs import UnlabelledPhotographs
 from curio_train.errors import UsageError
 from curio_train.learning.parallel import Ranks
 from curio_train.learning.trainer import Trainer
@@ -18,6 +19,7 @@ from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.crop_pose_loss import ASSUMED_DEPTH
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import EXPOSURE, Object
+from PIL import Image
 from torch import Tensor
 
 CONFIG = RunConfig(
@@ -54,6 +56,41 @@ def test_crops_lie_around_first_answers(brick_world: TwoStageWorld, tmp_path: Pa
     assert object_pixels.median() > 0.05  # the object's diameter spans 0.6 of the side
     assert (batch.given[ASSUMED_DEPTH] > 0.3).all()
     assert torch.equal(source.batch(0, 16).images, batch.images)
+
+
+class Files:
+    """Photographs."""
+
+    def __init__(self, paths: list[Path]) -> None:
+        self.paths = paths
+
+    def unlabelled_paths(self) -> list[Path]:
+        return self.paths
+
+    def unlabelled(self) -> UnlabelledPhotographs:
+        raise AssertionError("nobody asks for camera poses")
+
+
+def test_backgrounds_of_photographs_are_what_surrounds_the_object(brick: Object, tmp_path: Path) -> None:
+    world = TwoStageWorld("linemod", brick)
+    frames = world.source("train", 0, with_code=True, cache=tmp_path)
+    shown = [frames.batch(number, 1) for number in range(4)]
+    position_m = torch.cat([batch.code[TRANSLATION] for batch in shown if batch.code is not None])
+    grey = torch.full((1, 3, 480, 640), 0.5)
+    paths = []
+    for number, batch in enumerate(shown):
+        assert batch.code is not None
+        pixels = (world.render(batch.code, grey)[0].permute(1, 2, 0).clamp(0, 1) * 255).byte().numpy()
+        paths.append(tmp_path / f"{number}.png")
+        Image.fromarray(pixels).save(paths[-1])
+    world = TwoStageWorld("linemod", brick, Files(paths))
+    asked = Knowing(torch.cat([position_m, position_m]))  # for the frames, then for the photographs
+    source = OwnCrops(world, asked, frames, 0, photographed=0.5, num_frames=4)
+    batch = source.batch(0, 16)
+    assert batch.backgrounds is not None
+    behind, differing = batch.backgrounds[:8], (batch.images - batch.backgrounds).abs().amax(1) > 0.02
+    assert (behind - 0.5).abs().max() < 0.1  # the wall, not the object
+    assert differing[:8].float().mean((1, 2)).median() > 0.05  # which the crops show
 
 
 @pytest.mark.parametrize(

@@ -130,6 +130,9 @@ class OnePhotographEach:
     def __init__(self, paths: list, cameras: CameraPoses | None) -> None:
         self._found = UnlabelledPhotographs(paths, cameras)
 
+    def unlabelled_paths(self) -> Sequence:
+        return self._found.paths
+
     def unlabelled(self) -> UnlabelledPhotographs:
         return self._found
 

@@ -142,6 +142,9 @@ class Photographs:
     def __init__(self, paths: list[Path]) -> None:
         self.paths = paths
 
+    def unlabelled_paths(self) -> list[Path]:
+        return self.paths
+
     def unlabelled(self) -> UnlabelledPhotographs:
         return UnlabelledPhotographs(self.paths)
 

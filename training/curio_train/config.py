@@ -163,9 +163,10 @@ class Recipe:
     """Fraction of wake–sleep's scene codes that is drawn from the world's known range instead of around predictions;
     --method sleep draws all of them, and so does wake–sleep where the decoder is dense or reads crops."""
     self_training: float = 0.0
-    """Fraction of the crop-pose stage's images that are crops of photographs. Their pseudo-labels are the network's own
-    poses, refined by render-and-compare. Mixed in during the last two fifths of a run with --method sleep, or the last
-    four where it began with trained weights (--init); 0: none. Only where a world has photographs."""
+    """Fraction of the crop-pose stage's images that are crops of photographs; 0: none. Only where a world has
+    photographs. An image loss compares renderings with them from the start. For --method sleep, their pseudo-labels are
+    the network's own poses, refined by render-and-compare, and they are mixed in during the last two fifths of a run
+    (the last four where it began with trained weights, --init)."""
     gradient_clip: float = 0.5
     """Largest L2 norm of a step's gradient, of the network and of the critic each."""
     precision: Literal["float32", "bfloat16"] = "float32"

@@ -95,7 +95,8 @@ def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[s
     supervision = [text for term, text in _SUPERVISION.items() if getattr(terms, term)] or ["none: images alone"]
     if made.pretrained:
         supervision.append(_PRETRAINED)
-    if made.config.recipe.self_training and (photos := getattr(made.config.world, "photos", None)):
+    shows_photographs = made.config.recipe.self_training and (terms.sleep or terms.renders_predictions)
+    if shows_photographs and (photos := getattr(made.config.world, "photos", None)):
         supervision.append(
             f"what the network itself found in the photographs of `{photos.name}`, no label of which was opened"
         )

@@ -94,9 +94,10 @@ class Trainer:
         self._micro_batches = ranks.micro_batches(self._num_micro)
         seen = sources
         if isinstance(world, TwoStageWorld) and config.terms.renders_predictions:
-            seen = [sources[0], OwnCrops(world, self.state.stages[0], sources[0], config.seed)]
+            crops = OwnCrops(world, self.state.stages[0], sources[0], config.seed, config.recipe.self_training)
+            seen = [sources[0], crops]
         self._stages = [Stage(*parts) for parts in zip(stages_of(world), self.state.stages, seen, strict=True)]
-        network, fraction = self.state.pose.network, config.recipe.self_training
+        network, fraction = self.state.pose.network, config.recipe.self_training if config.terms.sleep else 0.0
         self.self_training = SelfTraining(
             network, world, fraction, ranks.device, pretrained=config.init is not None, minutes=config.minutes
         )

@@ -70,13 +70,21 @@ class CapturePhotographs:
         paths = spread(self._split[0], count)
         return paths, self._read(paths)
 
+    def unlabelled_paths(self) -> Sequence[Path]:
+        """Files of the others, which the model may learn from.
+
+        Raises:
+            DataError: The folder cannot be read.
+        """
+        return spread(self._split[1], MAX_UNLABELLED)
+
     def unlabelled(self) -> UnlabelledPhotographs:
         """The others, for self-training.
 
         Raises:
             DataError: The folder cannot be read.
         """
-        return UnlabelledPhotographs(spread(self._split[1], MAX_UNLABELLED))
+        return UnlabelledPhotographs(self.unlabelled_paths())
 
     def background_image(self) -> Tensor | None:
         """The empty scene, [3, height, width] in [0, 1], if there is a photograph of it.

@@ -52,6 +52,14 @@ class LinemodPhotographs:
         self._folder, self._camera, self._views = folder, camera, views
         self._unlabelled: UnlabelledPhotographs | None = None
 
+    def unlabelled_paths(self) -> Sequence[Path]:
+        """Files of the frames.
+
+        Raises:
+            DataError: The folder cannot be read.
+        """
+        return spread(Photographs(self._folder).paths, MAX_UNLABELLED)
+
     def unlabelled(self) -> UnlabelledPhotographs:
         """The frames; the poses of their cameras are recovered once.
 
@@ -59,7 +67,7 @@ class LinemodPhotographs:
             DataError: The folder cannot be read.
             CameraError: The file of camera poses cannot be used.
         """
-        paths = spread(Photographs(self._folder).paths, MAX_UNLABELLED)
+        paths = self.unlabelled_paths()
         if self._unlabelled is None or self._unlabelled.paths != paths:
             self._unlabelled = UnlabelledPhotographs(paths, self._camera_poses(paths))
         return self._unlabelled

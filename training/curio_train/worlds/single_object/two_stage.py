@@ -32,8 +32,15 @@ STAGE_SCHEDULE, STAGE_SCHEDULE_IN_KNOWN_SCENE = (0, 1, 1), (0, 1, 1, 1, 1)
 class TrainingPhotographs(Protocol):
     """Photographs of a world's object."""
 
+    def unlabelled_paths(self) -> Sequence[Path]:
+        """Files of the photographs that a network may learn from.
+
+        Raises:
+            DataError: The folder of photographs cannot be read.
+        """
+
     def unlabelled(self) -> UnlabelledPhotographs:
-        """The photographs that self-training may use.
+        """The photographs that a network may learn from, and their cameras.
 
         Raises:
             DataError: The folder of photographs cannot be read.
