@@ -1,15 +1,20 @@
 """What a finished run leaves beside itself: a report, and of one's own part a model that can be served."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from curio_train.config import RunConfig
 from curio_train.errors import CurioError, ExportError
+from curio_train.second_process import SecondProcess
 from curio_train.worlds.options import CaptureOptions
 
 if TYPE_CHECKING:
+    from onnx import ModelProto
+
     from curio_train.export.ahead import TracingAhead
+    from curio_train.export.graph import Graph
 
 MODELS_FOLDER = "models"
 """In the folder of a run of one's own part: its exported models."""
@@ -25,7 +30,7 @@ def end(
         config: Its configuration.
         cache: Where worlds keep their image sets.
         warn: Called with the reason if the report could not be made; the run has succeeded all the same.
-        ahead: Traces the graph of its model, if that was begun before.
+        ahead: Traces the graph of its model, if that was begun before. A further process then makes the report.
 
     Returns:
         How to go on, for the user.
@@ -35,33 +40,50 @@ def end(
     """
     from curio_train.evaluation.reporting.report import REPORT_FILE, report_training
 
-    verdict = ""
+    if isinstance(config.world, CaptureOptions) and ahead is not None:
+        with SecondProcess(report_training, run, cache) as reporting:
+            told = functools.cache(lambda: _told(reporting.result, warn))
+            return _exported(run, config.world.camera, told, ahead.model)
     try:
         verdict = report_training(run, cache)
     except CurioError as exc:
-        warn(str(exc))
-    if not isinstance(config.world, CaptureOptions):
-        return (
-            f"to see what it learned: {run / REPORT_FILE}, or curio-view {run}\n"
-            f"to serve it: curio-export {run} --out models/, then curio-serve models/"
-        )
-    return _exported(run, config.world.camera, verdict, ahead)
+        verdict = _told(exc, warn)
+    if isinstance(config.world, CaptureOptions):
+        return _exported(run, config.world.camera, lambda: verdict)
+    return (
+        f"to see what it learned: {run / REPORT_FILE}, or curio-view {run}\n"
+        f"to serve it: curio-export {run} --out models/, then curio-serve models/"
+    )
 
 
-def _exported(run: Path, camera: Path, verdict: str, ahead: "TracingAhead | None") -> str:
+def _told(verdict: str | CurioError, warn: Callable[[str], None]) -> str:
+    if isinstance(verdict, str):
+        return verdict
+    warn(str(verdict))
+    return ""
+
+
+def _exported(
+    run: Path, camera: Path, verdict: Callable[[], str], traced: "Callable[[Graph], ModelProto | None]" = lambda _: None
+) -> str:
     from curio_train.export.graph import export
+
+    def model(graph: "Graph") -> "ModelProto | None":
+        verdict()  # the model's card, which is written next, quotes the report
+        return traced(graph)
 
     models = run / MODELS_FOLDER
     try:
-        done = export(run, models) if ahead is None else export(run, models, ahead=ahead.model)
+        done = export(run, models, ahead=model)
     except CurioError as exc:
         raise ExportError(
             f"{run} is trained and whole, but no model could be made of it: {exc}. Once that is put right: "
             f"curio-export {run} --out {models}"
         ) from exc
+    said = verdict()
     return (
         f"{done.path}: the model, {done.num_bytes / 1e6:.1f} MB; what it finds in the photographs: {run}/report.html\n"
-        + (f"by its photographs, without labels: {verdict}\n" if verdict else "")
+        + (f"by its photographs, without labels: {said}\n" if said else "")
         + f"to serve it: curio-serve {models}\n"
         f"to try it:   curio-detect {done.path.parent} PHOTOS --camera {camera} --out poses.jsonl --overlays overlays/"
     )
