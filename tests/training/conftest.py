@@ -15,7 +15,7 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress, TrainState
 from curio_train.meshes.shapes import box
-from curio_train.worlds import build
+from curio_train.worlds import build, image_sets
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.options import CirclesOptions
 from curio_train.worlds.single_object import confidence
@@ -59,6 +59,12 @@ def circles_models(tmp_path_factory: pytest.TempPathFactory, circles_run: Path) 
     """That run exported in float32 (version 1) and in float16 (version 2); copy the folder before you change it."""
     models = tmp_path_factory.mktemp("out") / "models"
     return export(circles_run, models), export(circles_run, models, half=True)
+
+
+@pytest.fixture
+def small_image_sets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stored image sets of 100 and 50 images instead of 2,000 and 500, which take ten seconds to draw."""
+    monkeypatch.setattr(image_sets, "NUM_IMAGES", {"train": 100, "validation": 50, "test": 50})
 
 
 @pytest.fixture

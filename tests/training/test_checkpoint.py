@@ -24,7 +24,7 @@ from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions, LinemodOptions
 from torch import Tensor
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "small_image_sets")
 
 CONFIG = RunConfig(
     CirclesOptions(),

@@ -32,7 +32,7 @@ CONFIG = RunConfig(
 Fault = Literal["kill", "full disk"]
 _FAULT_STATUS = 3
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "small_image_sets")
 
 
 def _train(path: Path, cache: Path, num_images: int, *, resume: bool = True) -> None:

@@ -25,6 +25,8 @@ from torch import Tensor
 
 CONFIG = RunConfig(CirclesOptions(), method="noncur")
 
+pytestmark = pytest.mark.usefixtures("small_image_sets")
+
 
 @pytest.fixture
 def run(circles_run: Path) -> Path:
