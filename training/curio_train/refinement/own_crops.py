@@ -34,7 +34,6 @@ from curio_train.worlds.single_object.two_stage import TwoStageWorld
 _A_FRAME = 8
 """Crops of each frame, around answers as wrong again as the crop-pose stage has to bear."""
 
-
 _MARGIN_PX = 1.0
 """Pixels at an object's outline show it, too."""
 
