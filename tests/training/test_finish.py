@@ -1,0 +1,26 @@
+"""What a run of one's own part leaves beside itself where a second process makes the report."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from curio_train.commands.finish import end
+from curio_train.export.ahead import TracingAhead
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.worlds.options import CaptureOptions
+
+
+@pytest.mark.parametrize("is_writable", [True, False])
+def test_the_report_is_made_beside_the_model(circles_run: Path, tmp_path: Path, is_writable: bool) -> None:
+    run, warnings = tmp_path / "run", list[str]()
+    shutil.copytree(circles_run, run)
+    if not is_writable:
+        (run / "report.html").mkdir()
+    made = RunFolder.open(run).config
+    part = CaptureOptions(mesh=(tmp_path / "part.stl",), camera=tmp_path / "camera.json", photos=tmp_path)
+    told = end(run, replace(made, world=part), tmp_path / "cache", warnings.append, TracingAhead(made))
+    assert f"curio-serve {run / 'models'}" in told
+    assert (run / "models" / "circles" / "1" / "model.onnx").is_file()
+    assert (run / "report.html").is_file() == is_writable
+    assert [str(run / "report.html") in warning for warning in warnings] == [True] * (not is_writable)
