@@ -4,7 +4,7 @@
 
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
-10c6bff; models/lmo/4 has seen them), and no label of a frame is opened in training. What is finished is kept, a run
+10c6bff; models/lmo/5 has seen them), and no label of a frame is opened in training. What is finished is kept, a run
 that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, by one read, by
 nine, and by one and three of the model that ``curio-export --fast`` makes; as served, and refined by
 render-and-compare.

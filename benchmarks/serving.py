@@ -21,9 +21,8 @@ goodput_at_3x     good answers a second while three times the saturating rate is
 For these latencies and goodputs the server has one half of the cores and the load generator the other, so that making
 load does not pass for the server's weakness. ``offered_over_peak`` says what load was really made.
 
-objects8_frame_ms  CPU time a frame of models/lmo, which reads eight objects, served with one worker;
-                   ``bare_objects8_frame_ms`` of the bare loop; ``fast_objects8_frame_ms`` and
-                   ``bare_fast_objects8_frame_ms`` of models/lmo-fast
+objects8_frame_ms  CPU time a frame of models/lmo, served with one worker, all of its eight objects;
+                   ``objects1_frame_ms`` one asked for by name; ``fast_…`` of models/lmo-fast, ``bare_…`` bare
 
 With ``--peers``, other servers around the same decoding, warp and session stand beside ours under ``peers``, each with
 its version, the CPU time a request of all its processes, the answers a second at concurrency 4 with the load generator
@@ -62,6 +61,7 @@ from load.generator import (
     bare_latencies_ms,
     closed_loop,
     closed_loop_of,
+    cpu_s,
     make_frames,
     open_loop,
     pose_target,
@@ -72,8 +72,9 @@ from load.peers import all_peers, installed_version, prepare, running_peer
 _START_LIMIT_S = 60.0
 _WARM_UP_S = 2.0
 _TIGHT_DEADLINE_S = 0.1
-_OBJECTS8 = {"objects8": Path("models/lmo"), "fast_objects8": Path("models/lmo-fast")}
-_OBJECTS8_CALLS, _OBJECTS8_DEADLINE_S = 10, 60.0
+_SEVERAL = {"": Path("models/lmo"), "fast_": Path("models/lmo-fast")}
+_ASKED_FOR: dict[str, Sequence[str]] = {"objects8": (), "objects1": ("ape",)}
+_SEVERAL_CALLS, _SEVERAL_DEADLINE_S = 10, 60.0
 
 
 @dataclass(frozen=True)
@@ -101,8 +102,8 @@ def main() -> None:
         figures = {"ready_s": round(statistics.median(start_time_s(models) for _ in range(3)), 3)}
         figures |= cost(models, frames, arguments)
         figures |= limits(models, frames, arguments.seconds)
-        for name, model in _OBJECTS8.items():
-            figures |= eight_objects(name, model, frames, arguments.seconds)
+        for name, model in _SEVERAL.items():
+            figures |= several_objects(name, model, frames, arguments.seconds)
         if arguments.peers:
             figures["peers"] = beside_peers(models, frames, arguments.seconds)
     if arguments.json:
@@ -176,20 +177,21 @@ def limits(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any]:
     }
 
 
-def eight_objects(name: str, model: Path, frames: list[bytes], seconds: float) -> dict[str, float]:
-    """CPU time a frame of a shipped model of eight objects, served and bare."""
-    core = sorted(os.sched_getaffinity(0))[:1]
-    with tempfile.TemporaryDirectory() as folder:
+def several_objects(name: str, model: Path, frames: list[bytes], seconds: float) -> dict[str, float]:
+    """CPU time a frame of a shipped model of eight objects, served and bare, all of them and one."""
+    core, found = sorted(os.sched_getaffinity(0))[:1], {}
+    with tempfile.TemporaryDirectory() as folder, worker(core) as load, worker(core) as bare:
         shutil.copytree(model, Path(folder) / model.name)
-        with running_server(Path(folder), core) as (address, pid), worker(core) as load:
-            target = pose_target(address, frames, pid, model=model.name)
-            load(closed_loop_of, target, 1, 1, _OBJECTS8_DEADLINE_S)
-            before_s = cpu_s(pid)
-            load(closed_loop_of, target, 1, _OBJECTS8_CALLS, _OBJECTS8_DEADLINE_S)
-            served_ms = 1000 * (cpu_s(pid) - before_s) / _OBJECTS8_CALLS
-    with worker(core) as bare:
-        bare_ms = bare(bare_cpu_ms, model, frames, 1, seconds)
-    return {f"{name}_frame_ms": round(served_ms, 3), f"bare_{name}_frame_ms": round(bare_ms, 3)}
+        for asked, objects in _ASKED_FOR.items():
+            with running_server(Path(folder), core) as (address, pid):
+                target = pose_target(address, frames, pid, model=model.name, objects=objects)
+                load(closed_loop_of, target, 1, 1, _SEVERAL_DEADLINE_S)
+                before_s = cpu_s(pid)
+                load(closed_loop_of, target, 1, _SEVERAL_CALLS, _SEVERAL_DEADLINE_S)
+                served_ms = 1000 * (cpu_s(pid) - before_s) / _SEVERAL_CALLS
+            found[f"{name}{asked}_frame_ms"] = round(served_ms, 3)
+            found[f"bare_{name}{asked}_frame_ms"] = round(bare(bare_cpu_ms, model, frames, 1, seconds, objects), 3)
+    return found
 
 
 def beside_peers(models: Path, frames: list[bytes], seconds: float) -> dict[str, dict[str, Any]]:
@@ -289,12 +291,6 @@ def worker(cores: Sequence[int]) -> Iterator[Callable[..., Any]]:
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, spawn, os.sched_setaffinity, (0, cores)) as pool:
         yield lambda function, *arguments: pool.submit(function, *arguments).result()
-
-
-def cpu_s(pid: int) -> float:
-    """User and system time that a process has used, all threads."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def memory_mb(pid: int) -> tuple[float, float]:

@@ -2,9 +2,10 @@
 
 import asyncio
 import math
+import os
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,16 +35,17 @@ def make_frames(num_frames: int = 24) -> list[bytes]:
     return frames
 
 
-def bare_loop(model_folder: Path) -> Callable[[bytes], None]:
-    """Decode, warp and session alone, for one frame; called from several threads."""
+def bare_loop(model_folder: Path, objects: Sequence[str] = ()) -> Callable[[bytes], None]:
+    """Decode, warp and session alone, for one frame and the objects asked for (none: all); for several threads."""
     from curio_serve.imaging.camera import PinholeCamera
     from curio_serve.imaging.image import decode, open_header
     from curio_serve.imaging.view import PinholeFrame, Region
     from curio_serve.models.detector import Detector
+    from curio_serve.models.model import answering
     from curio_serve.models.model_folder import open_model
 
     cv2.setNumThreads(1)
-    model = open_model(model_folder)
+    (model,) = answering([open_model(model_folder)], objects)
     camera, region = PinholeCamera(K), Region(0, 0, WIDTH, HEIGHT)
     detector = Detector(model)
 
@@ -57,9 +59,11 @@ def bare_loop(model_folder: Path) -> Callable[[bytes], None]:
     return one
 
 
-def bare_cpu_ms(model_folder: Path, frames: list[bytes], num_threads: int, seconds: float) -> float:
+def bare_cpu_ms(
+    model_folder: Path, frames: list[bytes], num_threads: int, seconds: float, objects: Sequence[str] = ()
+) -> float:
     """CPU milliseconds a frame of the bare loop, in as many threads as the server has workers."""
-    one = bare_loop(model_folder)
+    one = bare_loop(model_folder, objects)
 
     def work_until(end: float) -> int:
         num_done = 0
@@ -101,6 +105,12 @@ def bare_folder(model_folder: str, frames: str, num_threads: str) -> None:
             pass
 
 
+def cpu_s(pid: int) -> float:
+    """User and system time that a process has used, all threads."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 @dataclass(frozen=True)
 class Target:
     """A server and the calls that are put on it.
@@ -118,13 +128,15 @@ class Target:
     processes: tuple[int, ...] = ()
 
 
-def pose_target(address: str, frames: list[bytes], *processes: int, model: str = MODEL) -> Target:
+def pose_target(
+    address: str, frames: list[bytes], *processes: int, model: str = MODEL, objects: Sequence[str] = ()
+) -> Target:
     """``Detect`` calls with these frames."""
     from curio_proto.v1.detector_pb2 import Camera, DetectRequest, ModelSelector
 
     camera, models = Camera(camera_matrix=K.ravel()), [ModelSelector(name=model)]
-    requests = [DetectRequest(models=models, camera=camera, encoded=frame).SerializeToString() for frame in frames]
-    return Target(address, _METHOD, requests, processes)
+    requests = [DetectRequest(models=models, camera=camera, encoded=frame, objects=objects) for frame in frames]
+    return Target(address, _METHOD, [request.SerializeToString() for request in requests], processes)
 
 
 def closed_loop(target: Target, concurrency: int, seconds: float) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from curio_train.camera import Intrinsics
 from curio_train.config import RunConfig, WorldOptions
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.export import graph
-from curio_train.export.graph import Exported, export
+from curio_train.export.write_model import Exported, export
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress, TrainState

@@ -18,8 +18,9 @@ from curio_train.errors import CheckpointError, ExportError, UsageError
 from curio_train.export.ahead import TracingAhead
 from curio_train.export.card import EVALUATION_FILE, Provenance, card, portable
 from curio_train.export.folder import ModelFolder
-from curio_train.export.graph import Exported, Graph, check_images, export
+from curio_train.export.graph import Graph, check_images
 from curio_train.export.parity import largest_difference, refuse_disparity
+from curio_train.export.write_model import Exported, export
 from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import this_session
@@ -160,7 +161,7 @@ def test_versions_stand_beside_each_other(single: Exported, half: Exported, mode
 def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Exported, tmp_path: Path) -> None:
     spec = ExportedModel.open(single.path / "model.onnx").spec
     config, progress = RunConfig(CirclesOptions(), method="noncur"), TrainingProgress(step=2, images=64, seconds=1.5)
-    made = Provenance(tmp_path, config, [this_session()], progress, "float32", pretrained=False)
+    made = Provenance(tmp_path, config, [this_session()], progress, "float32", pretrained=False, chooses=True)
     result = {"split": "test", "num_images": 500, "metrics": {"position_px": 1.25}, "untrained": {"position_px": 40.0}}
     for images_seen, quoted in ((32, False), (64, True)):
         (tmp_path / EVALUATION_FILE).write_text(json.dumps(result | {"images_seen": images_seen}))
@@ -168,6 +169,7 @@ def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Expor
         assert ("| position_px | 1.25 | 40 |" in text) == quoted
         assert ("had not scored it" in text) != quoted
         assert "real frames" not in text
+        assert "| input | `slots`, int64 [wanted]: which rows" in text
     real = {"dataset": "lmo", "split_name": "bop19 targets", "num_targets": 89, "metrics": {"add_recall": 0.25}}
     for refined, column in (({}, "–"), ({"refined": {"real": {"metrics": {"add_recall": 0.5}}}}, "0.5")):
         found = result | {"images_seen": 64, "real": real} | refined

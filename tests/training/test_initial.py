@@ -11,7 +11,7 @@ import torch
 from curio_train.config import NetworkConfig, RunConfig
 from curio_train.errors import CheckpointError, CurioError, UsageError
 from curio_train.export.card import EVALUATION_FILE
-from curio_train.export.graph import Exported, export
+from curio_train.export.write_model import Exported, export
 from curio_train.exported_model import ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.initial import begin_with, method_before, uses_synthetic_labels

@@ -12,9 +12,10 @@ from curio_train.commands import export as export_command
 from curio_train.errors import ExportError
 from curio_train.evaluation import int8 as reduction
 from curio_train.evaluation.scores import accuracy
-from curio_train.export import graph, int8
-from curio_train.export.graph import Exported, Graph, export
+from curio_train.export import int8, write_model
+from curio_train.export.graph import Graph
 from curio_train.export.onnx import to_onnx
+from curio_train.export.write_model import Exported, export
 from curio_train.exported_model import ExportedModel
 from curio_train.scene_code import TRANSLATION
 from curio_train.worlds.generated.circles import Circles
@@ -120,7 +121,7 @@ def test_stored_answers_do_not_hang_on_how_float32_is_rounded(
         found = ExportedModel(other.SerializeToString(), "rounded otherwise")(torch.from_numpy(golden["image"][None]))
         assert np.nanmax(np.abs(found[TRANSLATION][0].numpy() - stored)) <= 5e-4
 
-    monkeypatch.setattr(graph, "_LARGEST_STEP", 1e-5)  # the network has learned nothing, and says hardly anything
+    monkeypatch.setattr(write_model, "_LARGEST_STEP", 1e-5)  # the network has learned nothing, and says hardly anything
     monkeypatch.setattr(int8, "_ROUNDING", (-1.0,))  # all that is quantised is 0
     with pytest.raises(ExportError, match="every answer to check images hangs on rounding"):
         export(circles_run, models, reduce=reduce)

@@ -11,7 +11,7 @@ from curio_train.commands.prepare import prepared
 from curio_train.commands.train import parse
 from curio_train.config import RunConfig
 from curio_train.errors import CameraError, DataError, UsageError
-from curio_train.export.graph import export
+from curio_train.export.write_model import export
 from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION

@@ -1,11 +1,14 @@
 """Templates learn how an object looks from photographs whose poses are known."""
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
+from curio_train.export.crop_stage import num_choosable
+from curio_train.export.onnx import to_onnx
 from curio_train.geometry import Pose
 from curio_train.meshes.shapes import chair
 from curio_train.networks.crop_camera import cut_crops
@@ -14,6 +17,7 @@ from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS, NUM_VIEWS
+from curio_train.networks.templates.reader import PoseReader
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
 from curio_train.refinement.photographed_confidence import Evidence, calibrate_by, read_by_others
 from curio_train.refinement.scene_labels import SceneLabels
@@ -75,7 +79,7 @@ def agreement(network: ObjectsNetwork, frame: torch.Tensor, pose: Pose) -> tuple
     shown = banks.points_of(0)[number][None], banks.described(0)[number][None]
     found = align(FeatureMaps.of(banks.fine_of(0, fine)), torch.tensor([0]), *shown, start, focal_px, 0)
     both = coarse[:, None, None].expand(-1, 2, -1, -1, -1, -1)
-    return float(found.score), float(banks.match(both)[0, 0, 0, number, 0])
+    return float(found.score), float(banks.match(both, torch.arange(2))[0, 0, 0, 0, number])
 
 
 def test_what_a_photograph_shows_is_learned_and_the_rest_stays(world: SeveralObjectsWorld) -> None:
@@ -115,6 +119,38 @@ def test_a_network_that_looks_less_reads_each_frame_alone_as_among_others(world:
         assert values.isfinite().all()
         torch.testing.assert_close(values[1:], alone[name], atol=1e-3, rtol=1e-3)
     assert not torch.equal(both["translation_m"], thorough["translation_m"])
+
+
+class _Graph(torch.nn.Module):
+    """The network with a camera's pixels and the wanted slots as its inputs, as an export has them."""
+
+    def __init__(self, network: ObjectsNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: torch.Tensor, slots: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(self.network(image.permute(0, 3, 1, 2).float() / 255, slots).values())
+
+
+def test_the_exported_graph_equals_torch_whichever_objects_are_asked_for(world: SeveralObjectsWorld) -> None:
+    network = with_random_templates(world)
+    steps = PoseReader(network.geometries, (1, 0, 0))
+    steps.load_state_dict(network.reader.state_dict())
+    network.reader = steps
+    network.look_less()
+    graph, names = _Graph(network).eval(), ["translation_m", "rotation_6d", "light", "confidence"]
+    assert num_choosable(network) == 2
+    session = onnxruntime.InferenceSession(to_onnx(graph, 640, 480, names, num_slots=2).SerializeToString())
+    coarse = torch.rand(3, 3, 60, 80, generator=torch.Generator().manual_seed(2))
+    smooth = torch.nn.functional.interpolate(coarse, (480, 640), mode="bicubic").clamp(0, 1)
+    images = (255 * smooth).round().byte().permute(0, 2, 3, 1).contiguous()
+    for batch, slots in ((3, None), (3, [0, 1]), (2, [1, 0]), (1, [0]), (3, [1])):
+        given = {"image": images[:batch].numpy()} | ({} if slots is None else {"slots": np.array(slots)})
+        with torch.no_grad():
+            expected = dict(zip(names, graph(images[:batch], torch.tensor(slots or [0, 1])), strict=True))
+        assert expected["translation_m"].shape == (batch, len(slots or [0, 1]), 3)
+        for name, found in zip(names, session.run(names, given), strict=True):
+            torch.testing.assert_close(torch.from_numpy(found), expected[name], atol=1e-3, rtol=1e-3)
 
 
 def test_confidence_is_calibrated_by_photographs_that_agree_and_templates_stay(world: SeveralObjectsWorld) -> None:

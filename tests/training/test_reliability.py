@@ -15,7 +15,7 @@ from curio_serve.models.model_folder import open_model
 from curio_train.errors import ExportError
 from curio_train.evaluation.reliability import Answers, coverage, fit_reliability, held_out_answers, pose_errors
 from curio_train.export.folder import ModelFolder
-from curio_train.export.graph import Exported
+from curio_train.export.write_model import Exported
 from curio_train.geometry import Pose
 from curio_train.metrics.conformal import conformal_quantile, error_bounds, sure_from
 from curio_train.scene_code import CONFIDENCE, SceneCode

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 from curio_train.errors import ExportError
-from curio_train.export.graph import Graph, _golden, numerically_stable
+from curio_train.export.graph import Graph, numerically_stable
+from curio_train.export.write_model import _golden
 from curio_train.scene_code import CONFIDENCE, LIGHT, TRANSLATION
 from curio_train.worlds.generated.circles import Circles
 

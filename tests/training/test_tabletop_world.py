@@ -15,7 +15,7 @@ from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, UsageError
 from curio_train.evaluation.evaluate import evaluate
 from curio_train.evaluation.unlabelled.photographed import judge
-from curio_train.export.graph import export
+from curio_train.export.write_model import export
 from curio_train.geometry import Pose, camera_looking_at
 from curio_train.learning.parallel import ranks
 from curio_train.learning.runs.configuration import load_config

@@ -21,6 +21,7 @@ from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError
 from curio_serve.imaging import image
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
+from curio_serve.models.model import answering
 from curio_serve.models.repository import Repository
 from curio_serve.rigs.detect_views import detect_views
 from curio_serve.telemetry import Metrics
@@ -232,7 +233,7 @@ class PoseService(PoseDetectorServicer):
         found = [self._repository.get(model.name, model.version) for model in models]
         if len(set(found)) < len(found):
             raise ArgumentError("models names a model more than once; expected each once")
-        return [Detector(model, num_reads) for model in found]
+        return [Detector(model, num_reads) for model in answering(found, request.objects)]
 
 
 def _check_following(request: messages.DetectRequest, following: FollowingStream | None) -> FollowingStream:

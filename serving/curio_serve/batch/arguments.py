@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from curio_serve.cores import num_cores
+from curio_serve.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,9 @@ class DetectArguments:
     overlays: Path | None = None
     """Folder for pictures with contours and axes drawn in, laid out like the images; with boxes where no mesh is known
     (--mesh)."""
+    objects: str | None = None
+    """Kinds of objects to look for, with commas: ape,can. None: all that the model knows. A model of several objects
+    spends no time on the others."""
     min_confidence: float = 0.0
     """Leave out detections below, 0 to 1. Those below the model's own threshold say that they are unsure."""
     max_detections: int | None = None
@@ -91,3 +95,15 @@ class DetectArguments:
     """Our own certificate (PEM), for a server that asks for one."""
     tls_key: Path | None = None
     """Key of our certificate (PEM)."""
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """The names in ``--objects``.
+
+        Raises:
+            UsageError: One of them is empty.
+        """
+        names = [] if self.objects is None else [name.strip() for name in self.objects.split(",")]
+        if not all(names):
+            raise UsageError(f"--objects {self.objects}: expected names with commas between them, such as ape,can")
+        return tuple(dict.fromkeys(names))

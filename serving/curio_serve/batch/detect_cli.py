@@ -186,6 +186,7 @@ def _settings(arguments: DetectArguments) -> "Settings":
         arguments.frame_rate,
         arguments.max_instances,
         arguments.reads,
+        arguments.object_names,
     )
 
 
@@ -213,6 +214,7 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
     from curio_serve.batch.named_models import SERVED_MODEL
     from curio_serve.models.model_folder import open_model
     from curio_serve.models.runtime import Runtime, read_providers
+    from curio_serve.models.spec import check_known
 
     found: list[Estimator] = []
     for model in models:
@@ -221,7 +223,7 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
             try:
                 found.append(LocalEstimator(open_model(model, runtime), settings))
             except ArgumentError as exc:
-                raise UsageError(f"--reads: {exc}") from exc
+                raise UsageError(f"MODEL {model}: {exc}") from exc
             continue
         served = SERVED_MODEL.fullmatch(model)
         if served is None:
@@ -231,7 +233,14 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
             )
         if arguments.provider != DetectArguments.provider:
             raise UsageError(f"--provider {arguments.provider}: found a model on a server, which chooses its own")
-        found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
+        try:
+            found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
+        except ArgumentError as exc:
+            raise UsageError(f"MODEL {model}: {exc}") from exc
+    try:
+        check_known([estimator.spec for estimator in found], settings.objects)
+    except ArgumentError as exc:
+        raise UsageError(f"--objects: {exc}") from exc
     return found
 
 

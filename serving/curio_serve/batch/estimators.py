@@ -28,6 +28,7 @@ from curio_serve.imaging.overlay import draw
 from curio_serve.imaging.silhouette import Surface
 from curio_serve.models.detector import Detector
 from curio_serve.models.model import Model, canonical_camera
+from curio_serve.models.spec import wanted_slots
 from curio_serve.tracking.stream import FollowingStream
 
 if TYPE_CHECKING:
@@ -62,6 +63,8 @@ class Settings:
     """Largest number of instances of each kind of object; None: as many as one run of the network gives."""
     num_reads: int = 1
     """How often each image is read."""
+    objects: tuple[str, ...] = ()
+    """Kinds of objects that are looked for; none: all that a model knows."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +237,7 @@ class LocalEstimator(Estimator):
     """Runs a model in this process."""
 
     def __init__(self, model: Model, settings: Settings) -> None:
+        model = model.of(settings.objects) if settings.objects else model
         super().__init__(model.name, model.version, model.spec, settings)
         self._detector = Detector(model, settings.num_reads)
         self._following, self._stream, self._num_frames = FollowingStream(), "", 0
@@ -305,6 +309,8 @@ class RemoteEstimator(Estimator):
     def __init__(self, client: "PoseClient", model: str, settings: Settings, *, timeout_s: float = 5.0) -> None:
         found = client.get_model(model, timeout_s=timeout_s)
         super().__init__(model.partition("/")[0], found.version, found.spec, settings)
+        if settings.objects:
+            wanted_slots(found.spec, model, settings.objects)  # soon, not with the first image
         self._client = client
 
     def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> Seen:
@@ -320,6 +326,7 @@ class RemoteEstimator(Estimator):
             max_detections=self.settings.max_detections,
             max_instances=self.settings.max_instances,
             reads=self.settings.num_reads if self.settings.num_reads > 1 else None,
+            objects=self.settings.objects,
         )
         camera = camera or self.canonical.for_frame(answer.width, answer.height)
         spent = answer.milliseconds

@@ -23,7 +23,7 @@ from curio_serve.batch.results.result_file import ResultFile
 from curio_serve.errors import ArgumentError, CameraError, ImageError, InternalError, UsageError
 from curio_serve.imaging import image as decoding
 from curio_serve.models.detector import Detector
-from curio_serve.models.model import Model
+from curio_serve.models.model import Model, answering
 from curio_serve.models.model_check import ChildCheck
 from curio_serve.models.model_folder import open_model
 from curio_serve.models.runtime import Runtime, read_providers
@@ -161,7 +161,10 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
     for model in models:
         ChildCheck()(Path(model))
     runtime = Runtime(read_providers(arguments.provider))
-    opened = [open_model(model, runtime) for model in models]
+    try:
+        opened = answering([open_model(model, runtime) for model in models], arguments.object_names)
+    except ArgumentError as exc:
+        raise UsageError(f"--objects: {exc}") from exc
     estimators = [RigEstimator(model, cameras, arguments.min_confidence, arguments.max_detections) for model in opened]
     form, passed_over = JsonLines(), PassedOver()
     names = [(model.name, model.version) for model in opened]

@@ -106,6 +106,7 @@ class PoseClient(_Client):
         image: ImageLike,
         camera: CameraLike = None,
         *,
+        objects: Iterable[str] = (),
         regions: Iterable[RegionLike] = (),
         min_confidence: float | None = None,
         max_detections: int | None = None,
@@ -124,6 +125,7 @@ class PoseClient(_Client):
                 [height, width].
             camera: Camera file, :class:`~curio_serve.imaging.camera.PinholeCamera` or K [3, 3] in pixels; None for
                 models that need none.
+            objects: Kinds of objects to look for, as the models name them; none: all that they know.
             regions: Rectangles to search, each (x, y, width, height) in pixels; none: the whole frame.
             min_confidence: Detections below it are left out; None: the server's own threshold.
             max_detections: Largest number a region and model, the most confident; None: no limit.
@@ -142,6 +144,7 @@ class PoseClient(_Client):
             model,
             image,
             camera,
+            objects=objects,
             regions=regions,
             min_confidence=min_confidence,
             max_detections=max_detections,

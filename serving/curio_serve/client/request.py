@@ -28,6 +28,7 @@ def detect_request(
     image: ImageLike,
     camera: CameraLike = None,
     *,
+    objects: Iterable[str] = (),
     regions: Iterable[RegionLike] = (),
     min_confidence: float | None = None,
     max_detections: int | None = None,
@@ -44,6 +45,7 @@ def detect_request(
         model: Name, or ``name/version``; several for several objects in one call.
         image: Path of a JPEG, PNG or WebP file, its bytes, or pixels uint8 [height, width, 3] or grey [height, width].
         camera: Camera file, camera, or K [3, 3] in pixels.
+        objects: Kinds of objects to look for; none: all that the models know.
         regions: Each (x, y, width, height) in pixels.
         min_confidence: None: the server's own threshold.
         max_detections: None: no limit.
@@ -62,6 +64,7 @@ def detect_request(
     request = messages.DetectRequest(
         request_id=request_id,
         models=[selector(name) for name in ([model] if isinstance(model, str) else model)],
+        objects=_names(objects),
         regions=[_region(region) for region in regions],
         min_confidence=min_confidence,
         max_detections=max_detections,
@@ -85,6 +88,7 @@ def views_request(
     model: str | Iterable[str],
     views: Iterable[tuple[ImageLike, CameraLike, np.ndarray]],
     *,
+    objects: Iterable[str] = (),
     min_confidence: float | None = None,
     max_detections: int | None = None,
     color: Literal["rgb", "bgr"] = "rgb",
@@ -96,6 +100,7 @@ def views_request(
         model: Name, or ``name/version``; several for several objects in one call.
         views: 2 to 16 of (image, camera, cam_from_rig [4, 4] in metres); images and cameras as in
             :func:`detect_request`.
+        objects: Kinds of objects to look for; none: all that the models know.
         min_confidence: None: the server's own threshold.
         max_detections: None: no limit.
         color: Order of the channels of pixels.
@@ -105,7 +110,12 @@ def views_request(
         As :func:`detect_request`.
     """
     request = detect_request(
-        model, b"", min_confidence=min_confidence, max_detections=max_detections, request_id=request_id
+        model,
+        b"",
+        objects=objects,
+        min_confidence=min_confidence,
+        max_detections=max_detections,
+        request_id=request_id,
     )
     request.ClearField("encoded")
     for image, camera, cam_from_rig in views:
@@ -130,6 +140,12 @@ def selector(model: str) -> messages.ModelSelector:
     if slash and not _VERSION.fullmatch(version):
         raise ArgumentError(f"model {model!r}: expected name or name/version with a version from 1 to 999999999")
     return messages.ModelSelector(name=name, version=int(version or 0))
+
+
+def _names(objects: Iterable[str]) -> list[str]:
+    if isinstance(objects, str):
+        raise ArgumentError(f"objects is the text {objects!r}; expected a list of names, such as [{objects!r}]")
+    return list(objects)
 
 
 def _raw(pixels: np.ndarray, color: str) -> messages.RawImage:

@@ -1,8 +1,9 @@
 """Loads a model: opens an ONNX file with onnxruntime and checks its specification against its graph."""
 
+import copy
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,12 +19,15 @@ from curio_serve.models.batching import Batcher
 from curio_serve.models.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote
 from curio_serve.models.reliability import RELIABILITY_FILE, parse_reliability
 from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime, open_session, runtime_errors
-from curio_serve.models.spec import read_metadata, read_spec
+from curio_serve.models.spec import check_known, part_of, read_metadata, read_spec, wanted_slots
 
 if TYPE_CHECKING:
     import onnxruntime
 
 INPUT = "image"
+SLOTS = "slots"
+"""An input that some graphs have beside the image, int64: which slots to answer, all where it is left out."""
+
 MAX_BYTES = 1 << 30
 _MAX_RELIABILITY_BYTES = 1 << 20
 Outputs = Mapping[str, np.ndarray]
@@ -82,8 +86,10 @@ class Model:
         self.camera = canonical_camera(spec, name)
         self.slots = slots(spec, name)
         self.output_names: Sequence[str] = [output.name for output in session.get_outputs()]
-        self._session = session
-        self._run_many = Batcher(self._run, max_batch) if max_batch > 1 else self._run
+        self._session, self._max_batch = session, max_batch
+        self._takes_slots = SLOTS in [given.name for given in session.get_overridable_initializers()]
+        self._wanted: np.ndarray | None = None
+        self._run_many = self._runner()
 
     @property
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -94,6 +100,27 @@ class Model:
     def label(self) -> str:
         """Name and version, for messages."""
         return f"{self.name}/{self.version}" if self.version else self.name
+
+    def of(self, objects: Collection[str]) -> "Model":
+        """The same model, which answers these kinds of objects alone, in less time if its graph can leave others out.
+
+        Args:
+            objects: Names; of those that it does not know nothing is answered.
+
+        Raises:
+            ArgumentError: It knows none of them.
+        """
+        wanted = wanted_slots(self.spec, self.label, objects)
+        if len(wanted) == len(self.slots):
+            return self
+        part = copy.copy(self)
+        part.slots, part.spec = [self.slots[row] for row in wanted], part_of(self.spec, wanted)
+        part._wanted = np.array(wanted) if self._wanted is None else self._wanted[wanted]
+        part._run_many = part._runner()
+        return part
+
+    def _runner(self) -> "Batcher | Callable[[np.ndarray], Sequence[np.ndarray]]":
+        return Batcher(self._run, self._max_batch) if self._max_batch > 1 else self._run
 
     def run(self, images: np.ndarray) -> Outputs:
         """Run the network.
@@ -115,11 +142,26 @@ class Model:
         return dict(zip(self.output_names, values, strict=True))
 
     def _run(self, images: np.ndarray) -> Sequence[np.ndarray]:
+        wanted = self._wanted
+        given = {INPUT: images} if wanted is None or not self._takes_slots else {INPUT: images, SLOTS: wanted}
         try:
-            outputs: Sequence[np.ndarray] = self._session.run(None, {INPUT: images})
+            outputs: Sequence[np.ndarray] = self._session.run(None, given)
         except runtime_errors() as exc:
             raise InternalError(f"model {self.label}: onnxruntime failed on a batch of {len(images)}: {exc}") from exc
-        return outputs
+        if wanted is None or self._takes_slots:
+            return outputs
+        named = zip(self.output_names, outputs, strict=True)
+        return [values[:, wanted] if _OUTPUT_SHAPES[name][1] else values for name, values in named]
+
+
+def answering(models: Sequence[Model], objects: Collection[str]) -> list[Model]:
+    """The models, which answer these kinds of objects alone; as they are where no kind is named.
+
+    Raises:
+        ArgumentError: No model knows one of the kinds, or a model knows none of them.
+    """
+    check_known([model.spec for model in models], objects)
+    return [model.of(objects) for model in models] if objects else [*models]
 
 
 def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAULT_RUNTIME) -> Model:

@@ -4,7 +4,7 @@ External data is a path out of the model folder waiting to be followed, so a fil
 covers every place where ONNX allows a tensor: initialisers, attributes of nodes, subgraphs, functions, training graphs.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from curio_proto.files.onnx_outline_pb2 import (
     OnnxAttribute,
@@ -18,7 +18,7 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 from google.protobuf import json_format
 from google.protobuf.message import DecodeError
 
-from curio_serve.errors import ModelError
+from curio_serve.errors import ArgumentError, ModelError
 
 SPEC_KEY = "curio.model_spec"
 SCHEMA_VERSION = 1
@@ -59,6 +59,45 @@ def read_spec(data: bytes, path: str) -> ModelSpec:
 def read_metadata(data: bytes, key: str) -> str:
     """An entry of the metadata of an ONNX file that :func:`read_spec` has read; empty if there is none."""
     return next((entry.value for entry in OnnxModel.FromString(data).metadata_props if entry.key == key), "")
+
+
+def check_known(specs: Sequence[ModelSpec], objects: Collection[str]) -> None:
+    """Check that some model knows each of these kinds of objects.
+
+    Raises:
+        ArgumentError: None knows one of them.
+    """
+    known = sorted({kind.name for spec in specs for kind in spec.objects})
+    if unknown := sorted(set(objects) - set(known)):
+        raise ArgumentError(f"objects names {unknown[0][:64]!r}; expected some of {', '.join(known)}")
+
+
+def wanted_slots(spec: ModelSpec, label: str, objects: Collection[str]) -> list[int]:
+    """The slots of these kinds of objects, ascending.
+
+    Raises:
+        ArgumentError: The model knows none of them.
+    """
+    wanted = sorted(slot for kind in spec.objects if kind.name in objects for slot in kind.slots)
+    if not wanted:
+        raise ArgumentError(
+            f"objects names {', '.join(sorted(objects))}, and model {label} knows none but "
+            f"{', '.join(kind.name for kind in spec.objects)}; leave one of them out"
+        )
+    return wanted
+
+
+def part_of(spec: ModelSpec, wanted: Sequence[int]) -> ModelSpec:
+    """The specification of a model that answers these rows alone."""
+    part = ModelSpec()
+    part.CopyFrom(spec)
+    part.num_slots = len(wanted)
+    del part.objects[:]
+    for kind in spec.objects:
+        if rows := [row for row, slot in enumerate(wanted) if slot in kind.slots]:
+            part.objects.add().CopyFrom(kind)
+            part.objects[-1].slots[:] = rows
+    return part
 
 
 def _parse_spec(text: str, path: str) -> ModelSpec:

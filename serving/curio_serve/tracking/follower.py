@@ -95,6 +95,8 @@ class Follower:
             As :meth:`~curio_serve.models.detector.Detector.detect`.
         """
         frame = StreamFrame(detector, pixels, camera, reduction, time_s, before_run)
+        wanted = [slot.object for slot in detector.model.slots]
+        self._tracks = [track for track in self._tracks if track.kind.name in wanted]
         for track in self._tracks:
             track.predict(min(time_s - self._time_s, following.keep_s))
         self._time_s = time_s

@@ -128,7 +128,7 @@ def _measure(command: ExportCommand, folder: Path) -> None:
 def _write(command: ExportCommand) -> Path:
     """Write the next version of the model, and print what it is."""
     from curio_train.evaluation.int8 import int8
-    from curio_train.export.graph import export
+    from curio_train.export.write_model import export
 
     reduce = int8(command.cache.expanduser(), half=command.half) if command.int8 else None
     with Console(stderr=True).status("tracing, and comparing torch with onnxruntime"):

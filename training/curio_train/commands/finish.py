@@ -66,7 +66,7 @@ def _told(verdict: str | CurioError, warn: Callable[[str], None]) -> str:
 def _exported(
     run: Path, camera: Path, verdict: Callable[[], str], traced: "Callable[[Graph], ModelProto | None]" = lambda _: None
 ) -> str:
-    from curio_train.export.graph import export
+    from curio_train.export.write_model import export
 
     def model(graph: "Graph") -> "ModelProto | None":
         verdict()  # the model's card, which is written next, quotes the report

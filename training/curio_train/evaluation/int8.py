@@ -8,9 +8,9 @@ from curio_train.errors import ExportError
 from curio_train.evaluation.evaluate import draw
 from curio_train.evaluation.scores import accuracy
 from curio_train.evaluation.subject import Predict, model_reader
-from curio_train.export.graph import Reduce, Reduced
 from curio_train.export.int8 import to_int8
 from curio_train.export.onnx import store_half
+from curio_train.export.write_model import Reduce, Reduced
 from curio_train.exported_model import ExportedModel
 from curio_train.worlds.base import World
 

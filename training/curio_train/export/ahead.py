@@ -9,6 +9,7 @@ import onnx_ir as ir
 import torch
 
 from curio_train.config import RunConfig
+from curio_train.export.crop_stage import num_choosable
 from curio_train.export.graph import Graph, deployable
 from curio_train.export.onnx import simplified, traced_program
 from curio_train.learning.state import TrainState
@@ -41,7 +42,7 @@ class TracingAhead(SecondProcess[bytes]):
         for name, initializer in model.graph.initializers.items():
             if name in values:
                 initializer.const_value = ir.tensor(values[name].detach().numpy(), name=name)
-        return simplified(model)
+        return simplified(model, num_choosable(graph.network))
 
 
 def _trace(config: RunConfig) -> bytes:
@@ -51,5 +52,6 @@ def _trace(config: RunConfig) -> bytes:
     camera = world.camera
     with torch.no_grad():
         names = list(graph.outputs(torch.zeros(1, camera.height, camera.width, 3, dtype=torch.uint8)))
-    content: bytes = traced_program(graph, camera.width, camera.height, names).model_proto.SerializeToString()
+    program = traced_program(graph, camera.width, camera.height, names, num_choosable(network))
+    content: bytes = program.model_proto.SerializeToString()
     return content

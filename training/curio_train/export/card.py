@@ -48,6 +48,8 @@ class Provenance:
     """How they are stored, and what that costs."""
     pretrained: bool
     """Whether a trunk that others trained reads images in it, or found the poses that it learned from."""
+    chooses: bool
+    """Whether a caller may ask for some objects alone."""
 
 
 def card(
@@ -110,6 +112,8 @@ def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[s
     yield "training time", _sum(progress.seconds_before / 60, progress.seconds / 60, "{:.1f}") + " minutes"
     yield "machine", first.machine
     yield "input", f"`image`, uint8 RGB [batch, {spec.camera.height}, {spec.camera.width}, 3]"
+    if made.chooses:
+        yield "input", "`slots`, int64 [wanted]: which rows of the outputs to answer; all where it is left out"
     yield "weights", made.weights
     yield "to train it further", f"`curio-train {spec.world} --init models/{spec.name}/{version}`, other flags as above"
     yield "torch to onnxruntime", f"differ by at most {spec.parity_max_abs_error:.2g} in any output"

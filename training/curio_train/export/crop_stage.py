@@ -9,6 +9,7 @@ from curio_serve.models.crop_stage import CROP_STAGE_KEY, INPUT, OUTPUTS
 from torch import nn
 
 from curio_train.export.onnx import hide_outputs, put_metadata, to_onnx
+from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.worlds.base import Camera
 
@@ -28,9 +29,16 @@ def traced(graph: nn.Module, network: nn.Module, camera: Camera, outputs: Sequen
         outputs: Their names.
     """
     if not isinstance(network, TwoStageNetwork):
-        return to_onnx(graph, camera.width, camera.height, outputs)
+        return to_onnx(graph, camera.width, camera.height, outputs, num_choosable(network))
     names = {name: _PREFIX + name for name in STAGE_TENSORS}
     model = to_onnx(graph, camera.width, camera.height, [*outputs, *names.values()])
     hide_outputs(model, names.values())
     put_metadata(model, CROP_STAGE_KEY, json.dumps(asdict(network.crop_stage_note(names))))
     return model
+
+
+def num_choosable(network: nn.Module) -> int | None:
+    """How many slots a network has of which a caller may choose; None: it always answers all."""
+    if not isinstance(network, ObjectsNetwork) or len(network.geometries) == 1:
+        return None
+    return len(network.geometries)

@@ -11,7 +11,7 @@ import onnx
 import onnx_ir as ir
 import torch
 from curio_proto.v1.model_spec_pb2 import ModelSpec
-from curio_serve.models.model import INPUT
+from curio_serve.models.model import INPUT, SLOTS
 from curio_serve.models.spec import SPEC_KEY
 from google.protobuf import json_format
 from onnx import TensorProto, helper, numpy_helper
@@ -21,10 +21,13 @@ from onnxscript.rewriter.rules.common import materialize_reshape_shape_rule
 from torch import nn
 
 OPSET = 18
+_LARGEST_REPEATED = 1 << 20  # values; larger constants are weights, which are there once
 _SMALLEST_HALF = 256  # values; below, a Cast costs more than it saves
 
 
-def to_onnx(network: nn.Module, width: int, height: int, outputs: Sequence[str]) -> onnx.ModelProto:
+def to_onnx(
+    network: nn.Module, width: int, height: int, outputs: Sequence[str], num_slots: int | None = None
+) -> onnx.ModelProto:
     """Trace a network into an ONNX model with a free batch, and simplify it.
 
     Args:
@@ -32,14 +35,17 @@ def to_onnx(network: nn.Module, width: int, height: int, outputs: Sequence[str])
         width: Of the images, pixels.
         height: Of the images, pixels.
         outputs: Names of the returned tensors, in order.
+        num_slots: See :func:`traced_program`.
 
     Returns:
         A model that holds its weights and nothing of the machine it was traced on.
     """
-    return simplified(traced_program(network, width, height, outputs).model)
+    return simplified(traced_program(network, width, height, outputs, num_slots).model, num_slots)
 
 
-def traced_program(network: nn.Module, width: int, height: int, outputs: Sequence[str]) -> torch.onnx.ONNXProgram:
+def traced_program(
+    network: nn.Module, width: int, height: int, outputs: Sequence[str], num_slots: int | None = None
+) -> torch.onnx.ONNXProgram:
     """Trace a network; weights keep their names in its graph.
 
     Args:
@@ -47,18 +53,22 @@ def traced_program(network: nn.Module, width: int, height: int, outputs: Sequenc
         width: Of the images, pixels.
         height: Of the images, pixels.
         outputs: Names of the returned tensors, in order.
+        num_slots: Of a network that takes the numbers of the wanted slots, too, int64 [wanted]; None: it does not.
 
     Returns:
         What :func:`simplified` makes a model of.
     """
-    example = torch.zeros(2, height, width, 3, dtype=torch.uint8)
+    examples: tuple[torch.Tensor, ...] = (torch.zeros(2, height, width, 3, dtype=torch.uint8),)
+    free: tuple[dict[int, Any], ...] = ({0: torch.export.Dim("batch")},)
+    if num_slots is not None:
+        examples, free = (*examples, torch.arange(num_slots)), (*free, {0: torch.export.Dim("wanted")})
     with _quiet():
         program = torch.onnx.export(
             network,
-            (example,),
-            input_names=[INPUT],
+            examples,
+            input_names=[INPUT, SLOTS][: len(examples)],
             output_names=list(outputs),
-            dynamic_shapes=({0: torch.export.Dim("batch")},),
+            dynamic_shapes=free,
             opset_version=OPSET,
             dynamo=True,
             external_data=False,
@@ -69,11 +79,18 @@ def traced_program(network: nn.Module, width: int, height: int, outputs: Sequenc
     return program
 
 
-def simplified(traced: ir.Model) -> onnx.ModelProto:
-    """A traced graph as it is stored; changes the graph that is given."""
+def simplified(traced: ir.Model, num_slots: int | None = None) -> onnx.ModelProto:
+    """A traced graph as it is stored; changes the graph that is given.
+
+    Args:
+        traced: By :func:`traced_program`.
+        num_slots: As it was traced for. A caller may then leave the input out, which means all slots in their order.
+    """
     _simplify(traced)
     model: onnx.ModelProto = ir.to_proto(traced)
     _strip(model)
+    if num_slots is not None:
+        model.graph.initializer.append(numpy_helper.from_array(np.arange(num_slots), SLOTS))
     onnx.checker.check_model(model)
     return model
 
@@ -92,7 +109,7 @@ def _simplify(model: ir.Model) -> None:
     for simplify in (
         passes.RemoveUnusedNodesPass(),
         passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
-        passes.DeduplicateInitializersPass(),
+        passes.DeduplicateInitializersPass(size_limit=_LARGEST_REPEATED),
         passes.CommonSubexpressionEliminationPass(),
         passes.OutputFixPass(),
         passes.NameFixPass(),

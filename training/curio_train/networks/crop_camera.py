@@ -13,6 +13,8 @@ from torch import Tensor
 
 from curio_train.geometry import rotation_between
 
+_ROWS_AT_ONCE = 10
+
 
 def project(points: Float[Tensor, "*#batch n 3"], matrix: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "... n 2"]:
     """Pixels of points in the camera frame (metres). Points must lie in front: z > 0."""
@@ -131,7 +133,11 @@ def cut_crops(
     if roll is not None:
         camera = camera._replace(rotation=roll @ camera.rotation)
     grid = sampling_grid(camera, matrices, fine_side, images.shape[3], images.shape[2])
-    # One crop of all images after the other: no image is copied, and what a crop needs stays in a core's cache.
-    of_images = grid.unflatten(0, (-1, num)).unbind(1)
-    crops = torch.stack([F.grid_sample(images, one, align_corners=False) for one in of_images], dim=1).flatten(0, 1)
+    # The same few rows of all crops in one grid: no image is copied, an exported graph may cut any number of crops, and
+    # what the grid's places need stays in a core's cache.
+    strips = [
+        F.grid_sample(images, rows.flatten(1, 2), align_corners=False).unflatten(2, (num, -1))
+        for rows in grid.unflatten(0, (-1, num)).split(_ROWS_AT_ONCE, dim=2)
+    ]
+    crops = torch.cat(strips, dim=3).transpose(1, 2).flatten(0, 1)
     return (F.avg_pool2d(crops, oversampling) if oversampling > 1 else crops), camera.rotation

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from curio_train.networks.base import StageNetwork
@@ -95,9 +95,10 @@ class LocatorNetwork(StageNetwork):
             PROPOSALS: proposals,
         }
 
-    def places(self, images: Float[Tensor, "batch 3 height width"], num: int) -> Found:
-        """The likeliest ``num`` places of each object that are not beside each other."""
-        return self._top(*self._proposals(self.encoder(images)), num)
+    def places(self, images: Float[Tensor, "batch 3 height width"], num: int, slots: Int[Tensor, " objects"]) -> Found:
+        """The likeliest ``num`` places, not beside each other, of each of the objects in ``slots``."""
+        heat, proposals = self._proposals(self.encoder(images))
+        return self._top(heat[:, slots], proposals[:, slots], num)
 
     def _proposals(
         self, features: Tensor

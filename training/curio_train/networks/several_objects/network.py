@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from typing import Final
 
+import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from curio_train.networks.several_objects.locator import LocatorNetwork
@@ -46,14 +47,24 @@ class ObjectsNetwork(nn.Module):
         """
         self._num_places, self.reader.effort = 1, Effort(hypotheses=1, closer=1, rolls_deg=(0.0,))
 
-    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
-        """Codes in the frame's camera: metres, 6D rotation and confidence [batch, objects, …], light [batch, 3]."""
-        code: dict[str, Tensor] = self.reader(self.locator.trunk, images, self._places(images))
+    def forward(
+        self, images: Float[Tensor, "batch 3 height width"], slots: Int[Tensor, " objects"] | None = None
+    ) -> dict[str, Tensor]:
+        """Codes in the frame's camera: metres, 6D rotation and confidence [batch, objects, …], light [batch, 3].
+
+        Args:
+            images: sRGB in [0, 1].
+            slots: Which objects to look for, in any order; None: all.
+        """
+        code: dict[str, Tensor] = self.reader(self.locator.trunk, images, self._places(images, slots))
         return code
 
     def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code without its confidence, and what that is made of."""
-        return self.reader.read(self.locator.trunk, images, self._places(images))
+        return self.reader.read(self.locator.trunk, images, self._places(images, None))
 
-    def _places(self, images: Tensor) -> Places:
-        return Places(*self.locator.places(F.avg_pool2d(images, FRAME_STRIDE), self._num_places))
+    def _places(self, images: Tensor, slots: Tensor | None) -> Places:
+        if slots is None:
+            slots = torch.arange(len(self.geometries), device=images.device)
+        found = self.locator.places(F.avg_pool2d(images, FRAME_STRIDE), self._num_places, slots)
+        return Places(*found, slots)

@@ -129,44 +129,51 @@ class Banks(nn.Module):
         return normalised(features - self.fine_mean[number][:, None, None], dim=1)
 
     def match(
-        self, features: Float[Tensor, "batch objects num channels rows columns"]
-    ) -> Float[Tensor, "batch objects num templates shifts"]:
-        """Mean cosine over each template's silhouette, at every shift of whole cells."""
-        batch, objects, num = features.shape[:3]
-        centred = features - self.coarse_mean[:, None, :, None, None]
-        side_by_side = centred.transpose(1, 2).flatten(2, 3).flatten(0, 1)  # [batch * num, objects * channels, …]
-        projection = self.coarse_projection.flatten(0, 1)[..., None, None]
-        projected = F.conv2d(side_by_side, projection, groups=objects).unflatten(1, (objects, COARSE_SIZE))
-        described = normalised(projected, dim=2).flatten(1, 2)
-        filtered = F.conv2d(described, self.filters.float().flatten(0, 1), groups=objects)
-        filtered = filtered.unflatten(1, (objects, RANK)).flatten(3)  # [batch * num, objects, RANK, shifts]
-        found = self.weights.float() @ (filtered * self.match_scale[..., None])
-        return found.unflatten(0, (batch, num)).transpose(1, 2)
+        self, features: Float[Tensor, "batch asked num channels rows columns"], slots: Int[Tensor, " asked"]
+    ) -> Float[Tensor, "batch asked num shifts templates"]:
+        """Mean cosine over each template's silhouette, at every shift of whole cells, of the objects in ``slots``."""
+        columns, side = features.shape[-1], self.filters.shape[-1]
+        centred = features.flatten(-2).transpose(-1, -2) - self.coarse_mean[slots][:, None, None]
+        described = normalised(centred @ self.coarse_projection[slots].transpose(1, 2)[:, None], dim=-1)
+        cells = _windows(columns, side).to(features.device)
+        windows = described.index_select(-2, cells.flatten()).unflatten(-2, cells.shape).flatten(-2)
+        # As floats before the choice: a runtime then converts them once, not with every image.
+        filters = self.filters.permute(0, 3, 4, 2, 1).flatten(1, 3).float().index_select(0, slots)
+        filtered = windows @ filters[:, None] * self.match_scale[slots][:, None, None]
+        found: Tensor = filtered @ self.weights.transpose(1, 2).float().index_select(0, slots)[:, None]
+        return found
 
     def fine(
-        self, features: Float[Tensor, "batch*objects*num channels rows columns"], num: int
-    ) -> Float[Tensor, "batch*objects*num channels rows columns"]:
+        self, features: Float[Tensor, "batch*asked*num channels rows columns"], slots: Int[Tensor, " asked"], num: int
+    ) -> Float[Tensor, "batch*asked*num channels rows columns"]:
         """Descriptors at stride 4 of crops, ``num`` an object."""
-        by_object = features.unflatten(0, (-1, self.num_objects, num))
-        return normalised(by_object - self.fine_mean[:, None, :, None, None], dim=3).flatten(0, 2)
+        by_object = features.unflatten(0, (-1, slots.shape[0], num))
+        return normalised(by_object - self.fine_mean[slots][:, None, :, None, None], dim=3).flatten(0, 2)
 
     def surface(
-        self, templates: Int[Tensor, "batch*objects num"]
-    ) -> tuple[Float[Tensor, "batch*objects*num points 3"], Float[Tensor, "batch*objects*num points size"]]:
+        self, templates: Int[Tensor, "batch*asked num"], slots: Int[Tensor, " asked"]
+    ) -> tuple[Float[Tensor, "batch*asked*num points 3"], Float[Tensor, "batch*asked*num points size"]]:
         """Points of templates, diameters, and their descriptors."""
-        count, by_object = self.points.shape[1], templates.unflatten(0, (-1, self.num_objects))
-        number = torch.arange(self.num_objects, device=templates.device)[:, None].expand_as(by_object).flatten()
+        count, by_object = self.points.shape[1], templates.unflatten(0, (-1, slots.shape[0]))
+        number = slots[:, None].expand_as(by_object).flatten()
         row = number * count + by_object.flatten()
-        points = self.points.flatten(0, 1)[row].float() * self.points_scale[number][:, None, None]
+        points = self.points.flatten(0, 1).index_select(0, row).float() * self.points_scale[number][:, None, None]
         first = number[:, None, None] * _PARTS + torch.arange(_PARTS, device=templates.device)
-        codeword = first * CODEWORDS + self.codes.flatten(0, 1)[row].long()
-        return points, self.codewords.flatten(0, 2)[codeword].float().flatten(2)
+        codeword = first * CODEWORDS + self.codes.flatten(0, 1).index_select(0, row).long()
+        described = self.codewords.flatten(0, 2).float().index_select(0, codeword.flatten())
+        return points, described.unflatten(0, codeword.shape).flatten(2)
 
     def outlines(
-        self, templates: Int[Tensor, " batch*objects"]
-    ) -> tuple[Float[Tensor, "batch*objects points 3"], Float[Tensor, "batch*objects points 3"]]:
+        self, templates: Int[Tensor, " batch*asked"], slots: Int[Tensor, " asked"]
+    ) -> tuple[Float[Tensor, "batch*asked points 3"], Float[Tensor, "batch*asked points 3"]]:
         """Points on the outlines of templates, diameters, and vectors out of them; a template an object."""
-        number = torch.arange(self.num_objects, device=templates.device).repeat(templates.shape[0] // self.num_objects)
+        number = slots.expand(templates.unflatten(0, (-1, slots.shape[0])).shape).flatten()
         row = number * self.outline.shape[1] + torch.div(templates, NUM_ROLLS, rounding_mode="floor")
-        points = self.outline.flatten(0, 1)[row].float() * self.outline_scale[number][:, None, None]
-        return points, self.outward.flatten(0, 1)[row].float()
+        points = self.outline.flatten(0, 1).index_select(0, row).float() * self.outline_scale[number][:, None, None]
+        return points, self.outward.flatten(0, 1).index_select(0, row).float()
+
+
+def _windows(columns: int, side: int) -> Int[Tensor, "shifts side*side"]:
+    """Numbers of the cells of a square map, in every square of ``side`` cells that lies in it."""
+    of_cells = torch.arange(columns * columns).unflatten(0, (columns, columns))
+    return of_cells.unfold(0, side, 1).unfold(1, side, 1).flatten(2).flatten(0, 1)

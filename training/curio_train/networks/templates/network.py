@@ -59,4 +59,4 @@ class TemplateNetwork(nn.Module):
 
     def _places(self, images: Tensor) -> Places:
         position_m, score = self.localiser(self.trunk(F.avg_pool2d(images, FRAME_STRIDE))[1])
-        return Places(position_m[:, None], score[:, None])
+        return Places(position_m[:, None], score[:, None], torch.zeros(1, dtype=torch.long, device=images.device))

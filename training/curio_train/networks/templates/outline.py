@@ -49,7 +49,7 @@ def outline_log_factor(
     column = (_REACH_PX - lever_px[..., None] * factors - shift_px).clamp(0, 2 * _REACH_PX)
     left = column.floor().clamp(max=2 * _REACH_PX - 1)
     near, far = edges.gather(2, left.long()), edges.gather(2, left.long() + 1)
-    scores = torch.lerp(near, far, column - left).mean(dim=1)
+    scores = (near + (column - left) * (far - near)).mean(dim=1)
     return _peak(scores - _PREFERENCE * factors.abs(), factors)
 
 

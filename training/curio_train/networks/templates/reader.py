@@ -51,6 +51,13 @@ class Places(NamedTuple):
     """Of the object's centre, camera frame."""
     score: Float[Tensor, "batch objects num"]
     """The higher the likelier; its unit is that of what finds places."""
+    slots: Int[Tensor, " objects"]
+    """Which objects these are, of all that the network knows."""
+
+    def repeated(self, count: int) -> "Places":
+        """Each place that often, one after the other."""
+        position_m, score = (of_all.repeat_interleave(count, dim=2) for of_all in self[:2])
+        return Places(position_m, score, self.slots)
 
 
 class CalibrationFeatures(NamedTuple):
@@ -77,6 +84,12 @@ class _Crops(NamedTuple):
     """Of the places."""
     focal_px: Float[Tensor, " crops"]
     """Of the crops' cameras."""
+    slots: Int[Tensor, " objects"]
+    """Which objects are looked for."""
+
+    def by_object(self, values: Tensor) -> Tensor:
+        """Rows, object after object, as [batch, objects, …]."""
+        return values.unflatten(0, (-1, self.slots.shape[0]))
 
 
 class _Hypotheses(NamedTuple):
@@ -134,7 +147,8 @@ class PoseReader(nn.Module):
     def forward(self, trunk: Trunk, images: Float[Tensor, "batch 3 height width"], places: Places) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, objects, …], light [batch, 3]."""
         code, features = self.read(trunk, images, places)
-        sure = _probability(features.right, self.pose_correct) * _probability(features.there, self.presence)
+        right, there = self.pose_correct[places.slots], self.presence[places.slots]
+        sure = _probability(features.right, right) * _probability(features.there, there)
         return code | {CONFIDENCE: sure[..., None]}
 
     def read(
@@ -147,11 +161,8 @@ class PoseReader(nn.Module):
         pose, spread = self._averaged(crops, best)
         pose, gap = self._between(crops, best.crop, pose)
 
-        def by_object(values: Tensor) -> Tensor:
-            return values.unflatten(0, (-1, self.banks.num_objects))
-
-        found = best._replace(pose=pose)
-        position_m = by_object(found.in_frame(crops)) * self._diameter_m[:, None]
+        found, by_object = best._replace(pose=pose), crops.by_object
+        position_m = by_object(found.in_frame(crops)) * self._diameter_m[places.slots][:, None]
         score, place = by_object(10 * pose.score), by_object(best.place_score)
         return {
             TRANSLATION: position_m,
@@ -178,14 +189,13 @@ class PoseReader(nn.Module):
         )
         best = score.topk(self.effort.closer, dim=1).indices
         of_rows = best[..., None].expand(-1, -1, 3)
-        chosen = position.gather(1, of_rows).unflatten(0, (-1, self.banks.num_objects))
-        chosen = chosen * self._diameter_m[:, None, None]
-        in_front = torch.maximum(chosen[..., 2:], self._nearest_m[:, None, None])
+        chosen = crops.by_object(position.gather(1, of_rows)) * self._diameter_m[places.slots][:, None, None]
+        in_front = torch.maximum(chosen[..., 2:], self._nearest_m[places.slots][:, None, None])
         closer = torch.cat([chosen[..., :2], in_front], dim=3)
-        of_places = place_score.gather(1, best).unflatten(0, (-1, self.banks.num_objects))
+        of_places = crops.by_object(place_score.gather(1, best))
         rolls_deg = self.effort.rolls_deg
         roll = upright_rolls(closer.flatten(0, 2), upward.gather(1, of_rows).flatten(0, 1), rolls_deg)
-        return Places(*(of_all.repeat_interleave(len(rolls_deg), dim=2) for of_all in (closer, of_places))), roll
+        return Places(closer, of_places, places.slots).repeated(len(rolls_deg)), roll
 
     def _turned(self, places: Places) -> tuple[Places, Float[Tensor, "crops 3 3"] | None]:
         """Places in all quarter turns where objects may be rolled in any way; else as they are."""
@@ -193,31 +203,32 @@ class PoseReader(nn.Module):
             return places, None
         quarters = places.score.new_tensor([[1, 0], [0, 1], [-1, 0], [0, -1]])
         turns = about_axis(quarters).expand(*places.score.shape, -1, -1, -1).flatten(0, 3)
-        return Places(*(of_all.repeat_interleave(QUARTER_TURNS, dim=2) for of_all in places)), turns
+        return places.repeated(QUARTER_TURNS), turns
 
     def _crops(self, trunk: Trunk, images: Tensor, places: Places, roll: Tensor | None = None) -> _Crops:
         """Crops in which templates can be shifted."""
-        num, side = places.score.shape[2], CROP_PX + 2 * _MARGIN_PX
+        num, side, slots = places.score.shape[2], CROP_PX + 2 * _MARGIN_PX, places.slots
         by_image = places.position_m.flatten(1, 2)
-        rows = by_image.shape[0] * by_image.shape[1]
-        nearest, diameter_m = (self._of_rows(one, rows, num) for one in (self._nearest_m, self._diameter_m))
+        nearest, diameter_m = (
+            of_all[slots][:, None].expand_as(places.score).flatten() for of_all in (self._nearest_m, self._diameter_m)
+        )
         distance_m = torch.maximum(by_image.flatten(0, 1).square().sum(dim=1).sqrt(), nearest)
         focal_px = FILL * CROP_PX * distance_m / diameter_m
         pictures, crop_from_cam = cut_crops(images, self._matrix, by_image, focal_px, side, oversampling=1, roll=roll)
         fine, coarse = trunk(pictures)
-        by_object = coarse.unflatten(0, (-1, self.banks.num_objects, num))
-        maps = FeatureMaps.of(self.banks.fine(fine, num))
-        return _Crops(pictures, maps, by_object, crop_from_cam.transpose(1, 2), distance_m, focal_px)
+        by_object = coarse.unflatten(0, (-1, slots.shape[0], num))
+        maps = FeatureMaps.of(self.banks.fine(fine, slots, num))
+        return _Crops(pictures, maps, by_object, crop_from_cam.transpose(1, 2), distance_m, focal_px, slots)
 
     def _hypotheses(self, crops: _Crops, places: Places) -> _Hypotheses:
         """The best match, the best of those that differ from it, and so on, of each object in each image."""
         num = places.score.shape[2]
-        scores, shift = (found.flatten(0, 1) for found in self.banks.match(crops.coarse).max(dim=4))
+        scores, shift = (found.flatten(0, 1) for found in self.banks.match(crops.coarse, places.slots).max(dim=3))
         positions_m, place_scores = places.position_m.flatten(0, 1), places.score.flatten()
-        shifts, diameter_m = _shifts().to(scores), self._of_rows(self._diameter_m, scores.shape[0], 1)
+        shifts, diameter_m = _shifts().to(scores), self._diameter_of(places)
         found: list[_Hypotheses] = []
         row = torch.arange(scores.shape[0], device=scores.device)
-        for place, template, score in self._pick(scores, positions_m):
+        for place, template, score in self._pick(scores, positions_m, _ONE_PLACE * diameter_m):
             crop = row * num + place
             slope = shifts[shift[row, place, template]] / crops.focal_px[crop][:, None]
             ray = torch.cat([slope, torch.ones_like(slope[:, :1])], dim=1)
@@ -232,12 +243,14 @@ class PoseReader(nn.Module):
         return _Hypotheses(pose, *of_crops)
 
     def _pick(
-        self, scores: Float[Tensor, "rows num templates"], positions_m: Float[Tensor, "rows num 3"]
+        self,
+        scores: Float[Tensor, "rows num templates"],
+        positions_m: Float[Tensor, "rows num 3"],
+        apart_m: Float[Tensor, " rows"],
     ) -> list[tuple[Int[Tensor, " rows"], Int[Tensor, " rows"], Float[Tensor, " rows"]]]:
         """Place, template and score of each hypothesis; hypotheses at one place differ in rotation."""
         turns = self.banks.rotations.flatten(1)
         count, picked = turns.shape[0], []
-        apart_m = _ONE_PLACE * self._of_rows(self._diameter_m, scores.shape[0], 1)
         for _ in range(self.effort.hypotheses):
             score, best = scores.flatten(1).max(dim=1)
             place, template = torch.div(best, count, rounding_mode="floor"), best % count
@@ -251,7 +264,7 @@ class PoseReader(nn.Module):
     def _aligned(self, crops: _Crops, found: _Hypotheses, num_steps: int) -> _Hypotheses:
         """Each hypothesis moved to where the template nearest to it fits best."""
         templates = self._nearest(found.pose, 1).unflatten(0, (-1, self.effort.hypotheses))[..., 0]
-        surface = self.banks.surface(templates)
+        surface = self.banks.surface(templates, crops.slots)
         pose = align(crops.fine, found.crop, *surface, found.pose, crops.focal_px[found.crop], num_steps)
         return found._replace(pose=pose)
 
@@ -259,7 +272,7 @@ class PoseReader(nn.Module):
         """The mean of what the templates around a pose answer, and the spread of the logarithm of their distances."""
         rolled, pose = self._in_all_rolls(crops, best.crop, best.pose)
         templates = self._nearest(pose, NUM_NEIGHBOURS).unflatten(0, (-1, len(self.effort.rolls_deg))).flatten(1)
-        surface = self.banks.surface(templates)
+        surface = self.banks.surface(templates, crops.slots)
         start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in pose))
         crop = rolled.repeat_interleave(NUM_NEIGHBOURS)
         found = align(crops.fine, crop, *surface, start, crops.focal_px[crop], self._steps[2])
@@ -280,9 +293,8 @@ class PoseReader(nn.Module):
     def _between(self, crops: _Crops, crop: Tensor, pose: Aligned) -> tuple[Aligned, Float[Tensor, " rows"]]:
         """The pose at the mean of the distances that descriptors and outline tell, and the logarithm of their ratio."""
         num = len(self.effort.rolls_deg)
-        points, outward = (
-            of_all.repeat_interleave(num, dim=0) for of_all in self.banks.outlines(self._nearest(pose, 1)[:, 0])
-        )
+        outlines = self.banks.outlines(self._nearest(pose, 1)[:, 0], crops.slots)
+        points, outward = (of_all.repeat_interleave(num, dim=0) for of_all in outlines)
         rolled, seen = self._in_all_rolls(crops, crop, pose)
         gaps = outline_log_factor(crops.pictures[rolled], points, outward, seen, crops.focal_px[rolled])
         gap = gaps.unflatten(0, (-1, num)).mean(dim=1)
@@ -311,9 +323,9 @@ class PoseReader(nn.Module):
         turn = _seen_along(pose.position).transpose(1, 2) @ pose.rotation
         return (turn.flatten(1) @ self.banks.rotations.flatten(1).T).topk(num, dim=1).indices
 
-    def _of_rows(self, of_objects: Float[Tensor, " objects"], rows: int, num: int) -> Float[Tensor, " rows"]:
-        """What belongs to the object of each row; an object has ``num`` rows in an image."""
-        return of_objects.repeat_interleave(num).repeat(rows // (num * self.banks.num_objects))
+    def _diameter_of(self, places: Places) -> Float[Tensor, " batch*objects"]:
+        """Metres."""
+        return self._diameter_m[places.slots].expand(places.score.shape[:2]).flatten()
 
 
 def _seen_along(position: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3 3"]:
