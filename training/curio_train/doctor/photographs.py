@@ -1,7 +1,9 @@
 """Examines a folder of photographs: reads each once and looks for what would spoil training on them."""
 
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from curio_train.camera import Intrinsics
@@ -28,17 +30,23 @@ def examine_photographs(folder: Path, camera: Intrinsics | None) -> tuple[list[P
         paths = Photographs(folder).paths
     except CurioError as exc:
         return [], [Finding("photographs", "bad", str(exc), fault="photographs unreadable")]
-    photographs, broken = [], []
-    for path in paths:
-        try:
-            photographs.append(measure(path))
-        except CurioError as exc:
-            broken.append(str(exc))
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0)), "measure") as threads:
+        measured = list(threads.map(_measured, paths))
+    photographs = [found for found in measured if isinstance(found, Photograph)]
+    broken = [found for found in measured if isinstance(found, str)]
     findings = [*_unreadable(broken, len(paths))]
     if photographs:
         findings += [_sizes(folder, photographs), *_count(photographs), *_turned(photographs)]
         findings += [*_other_camera(photographs, camera), *examine_content(photographs)]
     return photographs, findings
+
+
+def _measured(path: Path) -> Photograph | str:
+    """A photograph, or why it cannot be read."""
+    try:
+        return measure(path)
+    except CurioError as exc:
+        return str(exc)
 
 
 def named(photographs: Sequence[Photograph]) -> str:

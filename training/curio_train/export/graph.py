@@ -18,7 +18,7 @@ from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import TRANSLATION, joined
 from curio_train.worlds.base import World
 
-NUM_JITTERED = 12
+NUM_JITTERED = 8
 """Rounds of jitter in the check of numerical stability; it misses a tie once in 2 to the power of this."""
 
 _NUM_CHECK_IMAGES = 4  # of either kind

@@ -20,7 +20,7 @@ from curio_train.scene_code import poses
 from curio_train.templates.threads import in_threads
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
-_NUM_FRAMES, _BATCH_SIZE = 160, 2  # larger batches take longer a frame
+_NUM_FRAMES, _BATCH_SIZE = 120, 2  # larger batches take longer a frame
 _NUM_POINTS = 500  # vertices that ADD is measured at, about
 
 
