@@ -18,10 +18,12 @@ from curio_serve.errors import ArgumentError, UsageError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
+from google.protobuf import json_format
 from onnx import TensorProto, helper, numpy_helper
 
 K = np.array([[110.0, 0, 50.0], [0, 112.0, 30.0], [0, 0, 1]])
 BRIGHT, DIM, DARK = 255, 160, 30
+_OF_OBJECT = {"rotation": (1, 1), "rotation_6d": (1,), "color": (1,)}
 
 
 @pytest.fixture(scope="module")
@@ -85,11 +87,75 @@ def seeking(
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
     spec = spot_spec(True)
     spec.name = "seeking"
-    from google.protobuf import json_format
-
     model.metadata_props.add(key="curio.model_spec").value = json_format.MessageToJson(spec)
     onnx.checker.check_model(model)
     return write_folder(tmp_path_factory.mktemp("seeking") / "models" / "seeking", model)
+
+
+@pytest.fixture(scope="module")
+def seeking_two(
+    tmp_path_factory: pytest.TempPathFactory,
+    spot_spec: Callable[[bool], ModelSpec],
+    write_folder: Callable[..., Path],
+) -> Path:
+    """A model that finds the reddest pixel, a "poppy", and the greenest, a "leaf", 1 m away."""
+    columns, rows = np.meshgrid(np.arange(96), np.arange(64))
+    table = np.stack([(columns - 50) / 110, (rows - 30) / 112, np.ones(rows.shape)], axis=-1).reshape(-1, 3)
+    spec = spot_spec(True)
+    spec.name, spec.num_slots = "seeking", 2
+    spec.objects.add().CopyFrom(spec.objects[0])
+    for slot, name in enumerate(("poppy", "leaf")):
+        spec.objects[slot].name, spec.objects[slot].slots[:] = name, [slot]
+    node = helper.make_node
+    constants = {
+        "flat": np.array([-1, 64 * 96, 3]),
+        "colors": np.array([0, 1]),
+        "pixels": np.array([2]),
+        "table": table.astype(np.float32),
+        "full": np.float32(255),
+        "none": np.float32(0),
+        "scene": np.array([0]),
+        "scene_end": np.array([1]),
+        "axis": np.array([1]),
+        **{f"{name}_shape": np.array([-1, 2, *shape]) for name, shape in _OF_OBJECT.items()},
+        "rotation_value": np.tile(np.eye(3, dtype=np.float32), (1, 2, 1, 1)),
+        "rotation_6d_value": np.tile(np.eye(3, dtype=np.float32)[:, :2].T.reshape(6), (1, 2, 1)),
+        "color_value": np.ones((1, 2, 3), np.float32),
+        "light_value": np.array([[0, -1, 0]], np.float32),
+    }
+    nodes = [
+        node("Cast", ["image"], ["float"], to=TensorProto.FLOAT),
+        node("Reshape", ["float", "flat"], ["rows"]),
+        node("Transpose", ["rows"], ["by_color"], perm=[0, 2, 1]),
+        node("Gather", ["by_color", "colors"], ["seen"], axis=1),
+        node("ArgMax", ["seen"], ["place"], axis=2, keepdims=0),
+        node("Gather", ["table", "place"], ["translation_m"]),
+        node("ReduceMax", ["seen", "pixels"], ["brightest"], keepdims=0),
+        node("Div", ["brightest", "full"], ["confidence"]),
+        node("Mul", ["confidence", "none"], ["nothing"]),
+        node("Slice", ["nothing", "scene", "scene_end", "axis"], ["of_scene"]),
+        node("Add", ["of_scene", "light_value"], ["light"]),
+    ]
+    for name in _OF_OBJECT:
+        nodes += [
+            node("Reshape", ["nothing", f"{name}_shape"], [f"{name}_nothing"]),
+            node("Add", [f"{name}_nothing", f"{name}_value"], [name]),
+        ]
+    sizes = {"translation_m": [2, 3], "color": [2, 3], "confidence": [2], "rotation_6d": [2, 6], "rotation": [2, 3, 3]}
+    graph = helper.make_graph(
+        nodes,
+        "seeking",
+        [helper.make_tensor_value_info("image", TensorProto.UINT8, ["b", 64, 96, 3])],
+        [
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, ["b", *size])
+            for name, size in (sizes | {"light": [3]}).items()
+        ],
+        [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    model.metadata_props.add(key="curio.model_spec").value = json_format.MessageToJson(spec)
+    onnx.checker.check_model(model)
+    return write_folder(tmp_path_factory.mktemp("seeking-two") / "models" / "seeking", model)
 
 
 def frame(*spots: tuple[int, int, int]) -> np.ndarray:
@@ -136,6 +202,22 @@ def test_there_are_as_many_as_asked_for_and_seen(seeking: Path, settings: dict[s
 
 def test_an_empty_frame_has_the_one_unlikely_answer(seeking: Path) -> None:
     assert [confidence for *_, confidence in found(seeking, frame(), max_instances=3)] == [0.0]
+
+
+def test_instances_of_every_kind_are_found(seeking_two: Path) -> None:
+    pixels = frame((15, 15, BRIGHT), (75, 15, DIM)) * np.uint8([1, 0, 0])
+    pixels += frame((15, 48, 250)) * np.uint8([0, 1, 0])
+    detector = Detector(open_model(seeking_two))
+
+    def kinds(**settings: Any) -> list[tuple[str, int]]:
+        (result,) = detector.detect(pixels, PinholeCamera(K), **settings)
+        return [(one.object, round(255 * one.confidence)) for one in result.detections]
+
+    assert kinds() == [("poppy", BRIGHT), ("leaf", 250)]
+    assert kinds(max_instances=1) == kinds()
+    assert kinds(max_instances=4) == [("poppy", BRIGHT), ("leaf", 250), ("poppy", DIM)]
+    detector = Detector(open_model(seeking_two).of(["poppy"]))
+    assert kinds(max_instances=4) == [("poppy", BRIGHT), ("poppy", DIM)]
 
 
 def test_each_region_is_searched_by_itself(seeking: Path) -> None:

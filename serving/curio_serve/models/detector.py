@@ -19,7 +19,7 @@ from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
 from curio_serve.models.crop_stage import CropPose
-from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Values
+from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Rows, Values
 from curio_serve.models.model import Model, Outputs, Slot
 from curio_serve.models.reliability import add_interval, calibrated, region_status, status_of
 from curio_serve.models.repeated import RepeatedReader
@@ -60,7 +60,7 @@ class Detector:
         Raises:
             ArgumentError: The model cannot read an image more than once, or not that often.
         """
-        self.model = model
+        self.model, self._num_reads = model, num_reads
         self._repeated = None if num_reads == 1 else RepeatedReader(model.spec, model.run, num_reads)
         self.depths_m = trained_depths_m(model.spec)
         self._calibration = tuple(model.spec.reliability.calibration)
@@ -119,23 +119,34 @@ class Detector:
             if crop is None:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
-                _fill(result, crop, self.model.slots, next(predictions), limits, self.depths_m)
+                _fill(result, crop, next(predictions), limits, self.depths_m)
                 _judge(result, self.model.spec.reliability)
         return results
 
     def _predictions(
         self, images: list[Array], max_instances: int | None, before_run: Callable[[], None]
-    ) -> list[Values]:
-        """The network's outputs for each image; of a network that reads one pose, a row an instance."""
-        outputs = self._outputs(images, before_run)
-        if max_instances in (None, 1) or len(self.model.slots) > 1:
-            return outputs
+    ) -> list[Rows]:
+        """The network's outputs for each image; of a network that reads one pose of each kind, a row an instance."""
+        slots, found = self.model.slots, [Rows(v, self.model.slots) for v in self._outputs(images, before_run)]
+        if max_instances in (None, 1) or len(slots) > len(self.model.spec.objects):
+            return found
+        kinds = [self if len(slots) == 1 else Detector(self.model.of([slot.object]), self._num_reads) for slot in slots]
+        of_kinds = [
+            kind._instances(images, [one.row(number) for one in found], max_instances or 1, before_run)
+            for number, kind in enumerate(kinds)
+        ]
+        return [Rows.joined(of_image) for of_image in zip(*of_kinds, strict=True)]
+
+    def _instances(
+        self, images: list[Array], first: list[Rows], most: int, before_run: Callable[[], None]
+    ) -> list[Rows]:
+        """Further instances of the model's one kind in each image, after the first."""
         searches = [InstanceSearch(self.model, image) for image in images]
-        going_on = [search for search, values in zip(searches, outputs, strict=True) if search.take(values)]
-        for _ in range((max_instances or 1) - 1):
+        going_on = [search for search, rows in zip(searches, first, strict=True) if search.take(rows.values)]
+        for _ in range(most - 1):
             outputs = self._outputs([search.image for search in going_on], before_run)
             going_on = [search for search, values in zip(going_on, outputs, strict=True) if search.take(values)]
-        return [search.outputs() for search in searches]
+        return [search.found for search in searches]
 
     def _check_instances(self, max_instances: int | None) -> None:
         if max_instances is None:
@@ -255,8 +266,7 @@ def _first_of_each(rows: list[int], slots: Sequence[Slot], count: int) -> list[i
 def _fill(
     result: RegionResult,
     crop: Crop,
-    slots: Sequence[Slot],
-    values: Values,
+    found: Rows,
     limits: _Limits,
     depths_m: tuple[float, float],
 ) -> None:
@@ -265,9 +275,9 @@ def _fill(
     Raises:
         CameraError: A pose is not finite in the frame's camera.
     """
+    values, slots = found
     if "light" in values:
         result.light.extend(crop.rotate([[value] for value in values["light"]]))
-    slots = [*slots] * (len(values["translation_m"]) // len(slots))
     confidences = [min(max(c, 0.0), 1.0) for c in values.get("confidence", [1.0] * len(slots))]
     confident = [row for row, confidence in enumerate(confidences) if confidence >= limits.min_confidence]
     confident.sort(key=confidences.__getitem__, reverse=True)

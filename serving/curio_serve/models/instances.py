@@ -1,4 +1,4 @@
-"""Several instances of an object from a network that reads one pose an image.
+"""Several instances of an object from a network that reads one pose of it an image.
 
 The network reads the image again with the instances covered that it found, as long as it finds another. This works with
 any exported model and costs a run an instance, and one more that finds none. An instance that stands in the box of
@@ -6,7 +6,7 @@ another is covered with it.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,6 +24,32 @@ LEAST_CONFIDENCE = 0.2
 _MARGIN = 1.15  # of a box that hides an object
 _NEAREST_M = 1e-3
 _OF_SCENE = "light"
+
+
+class Rows(NamedTuple):
+    """What was found in one image."""
+
+    values: Values
+    """Outputs by name; those of objects have a row each."""
+    slots: Sequence[Slot]
+    """Of which kind each row is."""
+
+    def row(self, number: int) -> "Rows":
+        """One row, with what the scene has once."""
+        return Rows(
+            {name: value if name == _OF_SCENE else [value[number]] for name, value in self.values.items()},
+            [self.slots[number]],
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence["Rows"]) -> "Rows":
+        """The rows of all parts; what the scene has once is that of the first."""
+        first = parts[0].values
+        values = {
+            name: value if name == _OF_SCENE else [row for part in parts for row in part.values[name]]
+            for name, value in first.items()
+        }
+        return cls(values, [slot for part in parts for slot in part.slots])
 
 
 def cover(pixels: Array, box_px: Array) -> None:
@@ -50,7 +76,7 @@ def enlarged(corners_m: Array) -> Array:
 
 
 class InstanceSearch:
-    """One image in which instances are found one after the other."""
+    """One image in which instances of one kind are found one after the other."""
 
     def __init__(self, model: Model, image: Array) -> None:
         """Begin without instances.
@@ -61,8 +87,7 @@ class InstanceSearch:
         """
         self.image = image
         """The image with the found instances painted over."""
-        self.readings: list[Values] = []
-        """Outputs of each instance, in the order of search."""
+        self._readings: list[Rows] = []
         self._model, self._covered = model, list[Array]()
 
     def take(self, values: Values) -> bool:
@@ -70,8 +95,8 @@ class InstanceSearch:
         (slot,) = self._model.slots
         center = self._pixels([values["translation_m"][0]])
         is_new = self._is_sure(values) and center is not None and not self._is_covered(center[0])
-        if is_new or not self.readings:
-            self.readings.append(values)
+        if is_new or not self._readings:
+            self._readings.append(Rows(values, self._model.slots))
         box_px = self._pixels(_corners(slot, values)) if is_new else None
         if box_px is None:
             return False
@@ -81,11 +106,10 @@ class InstanceSearch:
         self._covered.append(cv2.convexHull(box_px.astype(np.float32)))
         return True
 
-    def outputs(self) -> Values:
-        """Outputs by name, with a row for each instance; what a scene has once is that of the first reading."""
-        first = self.readings[0]
-        rows = {name: [values[name][0] for values in self.readings] for name in first if name != _OF_SCENE}
-        return {name: rows.get(name, value) for name, value in first.items()}
+    @property
+    def found(self) -> Rows:
+        """A row for each instance; what a scene has once is that of the first reading."""
+        return Rows.joined(self._readings)
 
     def _is_sure(self, values: Values) -> bool:
         return "confidence" not in values or bool(values["confidence"][0] >= LEAST_CONFIDENCE)
