@@ -18,6 +18,8 @@ from curio_serve.errors import ArgumentError, CameraError, CurioError, UsageErro
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from curio_proto.v1.model_spec_pb2 import ModelSpec
+
     from curio_serve.batch.estimators import Estimator, Settings
     from curio_serve.batch.images.recordings import Recording
     from curio_serve.batch.images.source_image import SourceImage
@@ -219,11 +221,12 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
     found: list[Estimator] = []
     for model in models:
         if os.path.exists(model):
-            runtime = Runtime(read_providers(arguments.provider))
+            opened = open_model(model, Runtime(read_providers(arguments.provider)))
+            _check_objects(opened.spec, model, settings)
             try:
-                found.append(LocalEstimator(open_model(model, runtime), settings))
+                found.append(LocalEstimator(opened, settings))
             except ArgumentError as exc:
-                raise UsageError(f"MODEL {model}: {exc}") from exc
+                raise UsageError(f"--reads: {exc}") from exc
             continue
         served = SERVED_MODEL.fullmatch(model)
         if served is None:
@@ -233,15 +236,22 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
             )
         if arguments.provider != DetectArguments.provider:
             raise UsageError(f"--provider {arguments.provider}: found a model on a server, which chooses its own")
-        try:
-            found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
-        except ArgumentError as exc:
-            raise UsageError(f"MODEL {model}: {exc}") from exc
+        found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
+        _check_objects(found[-1].spec, model, settings)
     try:
         check_known([estimator.spec for estimator in found], settings.objects)
     except ArgumentError as exc:
         raise UsageError(f"--objects: {exc}") from exc
     return found
+
+
+def _check_objects(spec: "ModelSpec", model: str, settings: "Settings") -> None:
+    from curio_serve.models.spec import wanted_slots
+
+    try:
+        wanted_slots(spec, model, settings.objects)
+    except ArgumentError as exc:
+        raise UsageError(f"--objects: {exc}") from exc
 
 
 def _answering(

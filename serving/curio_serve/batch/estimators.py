@@ -28,7 +28,6 @@ from curio_serve.imaging.overlay import draw
 from curio_serve.imaging.silhouette import Surface
 from curio_serve.models.detector import Detector
 from curio_serve.models.model import Model, canonical_camera
-from curio_serve.models.spec import wanted_slots
 from curio_serve.tracking.stream import FollowingStream
 
 if TYPE_CHECKING:
@@ -237,7 +236,7 @@ class LocalEstimator(Estimator):
     """Runs a model in this process."""
 
     def __init__(self, model: Model, settings: Settings) -> None:
-        model = model.of(settings.objects) if settings.objects else model
+        model = model.of(settings.objects)
         super().__init__(model.name, model.version, model.spec, settings)
         self._detector = Detector(model, settings.num_reads)
         self._following, self._stream, self._num_frames = FollowingStream(), "", 0
@@ -309,8 +308,6 @@ class RemoteEstimator(Estimator):
     def __init__(self, client: "PoseClient", model: str, settings: Settings, *, timeout_s: float = 5.0) -> None:
         found = client.get_model(model, timeout_s=timeout_s)
         super().__init__(model.partition("/")[0], found.version, found.spec, settings)
-        if settings.objects:
-            wanted_slots(found.spec, model, settings.objects)  # soon, not with the first image
         self._client = client
 
     def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> Seen:

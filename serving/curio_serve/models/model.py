@@ -105,7 +105,7 @@ class Model:
         """The same model, which answers these kinds of objects alone, in less time if its graph can leave others out.
 
         Args:
-            objects: Names; of those that it does not know nothing is answered.
+            objects: Names; of those that it does not know nothing is answered. None: all.
 
         Raises:
             ArgumentError: It knows none of them.
@@ -161,7 +161,7 @@ def answering(models: Sequence[Model], objects: Collection[str]) -> list[Model]:
         ArgumentError: No model knows one of the kinds, or a model knows none of them.
     """
     check_known([model.spec for model in models], objects)
-    return [model.of(objects) for model in models] if objects else [*models]
+    return [model.of(objects) for model in models]
 
 
 def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAULT_RUNTIME) -> Model:

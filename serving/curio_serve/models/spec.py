@@ -73,12 +73,12 @@ def check_known(specs: Sequence[ModelSpec], objects: Collection[str]) -> None:
 
 
 def wanted_slots(spec: ModelSpec, label: str, objects: Collection[str]) -> list[int]:
-    """The slots of these kinds of objects, ascending.
+    """The slots of these kinds of objects, ascending; of all where no kind is named.
 
     Raises:
         ArgumentError: The model knows none of them.
     """
-    wanted = sorted(slot for kind in spec.objects if kind.name in objects for slot in kind.slots)
+    wanted = sorted(slot for kind in spec.objects if not objects or kind.name in objects for slot in kind.slots)
     if not wanted:
         raise ArgumentError(
             f"objects names {', '.join(sorted(objects))}, and model {label} knows none but "

@@ -150,8 +150,10 @@ def _jittered_layers(network: nn.Module, generator: torch.Generator) -> Iterator
     noise = _LAYER_JITTER * torch.randn(_NUM_NOISE, generator=generator)
     repeated = noise
 
-    def off(_layer: nn.Module, _given: object, output: Tensor) -> Tensor:
+    def off(_layer: nn.Module, _given: object, output: object) -> object:
         nonlocal repeated
+        if not isinstance(output, Tensor):  # poses, which are no layer's
+            return output
         first = int(torch.randint(_NUM_NOISE, (1,), generator=generator))
         if len(repeated) < _NUM_NOISE + output.numel():
             repeated = noise.repeat(1 + -(-output.numel() // _NUM_NOISE))

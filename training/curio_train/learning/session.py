@@ -19,19 +19,22 @@ from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress
 from curio_train.learning.trainer import Trainer
 from curio_train.networks.several_objects.network import ObjectsNetwork
-from curio_train.templates.build import fill_objects
+from curio_train.networks.two_stage.network import TwoStageNetwork
+from curio_train.templates.build import fill_objects, fill_outline
 from curio_train.worlds import build
 from curio_train.worlds.base import World, stages_of
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 
-def _draw_templates(trainer: Trainer, cache: Path) -> None:
-    """Detectors for several objects read poses by templates, which are drawn before training begins."""
-    network, world = trainer.state.pose.network, trainer.world
+def _draw(trainer: Trainer, cache: Path) -> None:
+    """Draw what networks read or align poses by, before training begins: templates, or outlines."""
+    network, world, begin = trainer.state.pose.network, trainer.world, time.monotonic()
     if isinstance(network, ObjectsNetwork) and isinstance(world, SeveralObjectsWorld):
-        begin = time.monotonic()
         fill_objects(network, world, cache)
-        trainer.state.progress.seconds += time.monotonic() - begin
+    if isinstance(network, TwoStageNetwork) and isinstance(world, TwoStageWorld):
+        fill_outline(network, world)
+    trainer.state.progress.seconds += time.monotonic() - begin
 
 
 def _training_images(config: RunConfig, world: World, cache: Path) -> Callable[[Path], Found]:
@@ -94,7 +97,7 @@ def learn(
             if config.init is not None:
                 begin_with(trainer.state, config.init)
             trainer.state.progress.seconds_before += found.seconds
-            _draw_templates(trainer, cache)
+            _draw(trainer, cache)
 
         with reporting(path, trainer.state.progress) if here.leads else nullcontext() as reporter:
             outcome = train(

@@ -23,13 +23,15 @@ from curio_train.networks.templates.localiser import Localiser
 from curio_train.networks.templates.network import TemplateNetwork
 from curio_train.networks.templates.quick_trunk import QuickTrunk
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
+from curio_train.networks.two_stage.network import TwoStageNetwork
+from curio_train.networks.two_stage.outline_alignment import NUM_POINTS
 from curio_train.templates.describe import low_rank, mean_cosine
 from curio_train.templates.drawing import TemplateRenderer
 from curio_train.templates.fill_bank import filled_bank
+from curio_train.templates.outline import outlines
 from curio_train.worlds.base import World
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
-from curio_train.worlds.single_object.viewpoints import upper_hemisphere_rotations
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _NUM_FRAMES, _NUM_CROPS = 24, 256  # of backgrounds
@@ -49,18 +51,16 @@ def template_network(world: World) -> TemplateNetwork:
             f"--method templates finds one object in six degrees of freedom, which {world.name} does not ask for here: "
             "expected linemod without --one-stage, or capture without --plane"
         )
+    return TemplateNetwork(_geometry(world), has_color=world.object.unpainted)
+
+
+def _geometry(world: SingleObjectWorld) -> Geometry:
     assert world.camera.matrix is not None
     one = world.object
-    geometry = Geometry(
-        world.camera.matrix,
-        world.camera.width,
-        world.camera.height,
-        one.kind.diameter_m,
-        one.near_m,
-        one.far_m,
-        any_side=one.rotations is not upper_hemisphere_rotations,
+    size = world.camera.width, world.camera.height
+    return Geometry(
+        world.camera.matrix, *size, one.kind.diameter_m, one.near_m, one.far_m, any_side=one.seen_from_any_side
     )
-    return TemplateNetwork(geometry, has_color=one.unpainted)
 
 
 def without_scan_excess(world: TwoStageWorld) -> TwoStageWorld:
@@ -104,6 +104,19 @@ def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Pat
     backgrounds = world.members[0].backgrounds(cache).split(True)
     for number, (member, geometry) in enumerate(zip(world.members, network.geometries, strict=True)):
         network.reader.banks.put(number, filled_bank(trunk, geometry, member.mesh, _crops(backgrounds, geometry)))
+
+
+@torch.no_grad()
+def fill_outline(network: TwoStageNetwork, world: SingleObjectWorld) -> None:
+    """Draw the outlines that poses are aligned by, if they are.
+
+    Raises:
+        RendererError: The mesh cannot be rendered.
+    """
+    if network.outline is not None:
+        geometry = _geometry(world)
+        directions = geometry.outline_rotations[:, 2]
+        network.outline.put(directions, *outlines(world.object.mesh, geometry, NUM_POINTS))
 
 
 def _crops(backgrounds: Backgrounds, geometry: Geometry) -> Float[Tensor, "num 3 side side"]:

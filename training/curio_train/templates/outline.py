@@ -30,8 +30,13 @@ class Outlines(NamedTuple):
     """Unit vectors across the line of sight, object frame."""
 
 
-def outlines(mesh: Mesh, geometry: Geometry) -> Outlines:
+def outlines(mesh: Mesh, geometry: Geometry, num_points: int = NUM_OUTLINE_POINTS) -> Outlines:
     """Points of the outline in each viewing direction, drawn at random; of a short outline some are drawn twice.
+
+    Args:
+        mesh: Of the object.
+        geometry: Says from where it is seen.
+        num_points: In each direction.
 
     Raises:
         RendererError: The mesh cannot be rendered.
@@ -50,7 +55,7 @@ def outlines(mesh: Mesh, geometry: Geometry) -> Outlines:
         seen = coordinates * surface.half_extent_m + torch.from_numpy(surface.center_m).float()[:, None, None]
         reach_m = geometry.diameter_m / 2
         distance_m = depth + torch.einsum("bi,bihw->bhw", rotations[:, 2], seen).clamp(-reach_m, reach_m)
-        pixels, across = _edge_pixels(renderer.draw(rotations).alpha, random)
+        pixels, across = _edge_pixels(renderer.draw(rotations).alpha, random, num_points)
         column, row = (pixels - _INSIDE_PX * across).round().long().clamp(0, CROP_PX - 1).unbind(2)
         at_m = distance_m[torch.arange(count)[:, None], row, column][..., None]
         in_camera = torch.cat([(pixels - middle) / focal_px * at_m, at_m], dim=2) - centre
@@ -60,7 +65,7 @@ def outlines(mesh: Mesh, geometry: Geometry) -> Outlines:
 
 
 def _edge_pixels(
-    alpha: Float[Tensor, "views 1 side side"], random: np.random.Generator
+    alpha: Float[Tensor, "views 1 side side"], random: np.random.Generator, num_points: int
 ) -> tuple[Float[Tensor, "views points 2"], Float[Tensor, "views points 2"]]:
     """Places (x, y) on the outline, to fractions of a pixel, and the unit vectors out of the object there."""
     blurred = F.avg_pool2d(alpha, _BLUR_PX, 1, _BLUR_PX // 2)
@@ -70,7 +75,7 @@ def _edge_pixels(
     for coverage, gradient in zip(blurred[:, 0], slope / 2, strict=True):
         beside = (coverage - 0.5).abs()
         places = (beside <= beside.min().clamp(min=_NEAR_EDGE)).nonzero()
-        row, column = places[np.resize(random.permutation(len(places)), NUM_OUTLINE_POINTS)].T
+        row, column = places[np.resize(random.permutation(len(places)), num_points)].T
         inwards = gradient[row, column]
         length = inwards.norm(dim=1, keepdim=True).clamp(min=1e-6)
         to_edge = (0.5 - coverage[row, column])[:, None] * inwards / length.square()

@@ -143,7 +143,7 @@ def build(options: CaptureOptions) -> World:
         known_scene=options.background is not None,
     )
     photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera))
-    return TwoStageWorld("capture", object_, photographs)
+    return TwoStageWorld("capture", object_, photographs, aligns_outlines=True)
 
 
 def _refuse_collision(options: CaptureOptions, mesh: Mesh) -> None:

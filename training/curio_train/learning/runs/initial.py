@@ -48,7 +48,7 @@ def begin_with(state: TrainState, path: Path) -> None:
             raise CheckpointError(f"{path}: its {WEIGHTS_FILE} says {notes}; export the model anew") from exc
     network = state.pose.network
     try:
-        network.load_state_dict(tensors | _kept(network, tensors))
+        network.load_state_dict(_without_drawn(network, tensors) | _kept(network, tensors))
     except RuntimeError as exc:
         raise UsageError(
             f"--init {path}: its network does not fit this world ({str(exc).splitlines()[-1].strip()}); "
@@ -112,13 +112,17 @@ def method_before(config: RunConfig) -> str | None:
 
 
 def _learned(network: nn.Module) -> dict[str, Tensor]:
-    """The state of a network without its templates, which are drawn anew."""
-    drawn = ObjectsNetwork.DRAWN if isinstance(network, ObjectsNetwork) else ()
-    return {name: value for name, value in network.state_dict().items() if not name.startswith(drawn)}
+    """The state of a network without its templates or outlines, which are drawn anew."""
+    return _without_drawn(network, network.state_dict())
+
+
+def _without_drawn(network: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    drawn = network.DRAWN if isinstance(network, ObjectsNetwork | TwoStageNetwork) else ()
+    return {name: value for name, value in tensors.items() if not name.startswith(drawn)}
 
 
 def _kept(network: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """What a network does not take from another: templates, and a last layer of another size."""
+    """What a network does not take from another: what is drawn, and a last layer of another size."""
     own = network.state_dict()
     last = TwoStageNetwork.LAST if isinstance(network, TwoStageNetwork) else ()
     kept = {

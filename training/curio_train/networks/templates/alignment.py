@@ -12,14 +12,13 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from curio_train.networks.pose_steps import solve, turn
 from curio_train.networks.templates.trunk import FINE_STRIDE, FINE_WIDTH
 
 _DAMPING = 1e-2  # of the Hessian's diagonal
 _RIDGE = 1e-6
 _LARGEST_STEP = 0.2  # radians and diameters together
 _OUTLIER = 0.5  # squared distance of descriptors at which a point counts a quarter (Geman and McClure 1985)
-_CROSS = [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]]
-"""A vector times this is its cross-product matrix, row by row."""
 
 
 class FeatureMaps(NamedTuple):
@@ -90,7 +89,7 @@ def align(
     rotation, position = start.rotation, start.position
     for _ in range(num_steps):
         step = _step(maps, crop, points, wanted, rotation, position, focal_px)
-        rotation, position = _turn(step[:, :3]) @ rotation, position + step[:, 3:]
+        rotation, position = turn(step[:, :3]) @ rotation, position + step[:, 3:]
     _, seen = _sample(maps, crop, points, rotation, position, focal_px)
     here = seen[..., :FINE_WIDTH]
     cosine = (here * wanted).sum(dim=-1) / here.square().sum(dim=-1).clamp(min=1e-12).sqrt()
@@ -134,7 +133,7 @@ def _step(
     hessian = jacobian.transpose(1, 2) @ torch.cat([of_u, of_v], dim=1)
     slope = torch.cat([(across * residual).sum(dim=-1) * weight, (down * residual).sum(dim=-1) * weight], dim=1)
     gradient = (jacobian.transpose(1, 2) @ slope[..., None])[..., 0]
-    step = -_solve(hessian, gradient)
+    step = -solve(_damped(hessian), gradient)
     length = step.square().sum(dim=1, keepdim=True).clamp(min=1e-12).sqrt()
     return step * (_LARGEST_STEP / length).clamp(max=1)
 
@@ -144,22 +143,7 @@ def _by_pose(by_point: Float[Tensor, "batch points 3"], arm: Float[Tensor, "batc
     return torch.cat([torch.linalg.cross(arm, by_point), by_point], dim=-1)
 
 
-def _solve(hessian: Float[Tensor, "batch 6 6"], gradient: Float[Tensor, "batch 6"]) -> Float[Tensor, "batch 6"]:
-    """Solve the damped system by Gauss–Jordan elimination, written out: a positive matrix needs no pivots."""
+def _damped(hessian: Float[Tensor, "batch 6 6"]) -> Float[Tensor, "batch 6 6"]:
     identity = torch.eye(6, dtype=hessian.dtype, device=hessian.device)
     diagonal = (hessian * identity).sum(dim=2)
-    damped = hessian + identity * (_DAMPING * diagonal + _RIDGE * (1 + diagonal.mean(dim=1, keepdim=True)))[:, None]
-    system = torch.cat([damped, gradient[..., None]], dim=2)
-    for number in range(6):
-        row = system[:, number] / system[:, number, number, None]
-        system = system - (system[:, :, number] - identity[number])[..., None] * row[:, None]
-    return system[:, :, 6]
-
-
-def _turn(vector: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
-    """The rotation by a short rotation vector, by Cayley's formula."""
-    half = vector / 2
-    cross = (half @ vector.new_tensor(_CROSS)).unflatten(1, (3, 3))
-    scale = 2 / (1 + half.square().sum(dim=1))
-    identity = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    return identity + scale[:, None, None] * (cross + cross @ cross)
+    return hessian + identity * (_DAMPING * diagonal + _RIDGE * (1 + diagonal.mean(dim=1, keepdim=True)))[:, None]

@@ -16,6 +16,7 @@ from curio_train.networks.crop_camera import cut_crops
 from curio_train.networks.grid import per_cell
 from curio_train.networks.two_stage.crop_pose import CELL_WEIGHTS, OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import TOP_LOG_WEIGHTS, TOP_PROPOSALS
+from curio_train.networks.two_stage.outline_alignment import OutlineAlignment
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
 _VISIBILITY = "visibility"
@@ -58,23 +59,30 @@ class TwoStageNetwork(nn.Module):
 
     The crop-pose stage runs on a crop around each top proposal. The proposal with the highest sum of log weight and
     visibility then goes through a refinement pass: crops at three assumed distances around the estimated position.
-    Their errors are nearly independent, so the final position is their mean.
+    Their errors are nearly independent, so the final position is their mean. The pose may then be aligned with the
+    object's outline.
     """
 
+    DRAWN: Final = ("outline.",)
+    """Beginnings of the names of what is drawn instead of trained."""
     LAST: Final = ("second.cells.2.",)
     """Beginnings of the names of the layer whose size depends on what is read of an object, such as its colour."""
     first: StageNetwork
     """The localisation stage, on frames at low resolution."""
     second: StageNetwork
     """The crop-pose stage."""
+    outline: OutlineAlignment | None
+    """What its poses are aligned by in the end; None: they stay as they are read."""
     rightness: Tensor
     """[2], weight and offset from the feature ``pose_correct`` to a calibrated logit; set after training."""
     presence: Tensor
     """[3], weights and offset from the features ``presence`` to a calibrated logit; set after training."""
 
-    def __init__(self, first: StageNetwork, second: StageNetwork, optics: Optics) -> None:
+    def __init__(
+        self, first: StageNetwork, second: StageNetwork, optics: Optics, outline: OutlineAlignment | None = None
+    ) -> None:
         super().__init__()
-        self.first, self.second = first, second
+        self.first, self.second, self.outline = first, second, outline
         self._optics = optics
         self._matrix: Tensor
         self.register_buffer("rightness", torch.tensor([1.0, 0.0]))
@@ -127,7 +135,17 @@ class TwoStageNetwork(nn.Module):
         logit, visibility = torch.logit(refined[CONFIDENCE].flatten(), 1e-6), refined.pop(_VISIBILITY)
         logit, visibility = (values.view(-1, len(SCALES)).mean(dim=1, keepdim=True) for values in (logit, visibility))
         features = CalibrationFeatures(logit, torch.cat([visibility, log_weight], dim=1))
-        return _mean_position(refined), features, read
+        return self._aligned(images, _mean_position(refined)), features, read
+
+    def _aligned(self, images: Tensor, code: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The code with its pose aligned with the object's outline in the images."""
+        if self.outline is None:
+            return code
+        diameter_m = self._optics.diameter_m
+        rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
+        pose = self.outline(images, self._matrix[0], rotation, code[TRANSLATION][:, 0] / diameter_m)
+        position_m = diameter_m * pose.position[:, None]
+        return code | {TRANSLATION: position_m, ROTATION_6D: rotation_6d_from_matrix(pose.rotation)[:, None]}
 
     def crop_stage_note(self, tensors: dict[str, str]) -> CropStageNote:
         """What serving has to know to run the refinement pass alone.

@@ -16,7 +16,9 @@ from torch import nn
 from curio_train.camera import Intrinsics
 from curio_train.data.photographs import UnlabelledPhotographs
 from curio_train.networks.base import StageNetwork
+from curio_train.networks.templates.geometry import num_views
 from curio_train.networks.two_stage.network import Optics, TwoStageNetwork
+from curio_train.networks.two_stage.outline_alignment import OutlineAlignment
 from curio_train.worlds.base import Camera
 from curio_train.worlds.single_object.confidence import calibrate
 from curio_train.worlds.single_object.crop_pose_stage import CROP_PX, FILL, CropPoseStage
@@ -54,12 +56,26 @@ class TwoStageWorld(SingleObjectWorld):
     photographs: TrainingPhotographs | None
     """Photographs of the object; None: there are none."""
 
-    def __init__(self, name: str, object_: Object, photographs: TrainingPhotographs | None = None) -> None:
-        """Build the stages; photographs are not read before they are needed."""
+    def __init__(
+        self,
+        name: str,
+        object_: Object,
+        photographs: TrainingPhotographs | None = None,
+        *,
+        aligns_outlines: bool = False,
+    ) -> None:
+        """Build the stages; photographs are not read before they are needed.
+
+        Args:
+            name: As on the command line.
+            object_: What is detected.
+            photographs: Of it.
+            aligns_outlines: Poses are aligned with the object's outline in the end.
+        """
         camera = frame_camera(object_.camera)
         layout = pose_layout(position_field(object_), confidence=True, color=object_.unpainted)
         super().__init__(name, object_, camera, layout)
-        self.photographs = photographs
+        self.photographs, self._aligns_outlines = photographs, aligns_outlines
         self._stages = LocalisationStage(object_, camera), CropPoseStage(object_)
 
     @property
@@ -84,7 +100,9 @@ class TwoStageWorld(SingleObjectWorld):
         optics = Optics(
             self.camera.matrix, self.object.kind.diameter_m, self.object.near_m, LOCALISATION_STRIDE, CROP_PX, FILL
         )
-        return TwoStageNetwork(localisation, crop_pose, optics)
+        directions = num_views(self.object.seen_from_any_side)
+        outline = OutlineAlignment(directions) if self._aligns_outlines else None
+        return TwoStageNetwork(localisation, crop_pose, optics, outline)
 
     def calibrate_confidence(self, network: nn.Module, cache: Path) -> None:
         """Calibrate the network's confidence on renderings that it was not trained with."""

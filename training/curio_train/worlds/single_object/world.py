@@ -74,6 +74,11 @@ class Object:
     scan_excess_m: float = 0.0
     """How far the mesh's surface lies outside the real one: depth fusion makes scanned objects too thick."""
 
+    @property
+    def seen_from_any_side(self) -> bool:
+        """Whether it may be seen from below and rolled in any way."""
+        return self.rotations is not upper_hemisphere_rotations
+
     def without_scan_excess(self) -> "Object":
         """The object as thick as the real one."""
         return replace(self, mesh=inset(self.mesh, self.scan_excess_m), scan_excess_m=0.0)
