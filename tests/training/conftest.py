@@ -15,6 +15,7 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress, TrainState
 from curio_train.meshes.shapes import box
+from curio_train.networks import outline_alignment
 from curio_train.worlds import build, image_sets
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.options import CirclesOptions
@@ -69,9 +70,12 @@ def small_image_sets(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def small_checks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Calibration on 25 frames instead of 300, and 2 rounds of the check of numerical stability instead of 16."""
+    """Calibration on 25 frames instead of 300; 2 rounds of the check of numerical stability instead of 8; and one of
+    the alignment with outlines instead of 4, because these take long to trace.
+    """
     monkeypatch.setattr(confidence, "NUM_FRAMES", 25)
     monkeypatch.setattr(graph, "NUM_JITTERED", 2)
+    monkeypatch.setattr(outline_alignment, "_REACHES_PX", (4.0,))
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ from torch import Tensor
 from curio_train.data.backgrounds import Backgrounds
 from curio_train.errors import UsageError
 from curio_train.meshes.meshes import Mesh
+from curio_train.networks.outline_alignment import NUM_POINTS
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.templates.geometry import (
     CROP_PX,
@@ -24,7 +25,6 @@ from curio_train.networks.templates.network import TemplateNetwork
 from curio_train.networks.templates.quick_trunk import QuickTrunk
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
-from curio_train.networks.two_stage.outline_alignment import NUM_POINTS
 from curio_train.templates.describe import low_rank, mean_cosine
 from curio_train.templates.drawing import TemplateRenderer
 from curio_train.templates.fill_bank import filled_bank
@@ -51,7 +51,7 @@ def template_network(world: World) -> TemplateNetwork:
             f"--method templates finds one object in six degrees of freedom, which {world.name} does not ask for here: "
             "expected linemod without --one-stage, or capture without --plane"
         )
-    return TemplateNetwork(_geometry(world), has_color=world.object.unpainted)
+    return TemplateNetwork(_geometry(world), has_color=world.object.unpainted, aligns_outlines=world.aligns_outlines)
 
 
 def _geometry(world: SingleObjectWorld) -> Geometry:
@@ -88,6 +88,7 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> Non
     trunk = QuickTrunk(network.trunk)
     _fill_localiser(network.localiser, trunk, geometry, mesh, frames)
     network.reader.banks.put(0, filled_bank(trunk, geometry, mesh, _crops(backgrounds, geometry)))
+    fill_outline(network, world)
 
 
 @torch.no_grad()
@@ -107,7 +108,7 @@ def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Pat
 
 
 @torch.no_grad()
-def fill_outline(network: TwoStageNetwork, world: SingleObjectWorld) -> None:
+def fill_outline(network: TwoStageNetwork | TemplateNetwork, world: SingleObjectWorld) -> None:
     """Draw the outlines that poses are aligned by, if they are.
 
     Raises:

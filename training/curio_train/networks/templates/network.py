@@ -5,7 +5,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from curio_train.networks.templates.geometry import FRAME_STRIDE, Geometry
+from curio_train.networks.outline_alignment import OutlineAlignment
+from curio_train.networks.templates.geometry import FRAME_STRIDE, Geometry, num_views
 from curio_train.networks.templates.localiser import Localiser
 from curio_train.networks.templates.reader import STEPS, CalibrationFeatures, Places, PoseReader
 from curio_train.networks.templates.trunk import Trunk
@@ -21,23 +22,37 @@ class TemplateNetwork(nn.Module):
     """Finds centre proposals in the frame."""
     reader: PoseReader
     """From places to a pose."""
+    outline: OutlineAlignment | None
+    """What its poses are aligned by in the end; None: they stay as the reader answers them."""
     geometry: Geometry
     """Of frames and object."""
 
     color: Tensor
     """Of an object whose mesh has no colours: what its templates show and codes answer, sRGB [3]; else empty."""
 
-    def __init__(self, geometry: Geometry, steps: tuple[int, int, int] = STEPS, *, has_color: bool = False) -> None:
+    _matrix: Tensor
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        steps: tuple[int, int, int] = STEPS,
+        *,
+        has_color: bool = False,
+        aligns_outlines: bool = False,
+    ) -> None:
         """Build for frames and an object; all templates are still empty.
 
         Args:
             geometry: Of frames and object.
             steps: See :data:`STEPS`.
             has_color: Whether codes have a colour.
+            aligns_outlines: Whether poses are aligned with the object's outline in the end.
         """
         super().__init__()
         self.trunk, self.localiser, self.reader = Trunk(), Localiser(geometry), PoseReader([geometry], steps)
+        self.outline = OutlineAlignment(num_views(geometry.any_side)) if aligns_outlines else None
         self.geometry = geometry
+        self.register_buffer("_matrix", torch.from_numpy(geometry.matrix).float(), persistent=False)
         self.register_buffer("color", torch.zeros(3 if has_color else 0), persistent=has_color)
         self.requires_grad_(False)
         self.eval()
@@ -45,14 +60,17 @@ class TemplateNetwork(nn.Module):
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
         code: dict[str, Tensor] = self.reader(self.trunk, images, self._places(images))
-        return self._colored(code)
+        return self._finished(images, code)
 
     def read(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code without its confidence, and what that is made of."""
         code, features = self.reader.read(self.trunk, images, self._places(images))
-        return self._colored(code), features
+        return self._finished(images, code), features
 
-    def _colored(self, code: dict[str, Tensor]) -> dict[str, Tensor]:
+    def _finished(self, images: Tensor, code: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The code with its pose aligned, and with the colour, where the network has them."""
+        if self.outline is not None:
+            code = self.outline.of_code(images, self._matrix, code, self.geometry.diameter_m)
         if not len(self.color):
             return code
         return code | {COLOR: self.color.expand(*code[TRANSLATION].shape[:2], 3)}

@@ -14,9 +14,9 @@ from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matri
 from curio_train.networks.base import StageNetwork
 from curio_train.networks.crop_camera import cut_crops
 from curio_train.networks.grid import per_cell
+from curio_train.networks.outline_alignment import OutlineAlignment
 from curio_train.networks.two_stage.crop_pose import CELL_WEIGHTS, OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import TOP_LOG_WEIGHTS, TOP_PROPOSALS
-from curio_train.networks.two_stage.outline_alignment import OutlineAlignment
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
 _VISIBILITY = "visibility"
@@ -141,11 +141,7 @@ class TwoStageNetwork(nn.Module):
         """The code with its pose aligned with the object's outline in the images."""
         if self.outline is None:
             return code
-        diameter_m = self._optics.diameter_m
-        rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
-        pose = self.outline(images, self._matrix[0], rotation, code[TRANSLATION][:, 0] / diameter_m)
-        position_m = diameter_m * pose.position[:, None]
-        return code | {TRANSLATION: position_m, ROTATION_6D: rotation_6d_from_matrix(pose.rotation)[:, None]}
+        return self.outline.of_code(images, self._matrix[0], code, self._optics.diameter_m)
 
     def crop_stage_note(self, tensors: dict[str, str]) -> CropStageNote:
         """What serving has to know to run the refinement pass alone.

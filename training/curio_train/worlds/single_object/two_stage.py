@@ -16,9 +16,9 @@ from torch import nn
 from curio_train.camera import Intrinsics
 from curio_train.data.photographs import UnlabelledPhotographs
 from curio_train.networks.base import StageNetwork
+from curio_train.networks.outline_alignment import OutlineAlignment
 from curio_train.networks.templates.geometry import num_views
 from curio_train.networks.two_stage.network import Optics, TwoStageNetwork
-from curio_train.networks.two_stage.outline_alignment import OutlineAlignment
 from curio_train.worlds.base import Camera
 from curio_train.worlds.single_object.confidence import calibrate
 from curio_train.worlds.single_object.crop_pose_stage import CROP_PX, FILL, CropPoseStage
@@ -55,6 +55,8 @@ class TwoStageWorld(SingleObjectWorld):
 
     photographs: TrainingPhotographs | None
     """Photographs of the object; None: there are none."""
+    aligns_outlines: bool
+    """Whether poses are aligned with the object's outline in the end."""
 
     def __init__(
         self,
@@ -70,12 +72,12 @@ class TwoStageWorld(SingleObjectWorld):
             name: As on the command line.
             object_: What is detected.
             photographs: Of it.
-            aligns_outlines: Poses are aligned with the object's outline in the end.
+            aligns_outlines: Whether poses are aligned with the object's outline in the end.
         """
         camera = frame_camera(object_.camera)
         layout = pose_layout(position_field(object_), confidence=True, color=object_.unpainted)
         super().__init__(name, object_, camera, layout)
-        self.photographs, self._aligns_outlines = photographs, aligns_outlines
+        self.photographs, self.aligns_outlines = photographs, aligns_outlines
         self._stages = LocalisationStage(object_, camera), CropPoseStage(object_)
 
     @property
@@ -101,7 +103,7 @@ class TwoStageWorld(SingleObjectWorld):
             self.camera.matrix, self.object.kind.diameter_m, self.object.near_m, LOCALISATION_STRIDE, CROP_PX, FILL
         )
         directions = num_views(self.object.seen_from_any_side)
-        outline = OutlineAlignment(directions) if self._aligns_outlines else None
+        outline = OutlineAlignment(directions) if self.aligns_outlines else None
         return TwoStageNetwork(localisation, crop_pose, optics, outline)
 
     def calibrate_confidence(self, network: nn.Module, cache: Path) -> None:

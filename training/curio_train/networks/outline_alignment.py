@@ -17,8 +17,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from curio_train.color import linear_from_srgb
+from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.networks.crop_camera import cut_crops
 from curio_train.networks.pose_steps import solve, turn
+from curio_train.scene_code import ROTATION_6D, TRANSLATION
 
 NUM_POINTS = 160
 """Points of the outline in each direction."""
@@ -28,7 +30,7 @@ _REACHES_PX = (8.0, 6.0, 4.0, 3.0)  # to each side of the outline, in which edge
 _STEP_PX = 0.5
 _NEAR_PX, _FAR_PX = 1.5, 7.5  # from the outline: the strips whose colours are inside and outside
 _NOISE = 2e-4  # added to the variance of colours
-_SHORTEST = 1e-9  # squared distance of the two colours: there may be no difference
+_INDISTINCT = 0.01  # squared distance of the two sides' colours, in their deviations, at which edges count a half
 _CLEARNESS = 12.0  # by how much an edge is likelier than none, where all of the discriminant changes within a pixel
 _PRIOR_SPREAD = 0.7  # of how far edges are from the outline, reaches
 _EDGE_PX = 1.0  # standard deviation of where a clear edge is found
@@ -84,6 +86,19 @@ class OutlineAlignment(nn.Module):
         """Keep the outlines of an object, in numbers that half precision holds."""
         for buffer, values in ((self.directions, directions), (self.points, points), (self.outward, outward)):
             buffer.copy_(values.half())
+
+    def of_code(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        matrix: Float[Tensor, "3 3"],
+        code: dict[str, Tensor],
+        diameter_m: float,
+    ) -> dict[str, Tensor]:
+        """A code of one object, metres and 6D rotation [batch, 1, …], with its pose aligned; see :meth:`forward`."""
+        rotation, position_m = matrix_from_rotation_6d(code[ROTATION_6D][:, 0]), code[TRANSLATION][:, 0]
+        pose = self(images, matrix, rotation, position_m / diameter_m)
+        aligned = {ROTATION_6D: rotation_6d_from_matrix(pose.rotation), TRANSLATION: diameter_m * pose.position}
+        return code | {name: value[:, None] for name, value in aligned.items()}
 
     def forward(
         self,
@@ -185,7 +200,7 @@ def _find(
 def _discriminant(
     profiles: Float[Tensor, "batch 3 points offsets"], offsets: Float[Tensor, " offsets"]
 ) -> Float[Tensor, "batch points offsets"]:
-    """The linear discriminant of the colours inside and outside (Fisher 1936); their means differ by 1 in it."""
+    """The linear discriminant of the colours inside and outside (Fisher 1936); their means differ by 1 at most."""
     inside = ((offsets < -_NEAR_PX) & (offsets > -_FAR_PX)).nonzero()[:, 0]
     outside = ((offsets > _NEAR_PX) & (offsets < _FAR_PX)).nonzero()[:, 0]
     (mean_in, spread_in), (mean_out, spread_out) = (
@@ -193,7 +208,7 @@ def _discriminant(
     )
     apart = mean_in - mean_out
     weights = solve((spread_in + spread_out) / 2, apart)
-    length = (weights * apart).sum(dim=1).clamp(min=_SHORTEST)
+    length = (weights * apart).sum(dim=1) + _INDISTINCT
     return (profiles * (weights / length[:, None])[:, :, None, None]).sum(dim=1)
 
 

@@ -1,0 +1,143 @@
+"""Poses that are aligned with the object's outline in an image."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from curio_train.config import NetworkConfig
+from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.networks.outline_alignment import Aligned, OutlineAlignment
+from curio_train.networks.pose_steps import solve, turn
+from curio_train.networks.two_stage.network import TwoStageNetwork
+from curio_train.scene_code import ROTATION_6D, TRANSLATION
+from curio_train.templates.build import fill_outline
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.world import Object
+
+NUM = 24
+
+
+@pytest.fixture(scope="module")
+def world(brick: Object) -> TwoStageWorld:
+    return TwoStageWorld("capture", brick, aligns_outlines=True)
+
+
+@pytest.fixture(scope="module")
+def network(world: TwoStageWorld) -> TwoStageNetwork:
+    torch.manual_seed(0)
+    found = world.assemble([stage.network(NetworkConfig()) for stage in world.stages])
+    assert isinstance(found, TwoStageNetwork)
+    fill_outline(found, world)
+    return found.eval()
+
+
+@pytest.fixture(scope="module")
+def outline(network: TwoStageNetwork) -> OutlineAlignment:
+    assert network.outline is not None
+    return network.outline
+
+
+@pytest.fixture(scope="module")
+def scenes(world: TwoStageWorld) -> tuple[torch.Tensor, Aligned]:
+    """Images of the brick before smooth noise, and its true poses, positions in diameters."""
+    code = world.sample(NUM, (0,))
+    coarse = torch.rand(NUM, 3, 30, 40, generator=torch.Generator().manual_seed(0)) * 0.4
+    with torch.no_grad():
+        images = world.render(code, torch.nn.functional.interpolate(coarse, (480, 640), mode="bicubic")).clamp(0, 1)
+    rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
+    return images, Aligned(rotation, code[TRANSLATION][:, 0] / world.object.kind.diameter_m)
+
+
+def matrix(world: TwoStageWorld) -> torch.Tensor:
+    assert world.camera.matrix is not None
+    return torch.from_numpy(world.camera.matrix).float()
+
+
+def off(found: Aligned, true: Aligned) -> tuple[float, float, float]:
+    """Median errors: degrees, log distance, and across the view in diameters."""
+    cosine = ((found.rotation * true.rotation).sum(dim=(1, 2)) - 1) / 2
+    log_distance = (found.position.norm(dim=1) / true.position.norm(dim=1)).log().abs()
+    across = (found.position[:, :2] / found.position[:, 2:] - true.position[:, :2] / true.position[:, 2:]).norm(dim=1)
+    return (
+        math.degrees(float(cosine.clamp(-1, 1).arccos().median())),
+        float(log_distance.median()),
+        float((across * true.position[:, 2]).median()),
+    )
+
+
+@torch.no_grad()
+def test_outlines_correct_what_a_network_errs_by(
+    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, Aligned]
+) -> None:
+    images, true = scenes
+    random = torch.Generator().manual_seed(1)
+    vector = torch.randn(NUM, 3, generator=random) * math.radians(3)
+    scale = 1 + 0.03 * torch.randn(NUM, 1, generator=random)
+    shift = torch.nn.functional.pad(0.02 * torch.randn(NUM, 2, generator=random), (0, 1))
+    start = Aligned(turn(vector) @ true.rotation, scale * (true.position + shift))
+    found = outline(images, matrix(world), *start)
+    for before, after, share in zip(off(start, true), off(found, true), (0.5, 0.7, 0.4), strict=True):
+        assert after < share * before
+
+
+@torch.no_grad()
+def test_images_are_aligned_alone_as_among_others(
+    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, Aligned]
+) -> None:
+    images, true = scenes
+    both = outline(images[:3], matrix(world), true.rotation[:3], true.position[:3])
+    alone = outline(images[1:2], matrix(world), true.rotation[1:2], true.position[1:2])
+    for together, single in zip(both, alone, strict=True):
+        torch.testing.assert_close(together[1:2], single, atol=1e-4, rtol=1e-4)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("shade", [0.0, 0.5, 1.0])
+def test_where_nothing_is_seen_poses_stay(
+    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, Aligned], shade: float
+) -> None:
+    images, true = scenes
+    found = outline(torch.full_like(images, shade), matrix(world), *true)
+    for before, after in zip(true, found, strict=True):
+        torch.testing.assert_close(after, before, atol=2e-3, rtol=1e-3)
+
+
+@torch.no_grad()
+def test_the_network_answers_aligned_poses(world: TwoStageWorld, network: TwoStageNetwork) -> None:
+    images = torch.rand(2, 3, 480, 640, generator=torch.Generator().manual_seed(2))
+    code = network(images)
+    aligned, network.outline = network.outline, None
+    try:
+        as_read = network(images)
+    finally:
+        network.outline = aligned
+    assert code.keys() == as_read.keys()
+    assert code[TRANSLATION].isfinite().all()
+    assert not torch.equal(code[TRANSLATION], as_read[TRANSLATION])
+
+
+def test_outlines_are_drawn_anew_and_not_taken_from_another_network(
+    world: TwoStageWorld, network: TwoStageNetwork
+) -> None:
+    drawn = [name for name in network.state_dict() if name.startswith(TwoStageNetwork.DRAWN)]
+    assert sorted(drawn) == ["outline.directions", "outline.outward", "outline.points"]
+    assert (
+        TwoStageWorld("linemod", world.object)
+        .assemble([stage.network(NetworkConfig()) for stage in world.stages])
+        .outline
+        is None
+    )
+
+
+def test_steps_are_solved_and_turned() -> None:
+    random = np.random.default_rng(0)
+    root = random.normal(size=(4, 6, 6))
+    positive, right = (
+        torch.from_numpy(root @ root.transpose(0, 2, 1) + np.eye(6)),
+        torch.from_numpy(random.normal(size=(4, 6))),
+    )
+    torch.testing.assert_close((positive @ solve(positive, right)[..., None])[..., 0], right)
+    vector = torch.tensor([[0.0, 0.1, 0.0]], dtype=torch.float64)
+    expected = torch.tensor([[[math.cos(0.1), 0, math.sin(0.1)], [0, 1, 0], [-math.sin(0.1), 0, math.cos(0.1)]]])
+    torch.testing.assert_close(turn(vector).float(), expected, atol=2e-4, rtol=0)
