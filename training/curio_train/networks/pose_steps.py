@@ -14,8 +14,9 @@ def solve(matrix: Float[Tensor, "batch n n"], right: Float[Tensor, "batch n"]) -
     identity = torch.eye(count, dtype=matrix.dtype, device=matrix.device)
     system = torch.cat([matrix, right[..., None]], dim=2)
     for number in range(count):
-        row = system[:, number] / system[:, number, number, None]
-        system = system - (system[:, :, number] - identity[number])[..., None] * row[:, None]
+        here = slice(number, number + 1)  # a slice keeps dimensions, which saves an exported graph nodes
+        row = system[:, here] / system[:, here, here]
+        system = system - (system[:, :, here] - identity[:, here]) * row
     return system[:, :, count]
 
 
