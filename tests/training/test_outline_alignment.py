@@ -1,17 +1,22 @@
 """Poses that are aligned with the object's outline in an image."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from curio_train.config import NetworkConfig
+from curio_train.config import NetworkConfig, RunConfig
 from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.learning.runs.checkpoint import RunFolder
+from curio_train.learning.runs.initial import begin_with
+from curio_train.learning.state import TrainState
 from curio_train.networks.outline_alignment import Aligned, OutlineAlignment
 from curio_train.networks.pose_steps import solve, turn
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import ROTATION_6D, TRANSLATION
 from curio_train.templates.build import fill_outline
+from curio_train.worlds.options import CirclesOptions
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
 
@@ -117,17 +122,32 @@ def test_the_network_answers_aligned_poses(world: TwoStageWorld, network: TwoSta
     assert not torch.equal(code[TRANSLATION], as_read[TRANSLATION])
 
 
-def test_outlines_are_drawn_anew_and_not_taken_from_another_network(
-    world: TwoStageWorld, network: TwoStageNetwork
-) -> None:
-    drawn = [name for name in network.state_dict() if name.startswith(TwoStageNetwork.DRAWN)]
-    assert sorted(drawn) == ["outline.directions", "outline.outward", "outline.points"]
-    assert (
-        TwoStageWorld("linemod", world.object)
-        .assemble([stage.network(NetworkConfig()) for stage in world.stages])
-        .outline
-        is None
-    )
+def test_outlines_are_drawn_anew_and_not_taken_from_another_network(world: TwoStageWorld, tmp_path: Path) -> None:
+    config, path = RunConfig(CirclesOptions(), method="sleep"), tmp_path / "run"
+
+    def begun(of: TwoStageWorld, init: Path | None) -> TwoStageNetwork:
+        state = TrainState(config, of, torch.device("cpu"))
+        if init is None:
+            assert isinstance(state.pose.network, TwoStageNetwork)
+            fill_outline(state.pose.network, of)
+            run = RunFolder(path, config)
+            run.write_config(new=True)
+            run.save(state)
+        else:
+            begin_with(state, init)
+        assert isinstance(state.pose.network, TwoStageNetwork)
+        return state.pose.network
+
+    trained = begun(world, None)
+    with_outline, without = begun(world, path), begun(TwoStageWorld("linemod", world.object), path)
+    assert trained.outline is not None
+    assert with_outline.outline is not None
+    assert without.outline is None
+    assert trained.outline.points.any()
+    assert not with_outline.outline.points.any()
+    for name, value in without.state_dict().items():
+        assert torch.equal(value, trained.state_dict()[name])
+        assert torch.equal(value, with_outline.state_dict()[name])
 
 
 def test_steps_are_solved_and_turned() -> None:
