@@ -11,7 +11,7 @@ from curio_train.geometry import matrix_from_rotation_6d
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.initial import begin_with
 from curio_train.learning.state import TrainState
-from curio_train.networks.outline_alignment import Aligned, OutlineAlignment
+from curio_train.networks.outline_alignment import OutlineAlignment, OutlinePose
 from curio_train.networks.pose_steps import solve, turn
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import ROTATION_6D, TRANSLATION
@@ -44,14 +44,14 @@ def outline(network: TwoStageNetwork) -> OutlineAlignment:
 
 
 @pytest.fixture(scope="module")
-def scenes(world: TwoStageWorld) -> tuple[torch.Tensor, Aligned]:
+def scenes(world: TwoStageWorld) -> tuple[torch.Tensor, OutlinePose]:
     """Images of the brick before smooth noise, and its true poses, positions in diameters."""
     code = world.sample(NUM, (0,))
     coarse = torch.rand(NUM, 3, 30, 40, generator=torch.Generator().manual_seed(0)) * 0.4
     with torch.no_grad():
         images = world.render(code, torch.nn.functional.interpolate(coarse, (480, 640), mode="bicubic")).clamp(0, 1)
     rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0])
-    return images, Aligned(rotation, code[TRANSLATION][:, 0] / world.object.kind.diameter_m)
+    return images, OutlinePose(rotation, code[TRANSLATION][:, 0] / world.object.kind.diameter_m)
 
 
 def matrix(world: TwoStageWorld) -> torch.Tensor:
@@ -59,7 +59,7 @@ def matrix(world: TwoStageWorld) -> torch.Tensor:
     return torch.from_numpy(world.camera.matrix).float()
 
 
-def off(found: Aligned, true: Aligned) -> tuple[float, float, float]:
+def off(found: OutlinePose, true: OutlinePose) -> tuple[float, float, float]:
     """Median errors: degrees, log distance, and across the view in diameters."""
     cosine = ((found.rotation * true.rotation).sum(dim=(1, 2)) - 1) / 2
     log_distance = (found.position.norm(dim=1) / true.position.norm(dim=1)).log().abs()
@@ -73,14 +73,14 @@ def off(found: Aligned, true: Aligned) -> tuple[float, float, float]:
 
 @torch.no_grad()
 def test_outlines_correct_what_a_network_errs_by(
-    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, Aligned]
+    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, OutlinePose]
 ) -> None:
     images, true = scenes
     random = torch.Generator().manual_seed(1)
     vector = torch.randn(NUM, 3, generator=random) * math.radians(3)
     scale = 1 + 0.03 * torch.randn(NUM, 1, generator=random)
     shift = torch.nn.functional.pad(0.02 * torch.randn(NUM, 2, generator=random), (0, 1))
-    start = Aligned(turn(vector) @ true.rotation, scale * (true.position + shift))
+    start = OutlinePose(turn(vector) @ true.rotation, scale * (true.position + shift))
     found = outline(images, matrix(world), *start)
     for before, after, share in zip(off(start, true), off(found, true), (0.5, 0.7, 0.4), strict=True):
         assert after < share * before
@@ -88,7 +88,7 @@ def test_outlines_correct_what_a_network_errs_by(
 
 @torch.no_grad()
 def test_images_are_aligned_alone_as_among_others(
-    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, Aligned]
+    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, OutlinePose]
 ) -> None:
     images, true = scenes
     both = outline(images[:3], matrix(world), true.rotation[:3], true.position[:3])
@@ -100,7 +100,7 @@ def test_images_are_aligned_alone_as_among_others(
 @torch.no_grad()
 @pytest.mark.parametrize("shade", [0.0, 0.5, 1.0])
 def test_where_nothing_is_seen_poses_stay(
-    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, Aligned], shade: float
+    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, OutlinePose], shade: float
 ) -> None:
     images, true = scenes
     found = outline(torch.full_like(images, shade), matrix(world), *true)

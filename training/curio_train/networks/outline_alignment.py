@@ -40,7 +40,7 @@ _NUM_REWEIGHTED = 2
 _SPREAD = (0.105, 0.015, 0.0225)  # of the network's rotation, radians; of log distance; across the view, diameters
 
 
-class Aligned(NamedTuple):
+class OutlinePose(NamedTuple):
     """Poses in the camera of the image."""
 
     rotation: Float[Tensor, "batch 3 3"]
@@ -106,7 +106,7 @@ class OutlineAlignment(nn.Module):
         matrix: Float[Tensor, "3 3"],
         rotation: Float[Tensor, "batch 3 3"],
         position: Float[Tensor, "batch 3"],
-    ) -> Aligned:
+    ) -> OutlinePose:
         """Move poses to where their outlines lie on edges.
 
         Args:
@@ -118,16 +118,16 @@ class OutlineAlignment(nn.Module):
         focal_px = _FILL * _SIDE * position.norm(dim=1)
         crops, crop_from_cam = cut_crops(images, matrix, position[:, None], focal_px, _SIDE)
         colors = linear_from_srgb(crops)
-        pose = Aligned(crop_from_cam @ rotation, (crop_from_cam @ position[..., None])[..., 0])
+        pose = OutlinePose(crop_from_cam @ rotation, (crop_from_cam @ position[..., None])[..., 0])
         moved = torch.zeros_like(torch.cat([position, position], dim=1))
         for reach in _REACHES_PX:
             pose, moved = self._round(colors, focal_px, pose, moved, reach)
         cam_from_crop = crop_from_cam.transpose(1, 2)
-        return Aligned(cam_from_crop @ pose.rotation, (cam_from_crop @ pose.position[..., None])[..., 0])
+        return OutlinePose(cam_from_crop @ pose.rotation, (cam_from_crop @ pose.position[..., None])[..., 0])
 
     def _round(
-        self, colors: Tensor, focal_px: Tensor, pose: Aligned, moved: Float[Tensor, "batch 6"], reach: float
-    ) -> tuple[Aligned, Float[Tensor, "batch 6"]]:
+        self, colors: Tensor, focal_px: Tensor, pose: OutlinePose, moved: Float[Tensor, "batch 6"], reach: float
+    ) -> tuple[OutlinePose, Float[Tensor, "batch 6"]]:
         """One look for edges, and the pose that fits them and the network's own best."""
         turned = pose.rotation.transpose(1, 2)
         view = ((turned @ pose.position[..., None])[..., 0] @ self.directions.T).argmax(dim=1)
@@ -149,7 +149,7 @@ class OutlineAlignment(nn.Module):
         )
         step = self._step(jacobian, edges, moved, _OUTLIER_PX * max(1.0, reach / _WIDEST_OUTLIER))
         shifted = torch.cat([pose.position[:, :2] + step[:, 4:], pose.position[:, 2:]], dim=1)
-        return Aligned(turn(step[:, :3]) @ pose.rotation, shifted * step[:, 3:4].exp()), moved + step
+        return OutlinePose(turn(step[:, :3]) @ pose.rotation, shifted * step[:, 3:4].exp()), moved + step
 
     def _step(
         self, jacobian: Float[Tensor, "batch points 6"], edges: _Edges, moved: Tensor, outlier_px: float

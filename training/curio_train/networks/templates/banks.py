@@ -51,7 +51,6 @@ class Banks(nn.Module):
         super().__init__()
         views, side = num_views(any_side), CROP_PX // COARSE_STRIDE
         num = views * NUM_ROLLS
-        self.num_objects = num_objects
         for name, shape, dtype in (
             ("coarse_mean", (COARSE_WIDTH,), torch.float32),
             ("coarse_projection", (COARSE_SIZE, COARSE_WIDTH), torch.float32),
