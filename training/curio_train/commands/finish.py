@@ -69,8 +69,9 @@ def _exported(
     from curio_train.export.write_model import export
 
     def model(graph: "Graph") -> "ModelProto | None":
+        found = traced(graph)
         verdict()  # the model's card, which is written next, quotes the report
-        return traced(graph)
+        return found
 
     models = run / MODELS_FOLDER
     try:

@@ -226,21 +226,16 @@ class PoseReader(nn.Module):
         scores, shift = (found.flatten(0, 1) for found in self.banks.match(crops.coarse, places.slots).max(dim=3))
         positions_m, place_scores = places.position_m.flatten(0, 1), places.score.flatten()
         shifts, diameter_m = _shifts().to(scores), self._diameter_of(places)
-        found: list[_Hypotheses] = []
-        row = torch.arange(scores.shape[0], device=scores.device)
-        for place, template, score in self._pick(scores, positions_m, _ONE_PLACE * diameter_m):
-            crop = row * num + place
-            slope = shifts[shift[row, place, template]] / crops.focal_px[crop][:, None]
-            ray = torch.cat([slope, torch.ones_like(slope[:, :1])], dim=1)
-            far = crops.distance_m[crop] / diameter_m
-            position = ray / ray.square().sum(dim=1, keepdim=True).sqrt() * far[:, None]
-            rotation = _seen_along(position) @ self.banks.rotations[template]
-            found.append(_Hypotheses(Aligned(rotation, position, score), crop, place_scores[crop]))
-        pose = Aligned(
-            *(torch.stack(values, dim=1).flatten(0, 1) for values in zip(*(one.pose for one in found), strict=True))
-        )
-        of_crops = (torch.stack(values, dim=1).flatten() for values in zip(*(one[1:] for one in found), strict=True))
-        return _Hypotheses(pose, *of_crops)
+        picked = self._pick(scores, positions_m, _ONE_PLACE * diameter_m)
+        place, template, score = (torch.stack(values, dim=1).flatten() for values in zip(*picked, strict=True))
+        row = torch.arange(scores.shape[0], device=scores.device).repeat_interleave(len(picked))
+        crop = row * num + place
+        slope = shifts[shift[row, place, template]] / crops.focal_px[crop][:, None]
+        ray = torch.cat([slope, torch.ones_like(slope[:, :1])], dim=1)
+        far = crops.distance_m[crop] / diameter_m[row]
+        position = ray / ray.square().sum(dim=1, keepdim=True).sqrt() * far[:, None]
+        rotation = _seen_along(position) @ self.banks.rotations[template]
+        return _Hypotheses(Aligned(rotation, position, score), crop, place_scores[crop])
 
     def _pick(
         self,
