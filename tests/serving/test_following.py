@@ -13,9 +13,9 @@ from curio_serve.client import PoseClient
 from curio_serve.client.request import detect_request
 from curio_serve.errors import ArgumentError, ModelError
 from curio_serve.imaging.camera import PinholeCamera
-from curio_serve.models.crop_stage import CROP_STAGE_KEY, CropStageNote
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
+from curio_serve.models.stages.crop_stage import CROP_STAGE_KEY, CropStageNote
 from curio_serve.models.symmetries import symmetry_rotations
 from curio_serve.tracking.pose_filter import PoseFilter
 from curio_serve.tracking.stream import FollowingStream
@@ -254,6 +254,6 @@ def test_a_note_that_cannot_be_is_refused(change: dict[str, object]) -> None:
 
 
 def _outputs() -> tuple[str, ...]:
-    from curio_serve.models.crop_stage import OUTPUTS
+    from curio_serve.models.stages.crop_stage import OUTPUTS
 
     return OUTPUTS

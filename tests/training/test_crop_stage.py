@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 from curio_serve.imaging.camera import PinholeCamera
-from curio_serve.models.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote, cut_crop
 from curio_serve.models.model import from_bytes
+from curio_serve.models.stages.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote, cut_crop
 from curio_train.config import NetworkConfig
 from curio_train.export.crop_stage import traced
 from curio_train.export.graph import Graph

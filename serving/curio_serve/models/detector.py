@@ -18,11 +18,11 @@ from curio_serve.errors import ArgumentError, CameraError, CameraMissing, ImageE
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
-from curio_serve.models.crop_stage import CropPose
 from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Rows, Values
 from curio_serve.models.model import Model, Outputs, Slot
 from curio_serve.models.reliability import add_interval, calibrated, region_status, status_of
 from curio_serve.models.repeated import RepeatedReader
+from curio_serve.models.stages.crop_stage import CropPose
 
 if TYPE_CHECKING:
     from google.protobuf.internal.containers import RepeatedCompositeFieldContainer

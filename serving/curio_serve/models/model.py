@@ -16,10 +16,10 @@ from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.view import CanonicalCamera
 from curio_serve.models.batching import Batcher
-from curio_serve.models.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote
 from curio_serve.models.reliability import RELIABILITY_FILE, parse_reliability
 from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime, open_session, runtime_errors
 from curio_serve.models.spec import check_known, part_of, read_metadata, read_spec, wanted_slots
+from curio_serve.models.stages.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote
 
 if TYPE_CHECKING:
     import onnxruntime

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectModel
 
-from curio_serve.models.crop_stage import CropPose
+from curio_serve.models.stages.crop_stage import CropPose
 from curio_serve.models.symmetries import symmetry_rotations
 from curio_serve.tracking.assignment import assigned
 from curio_serve.tracking.pose_filter import PoseFilter

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 import onnx
-from curio_serve.models.crop_stage import CROP_STAGE_KEY, INPUT, OUTPUTS
+from curio_serve.models.stages.crop_stage import CROP_STAGE_KEY, INPUT, OUTPUTS
 from torch import nn
 
 from curio_train.export.onnx import hide_outputs, put_metadata, to_onnx

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from curio_serve.models.crop_stage import INPUT, CropStageNote
+from curio_serve.models.stages.crop_stage import INPUT, CropStageNote
 from jaxtyping import Float
 from torch import Tensor, nn
 
