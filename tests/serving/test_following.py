@@ -15,7 +15,9 @@ from curio_serve.errors import ArgumentError, ModelError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
+from curio_serve.models.stages import crop_stage, outline_stage
 from curio_serve.models.stages.crop_stage import CROP_STAGE_KEY, CropStageNote
+from curio_serve.models.stages.outline_stage import OUTLINE_STAGE_KEY, OutlineStageNote
 from curio_serve.models.symmetries import symmetry_rotations
 from curio_serve.tracking.pose_filter import PoseFilter
 from curio_serve.tracking.stream import FollowingStream
@@ -245,7 +247,7 @@ def test_an_object_that_moved_while_it_was_hidden_is_found_beside_its_last_place
     "change", [{"side_px": -1}, {"tensors": {}}, {"presence": [1.0]}, {"fill": "wide"}, {"unknown": 1}]
 )
 def test_a_note_that_cannot_be_is_refused(change: dict[str, object]) -> None:
-    names = ("crops", *_outputs())
+    names = (crop_stage.INPUT, *crop_stage.OUTPUTS)
     note: dict[str, object] = {"tensors": {name: name for name in names}, "side_px": 64, "fill": 0.6}
     note |= {"diameter_m": 0.1, "near_m": 0.5, "pose_correct": [1.0, 0.0], "presence": [1.0, 1.0, 0.0]}
     assert CropStageNote.parse(json.dumps(note), "file").side_px == 64
@@ -253,7 +255,13 @@ def test_a_note_that_cannot_be_is_refused(change: dict[str, object]) -> None:
         CropStageNote.parse(json.dumps(note | change), "file")
 
 
-def _outputs() -> tuple[str, ...]:
-    from curio_serve.models.stages.crop_stage import OUTPUTS
-
-    return OUTPUTS
+@pytest.mark.parametrize(
+    "change", [{"side_px": 0}, {"tensors": {}}, {"tensors": [{}]}, {"fill": "wide"}, {"near_m": 1}]
+)
+def test_a_note_of_outlines_that_cannot_be_is_refused(change: dict[str, object]) -> None:
+    names = (*outline_stage.INPUTS, *outline_stage.OUTPUTS)
+    note: dict[str, object] = {"tensors": {name: name for name in names}, "side_px": 128, "fill": 0.6}
+    note |= {"diameter_m": 0.1}
+    assert OutlineStageNote.parse(json.dumps(note), "file").side_px == 128
+    with pytest.raises(ModelError, match=OUTLINE_STAGE_KEY):
+        OutlineStageNote.parse(json.dumps(note | change), "file")

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from curio_train.data.background_image import BackgroundImages, MixedBackgrounds
 from curio_train.data.backgrounds import POOL_HEIGHT, POOL_WIDTH, ClutterBackgrounds, PhotographBackgrounds, render_pool
 from curio_train.data.clutter import dead_leaves_texture
 from curio_train.data.photographs import Photographs
@@ -80,3 +81,31 @@ def test_photographs_as_backgrounds(tmp_path):
     source = PhotographBackgrounds(Photographs(tmp_path))
     assert source.split(train=False).draw(10, 16, 16, (0,)).min() == pytest.approx(200 / 255)
     assert source.split(train=True).draw(30, 16, 16, (0,)).max() == pytest.approx(150 / 255)
+
+
+def test_crops_of_a_plate_span_what_they_span_in_a_frame() -> None:
+    ramp = np.tile(np.linspace(0, 255, 400).astype(np.uint8)[None, :, None], (300, 1, 3))
+    whole = BackgroundImages(ramp).draw(20, 40, 30, (0,))
+    part = BackgroundImages(ramp).of_crops(0.2, 0.3).draw(20, 30, 30, (0,))
+    across = [(views[..., -1] - views[..., 0]).mean(dim=(1, 2)) for views in (whole, part)]
+    assert across[0].min() > 0.55
+    assert across[1].max() < 0.45
+    assert across[1].min() > 0.05
+    assert BackgroundImages(ramp).of_crops(3.0, 4.0).draw(2, 30, 30, (0,)).shape == (2, 3, 30, 30), "larger than it"
+
+
+def test_crops_of_a_plate_are_darker_where_a_part_throws_its_shadow() -> None:
+    plate = BackgroundImages(np.full((300, 400, 3), 128, np.uint8))
+    crops, whole = plate.of_crops(0.2, 0.3).draw(100, 32, 32, (0,)), plate.draw(100, 32, 32, (0,))
+    middle, border = (slice(12, 20), slice(0, 2))
+    relative = [(v[..., middle, middle].mean() / v[..., border, :].mean()).item() for v in (crops, whole)]
+    assert relative[0] < 0.9
+    assert relative[1] == pytest.approx(1, abs=0.05)
+
+
+def test_a_mixture_draws_from_both() -> None:
+    black, white = (BackgroundImages(np.full((30, 40, 3), value, np.uint8)) for value in (0, 255))
+    mixed = MixedBackgrounds(black, white, 0.5).split(True).of_crops(0.5, 1)
+    bright = mixed.draw(40, 8, 6, (3,)).mean(dim=(1, 2, 3)) > 0.5
+    assert 8 < bright.sum() < 32
+    assert torch.equal(mixed.draw(40, 8, 6, (3,)), mixed.draw(40, 8, 6, (3,)))

@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.models.detector import Detector
+from curio_serve.models.model import Model
+from curio_serve.models.model_folder import open_model
 from curio_train.camera import Intrinsics
 from curio_train.commands import train as train_command
 from curio_train.config import NetworkConfig, RunConfig
 from curio_train.data import backgrounds
-from curio_train.data.background_image import BackgroundImages, MixedBackgrounds
+from curio_train.data.background_image import BackgroundImages
 from curio_train.data.photographs import NUM_JUDGED
 from curio_train.doctor.examine import refuse_unfit
 from curio_train.errors import CameraError, DataError, MeshError, UsageError
@@ -148,34 +152,6 @@ def test_backgrounds_are_the_plate_and_clutter(folder: Path, world: TwoStageWorl
     assert crops.shape == (8, 3, 64, 64)
 
 
-def test_crops_of_a_plate_span_what_they_span_in_a_frame() -> None:
-    ramp = np.tile(np.linspace(0, 255, 400).astype(np.uint8)[None, :, None], (300, 1, 3))
-    whole = BackgroundImages(ramp).draw(20, 40, 30, (0,))
-    part = BackgroundImages(ramp).of_crops(0.2, 0.3).draw(20, 30, 30, (0,))
-    across = [(views[..., -1] - views[..., 0]).mean(dim=(1, 2)) for views in (whole, part)]
-    assert across[0].min() > 0.55
-    assert across[1].max() < 0.45
-    assert across[1].min() > 0.05
-    assert BackgroundImages(ramp).of_crops(3.0, 4.0).draw(2, 30, 30, (0,)).shape == (2, 3, 30, 30), "larger than it"
-
-
-def test_crops_of_a_plate_are_darker_where_a_part_throws_its_shadow() -> None:
-    plate = BackgroundImages(np.full((300, 400, 3), 128, np.uint8))
-    crops, whole = plate.of_crops(0.2, 0.3).draw(100, 32, 32, (0,)), plate.draw(100, 32, 32, (0,))
-    middle, border = (slice(12, 20), slice(0, 2))
-    relative = [(v[..., middle, middle].mean() / v[..., border, :].mean()).item() for v in (crops, whole)]
-    assert relative[0] < 0.9
-    assert relative[1] == pytest.approx(1, abs=0.05)
-
-
-def test_a_mixture_draws_from_both() -> None:
-    black, white = (BackgroundImages(np.full((30, 40, 3), value, np.uint8)) for value in (0, 255))
-    mixed = MixedBackgrounds(black, white, 0.5).split(True).of_crops(0.5, 1)
-    bright = mixed.draw(40, 8, 6, (3,)).mean(dim=(1, 2, 3)) > 0.5
-    assert 8 < bright.sum() < 32
-    assert torch.equal(mixed.draw(40, 8, 6, (3,)), mixed.draw(40, 8, 6, (3,)))
-
-
 def photographs(world: World) -> CapturePhotographs:
     assert isinstance(world, TwoStageWorld)
     assert isinstance(world.photographs, CapturePhotographs)
@@ -273,6 +249,21 @@ def call(*words: object) -> int:
     return int(exit_.value.code or 0)
 
 
+def check_followed_poses_are_aligned(model: Model) -> None:
+    """What is read from crops, as of an object that is followed, is aligned with its outline as whole frames are."""
+    assert model.crop_stage is not None
+    assert model.outline_stage is not None
+    camera, focal_px = PinholeCamera(np.asarray(model.camera.matrix)), model.camera.focal_lengths[0]
+    pixels = np.random.default_rng(0).integers(0, 255, (480, 640, 3), np.uint8)
+    expected_m = np.array([0.0, 0.0, 0.7])
+    read = model.crop_stage.read(pixels, camera, expected_m, focal_px)
+    aligned = model.outline_stage.aligned(pixels, camera, read, focal_px)
+    found = Detector(model).read_crops(pixels, camera, expected_m)
+    np.testing.assert_array_equal(found.translation_m, aligned.translation_m)
+    np.testing.assert_array_equal(found.rotation, aligned.rotation)
+    assert not np.array_equal(aligned.translation_m, read.translation_m)
+
+
 def test_from_files_to_a_model_by_a_project_file(
     folder: Path,
     tmp_path: Path,
@@ -299,7 +290,7 @@ def test_from_files_to_a_model_by_a_project_file(
     assert f"curio-serve {run / 'models'}" in told
     assert "by its photographs, without labels: Do not trust it: in 0% of" in told
     assert f"curio-detect {run / 'models' / 'bracket'} PHOTOS --camera {folder / 'camera.json'}" in told
-    assert (run / "models" / "bracket" / "1" / "model.onnx").is_file()
+    check_followed_poses_are_aligned(open_model(run / "models" / "bracket"))
     config = RunFolder.open(run).config
     assert config.world == options(folder, upright=True)
     assert (config.images, config.recipe.batch_size) == (12, 4)

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.crop import cut_crop
 from curio_serve.models.model import from_bytes
-from curio_serve.models.stages.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote, cut_crop
+from curio_serve.models.stages.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote
 from curio_train.config import NetworkConfig
-from curio_train.export.crop_stage import traced
 from curio_train.export.graph import Graph
 from curio_train.export.onnx import put_spec, store_half
 from curio_train.export.spec import model_spec
+from curio_train.export.stages import traced
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
@@ -67,6 +68,6 @@ def test_a_note_of_tensors_that_need_more_than_crops_is_refused(exported: tuple[
     _, data = exported
     note = CropStageNote.parse(read_metadata(data, CROP_STAGE_KEY), "brick.onnx")
     wrong = CropStageNote(**{**note.__dict__, "tensors": {**note.tensors, "crops": "image_of_nothing"}})
-    with pytest.raises(ModelError, match="beside the crops"):
+    with pytest.raises(ModelError, match="beside image_of_nothing"):
         CropStage(data, wrong, "brick.onnx", ())
     assert json.loads(read_metadata(data, CROP_STAGE_KEY))["side_px"] == 64

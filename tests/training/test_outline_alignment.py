@@ -1,13 +1,21 @@
 """Poses that are aligned with the object's outline in an image."""
 
+import dataclasses
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from curio_serve.errors import ModelError
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.models.stages import outline_stage
+from curio_serve.models.stages.crop_stage import CropPose
+from curio_serve.models.stages.outline_stage import OutlineStage, OutlineStageNote
 from curio_train.config import NetworkConfig, RunConfig
-from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.export.graph import pixels_of
+from curio_train.export.onnx import to_onnx
+from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.initial import begin_with
 from curio_train.learning.state import TrainState
@@ -120,6 +128,78 @@ def test_the_network_answers_aligned_poses(world: TwoStageWorld, network: TwoSta
     assert code.keys() == as_read.keys()
     assert code[TRANSLATION].isfinite().all()
     assert not torch.equal(code[TRANSLATION], as_read[TRANSLATION])
+
+
+class Alone(torch.nn.Module):
+    """A graph that is nothing but the alignment of a pose that is nearly always the same."""
+
+    def __init__(self, outline: OutlineAlignment, matrix: torch.Tensor, start: OutlinePose, diameter_m: float) -> None:
+        super().__init__()
+        self._outline, self._diameter_m = outline, diameter_m
+        self.register_buffer("_matrix", matrix)
+        self.register_buffer("_rotation", rotation_6d_from_matrix(start.rotation))
+        self.register_buffer("_position_m", start.position * diameter_m)
+
+    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        pixels = pixels_of(image)
+        little = 1e-6 * pixels.mean(dim=(1, 2, 3))[:, None, None]  # a pose that depends on nothing would be a constant
+        pose = (values + little for values in (self._rotation, self._position_m))
+        code = dict(zip((ROTATION_6D, TRANSLATION), pose, strict=True))
+        aligned, tensors = self._outline.of_code(pixels, self._matrix, code, self._diameter_m)
+        return (*aligned.values(), *tensors.values())
+
+
+@pytest.fixture(scope="module")
+def stage(
+    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, OutlinePose]
+) -> tuple[OutlineStage, bytes, OutlineStageNote]:
+    """The alignment as serving cuts it out of a graph."""
+    names = [*outline_stage.INPUTS, *outline_stage.OUTPUTS]
+    start, diameter_m = OutlinePose(*(values[:1] for values in scenes[1])), world.object.kind.diameter_m
+    graph = Alone(outline, matrix(world), start, diameter_m).eval()
+    data = to_onnx(graph, 640, 480, [ROTATION_6D, TRANSLATION, *names]).SerializeToString()
+    note = outline.note({name: name for name in names}, diameter_m)
+    return OutlineStage(data, note, "brick.onnx", ("CPUExecutionProvider",)), data, note
+
+
+@torch.no_grad()
+def test_the_alignment_alone_moves_poses_as_the_network_does(
+    world: TwoStageWorld,
+    outline: OutlineAlignment,
+    scenes: tuple[torch.Tensor, OutlinePose],
+    stage: tuple[OutlineStage, bytes, OutlineStageNote],
+) -> None:
+    diameter_m, camera = world.object.kind.diameter_m, PinholeCamera(np.asarray(world.camera.matrix))
+    images, true = scenes
+    start = OutlinePose(turn(torch.tensor([[0.03, -0.03, 0.02]])) @ true.rotation, 1.02 * true.position)
+    expected = outline(images, matrix(world), *start)
+    gaps, moves = [], []
+    for number, image in enumerate(images):
+        pixels = (image.permute(1, 2, 0) * 255).round().byte().numpy()
+        read = pose_read(start.rotation[number], diameter_m * start.position[number])
+        found = stage[0].aligned(pixels, camera, read, camera.focal_lengths[0])
+        assert found.confidence == read.confidence
+        gaps.append(np.linalg.norm(found.translation_m - diameter_m * expected.position[number].numpy()))
+        moves.append(np.linalg.norm(found.translation_m - read.translation_m))
+        assert np.allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-5)
+    assert max(gaps) < 0.05 * np.median(moves), "crops' pixels are rounded, and sampled by OpenCV"
+
+
+def test_a_pose_behind_the_camera_stays(stage: tuple[OutlineStage, bytes, OutlineStageNote]) -> None:
+    read = pose_read(torch.eye(3), torch.tensor([0.0, 0.1, -0.5]))
+    camera = PinholeCamera(np.diag([572.4, 572.4, 1.0]))
+    assert stage[0].aligned(np.zeros((480, 640, 3), np.uint8), camera, read, 572.4) is read
+
+
+def test_a_note_of_tensors_that_are_not_there_is_refused(stage: tuple[OutlineStage, bytes, OutlineStageNote]) -> None:
+    _, data, note = stage
+    wrong = dataclasses.replace(note, tensors={**note.tensors, "crops": "image_of_nothing"})
+    with pytest.raises(ModelError, match=r"curio\.outline_stage names tensors that need .* beside image_of_nothing"):
+        OutlineStage(data, wrong, "brick.onnx", ())
+
+
+def pose_read(rotation: torch.Tensor, position_m: torch.Tensor) -> CropPose:
+    return CropPose(position_m.numpy(), rotation.numpy(), 0.5, np.eye(3), 0.01, np.ones(3))
 
 
 def test_outlines_are_drawn_anew_and_not_taken_from_another_network(world: TwoStageWorld, tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
-from curio_train.export.crop_stage import num_choosable
 from curio_train.export.onnx import to_onnx
+from curio_train.export.stages import num_choosable
 from curio_train.geometry import Pose
 from curio_train.meshes.shapes import chair
 from curio_train.networks.crop_camera import cut_crops

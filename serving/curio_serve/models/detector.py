@@ -182,6 +182,8 @@ class Detector:
     def read_crops(self, pixels: Array, camera: PinholeCamera, position_m: Array) -> CropPose:
         """The pose of the one object of a model with a crop-pose stage, in crops around a position.
 
+        It is aligned with the object's outline where the model's poses are.
+
         Args:
             pixels: uint8 RGB [height, width, 3].
             camera: That took them.
@@ -191,7 +193,10 @@ class Detector:
             InternalError: The network failed.
         """
         assert self.model.crop_stage is not None
-        pose = self.model.crop_stage.read(pixels, camera, position_m, self.model.camera.focal_lengths[0])
+        focal_px = self.model.camera.focal_lengths[0]
+        pose = self.model.crop_stage.read(pixels, camera, position_m, focal_px)
+        if self.model.outline_stage is not None:
+            pose = self.model.outline_stage.aligned(pixels, camera, pose, focal_px)
         return replace(pose, confidence=calibrated(self._calibration, pose.confidence))
 
     def reduction(self, camera: PinholeCamera | None, width: int, height: int) -> int:

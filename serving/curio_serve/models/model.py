@@ -20,6 +20,7 @@ from curio_serve.models.reliability import RELIABILITY_FILE, parse_reliability
 from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime, open_session, runtime_errors
 from curio_serve.models.spec import check_known, part_of, read_metadata, read_spec, wanted_slots
 from curio_serve.models.stages.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote
+from curio_serve.models.stages.outline_stage import OUTLINE_STAGE_KEY, OutlineStage, OutlineStageNote
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -72,6 +73,8 @@ class Model:
     """Of the file, hexadecimal."""
     crop_stage: CropStage | None = None
     """Reads poses from crops alone; None: the model has no such stage."""
+    outline_stage: OutlineStage | None = None
+    """Aligns what that reads with the object's outline; None: such poses stay as they are read."""
 
     def __init__(
         self,
@@ -218,9 +221,11 @@ def from_bytes(data: bytes, where: str, name: str = "", version: int = 0, runtim
     model = Model(session, spec, name, version, hashlib.sha256(data).hexdigest(), runtime.max_batch)
     _check_graph(session, model)
     _check_outputs(model)
-    note = read_metadata(data, CROP_STAGE_KEY)
-    if note and model.camera.matrix is not None and spec.num_slots == 1:
-        model.crop_stage = CropStage(data, CropStageNote.parse(note, where), where, runtime.providers)
+    if model.camera.matrix is not None and spec.num_slots == 1:
+        if note := read_metadata(data, CROP_STAGE_KEY):
+            model.crop_stage = CropStage(data, CropStageNote.parse(note, where), where, runtime.providers)
+        if note := read_metadata(data, OUTLINE_STAGE_KEY):
+            model.outline_stage = OutlineStage(data, OutlineStageNote.parse(note, where), where, runtime.providers)
     return model
 
 

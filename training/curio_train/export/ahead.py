@@ -9,9 +9,9 @@ import onnx_ir as ir
 import torch
 
 from curio_train.config import RunConfig
-from curio_train.export.crop_stage import num_choosable
 from curio_train.export.graph import Graph, deployable
 from curio_train.export.onnx import simplified, traced_program
+from curio_train.export.stages import num_choosable
 from curio_train.learning.state import TrainState
 from curio_train.second_process import SecondProcess
 from curio_train.worlds import build

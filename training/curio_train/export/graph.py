@@ -11,8 +11,8 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from curio_train.errors import ExportError
-from curio_train.export.crop_stage import STAGE_TENSORS
 from curio_train.export.parity import LARGEST_PARITY_ERROR
+from curio_train.export.stages import stage_tensors
 from curio_train.networks.layers import fold_batch_norm
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import TRANSLATION, joined
@@ -44,12 +44,12 @@ class Graph(nn.Module):
         self.eval()
 
     def forward(self, image: Tensor, slots: Tensor | None = None) -> tuple[Tensor, ...]:
-        """The outputs, of the wanted slots alone if given, then the tensors of the crop-pose stage, if there is one."""
+        """The outputs, of the wanted slots alone if given, then the tensors of the last stages, if it has such."""
         if not isinstance(self.network, TwoStageNetwork):
             code = self.network(pixels_of(image)) if slots is None else self.network(pixels_of(image), slots)
             return tuple(self._world.outputs.from_code(code).values())
-        code, stage = self.network.with_crop_stage(pixels_of(image))
-        return (*self._world.outputs.from_code(code).values(), *(stage[name] for name in STAGE_TENSORS))
+        code, stages = self.network.with_stages(pixels_of(image))
+        return (*self._world.outputs.from_code(code).values(), *(stages[name] for name in stage_tensors(self.network)))
 
     def outputs(self, image: Tensor) -> dict[str, Tensor]:
         """Outputs by name, for uint8 images [batch, height, width, 3]."""

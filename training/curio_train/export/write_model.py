@@ -18,13 +18,13 @@ from torch import Tensor, nn
 from curio_train.config import RunConfig
 from curio_train.errors import ExportError, UsageError
 from curio_train.export.card import Provenance, card
-from curio_train.export.crop_stage import num_choosable, traced
 from curio_train.export.folder import ModelFolder, triton_config
 from curio_train.export.graph import Graph, check_images, deployable, numerically_stable, pixels_of
 from curio_train.export.int8 import rounded_otherwise
 from curio_train.export.onnx import put_spec, store_half
 from curio_train.export.parity import largest_difference, refuse_disparity
 from curio_train.export.spec import model_spec
+from curio_train.export.stages import num_choosable, traced
 from curio_train.exported_model import WEIGHTS_FILE, ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import to_portable

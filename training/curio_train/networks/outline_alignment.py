@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
+from curio_serve.models.stages.outline_stage import INPUTS, OUTPUTS, OutlineStageNote
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -37,16 +38,34 @@ _EDGE_PX = 1.0  # standard deviation of where a clear edge is found
 _OUTLIER_PX = 1.6  # at which an edge counts a quarter, in the last rounds (Geman and McClure 1985)
 _WIDEST_OUTLIER = 4.0  # pixels of reach up to which outliers are as near
 _NUM_REWEIGHTED = 2
+_SHORTEST = 1e-12
 _SPREAD = (0.105, 0.015, 0.0225)  # of the network's rotation, radians; of log distance; across the view, diameters
 
 
 class OutlinePose(NamedTuple):
-    """Poses in the camera of the image."""
+    """Poses in the camera of the image, or of a crop."""
 
     rotation: Float[Tensor, "batch 3 3"]
     """cam_from_obj."""
     position: Float[Tensor, "batch 3"]
     """Diameters."""
+
+
+class _Crops(NamedTuple):
+    """What poses are aligned in."""
+
+    crops: Float[Tensor, "batch 3 side side"]
+    """SRGB in [0, 1], around the objects."""
+    focal_px: Float[Tensor, " batch"]
+    """Of the crops' cameras, whose principal points are their middles."""
+    pose: OutlinePose
+    """In these cameras, before the alignment."""
+    crop_from_cam: Float[Tensor, "batch 3 3"]
+    """Rotations from the images' camera."""
+
+    def in_frame(self, pose: OutlinePose) -> OutlinePose:
+        """Poses in the camera of the images."""
+        return _turned(self.crop_from_cam.transpose(1, 2), pose)
 
 
 class _Edges(NamedTuple):
@@ -93,12 +112,30 @@ class OutlineAlignment(nn.Module):
         matrix: Float[Tensor, "3 3"],
         code: dict[str, Tensor],
         diameter_m: float,
-    ) -> dict[str, Tensor]:
-        """A code of one object, metres and 6D rotation [batch, 1, …], with its pose aligned; see :meth:`forward`."""
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """A code of one object, metres and 6D rotation [batch, 1, …], with its pose aligned; see :meth:`forward`.
+
+        Returns:
+            The code, and the tensors at which the alignment can be cut out of an exported graph.
+        """
         rotation, position_m = matrix_from_rotation_6d(code[ROTATION_6D][:, 0]), code[TRANSLATION][:, 0]
-        pose = self(images, matrix, rotation, position_m / diameter_m)
-        aligned = {ROTATION_6D: rotation_6d_from_matrix(pose.rotation), TRANSLATION: diameter_m * pose.position}
-        return code | {name: value[:, None] for name, value in aligned.items()}
+        seen = _cut(images, matrix, OutlinePose(rotation, position_m / diameter_m))
+        pose = self._in_crops(seen)
+        in_frame = seen.in_frame(pose)
+        aligned = {ROTATION_6D: rotation_6d_from_matrix(in_frame.rotation), TRANSLATION: diameter_m * in_frame.position}
+        tensors = *(seen.crops, seen.focal_px), *seen.pose, *pose
+        return code | {name: value[:, None] for name, value in aligned.items()}, dict(
+            zip((*INPUTS, *OUTPUTS), tensors, strict=True)
+        )
+
+    def note(self, tensors: dict[str, str], diameter_m: float) -> OutlineStageNote:
+        """What serving has to know to run the alignment alone.
+
+        Args:
+            tensors: Names in the exported graph of what :meth:`of_code` gives beside the code.
+            diameter_m: Of the object.
+        """
+        return OutlineStageNote(tensors, _SIDE, _FILL, diameter_m)
 
     def forward(
         self,
@@ -115,15 +152,17 @@ class OutlineAlignment(nn.Module):
             rotation: cam_from_obj, right to some degrees.
             position: In front of the camera, diameters, right to some per cent.
         """
-        focal_px = _FILL * _SIDE * position.norm(dim=1)
-        crops, crop_from_cam = cut_crops(images, matrix, position[:, None], focal_px, _SIDE)
-        colors = linear_from_srgb(crops)
-        pose = OutlinePose(crop_from_cam @ rotation, (crop_from_cam @ position[..., None])[..., 0])
-        moved = torch.zeros_like(torch.cat([position, position], dim=1))
+        seen = _cut(images, matrix, OutlinePose(rotation, position))
+        return seen.in_frame(self._in_crops(seen))
+
+    def _in_crops(self, seen: _Crops) -> OutlinePose:
+        """The poses in the crops' cameras, aligned."""
+        colors, pose = linear_from_srgb(seen.crops), seen.pose
+        # Nothing here may take its shape from the images, which are not there where this is cut out of a graph.
+        moved = torch.cat([pose.position, pose.position], dim=1) * 0
         for reach in _REACHES_PX:
-            pose, moved = self._round(colors, focal_px, pose, moved, reach)
-        cam_from_crop = crop_from_cam.transpose(1, 2)
-        return OutlinePose(cam_from_crop @ pose.rotation, (cam_from_crop @ pose.position[..., None])[..., 0])
+            pose, moved = self._round(colors, seen.focal_px, pose, moved, reach)
+        return pose
 
     def _round(
         self, colors: Tensor, focal_px: Tensor, pose: OutlinePose, moved: Float[Tensor, "batch 6"], reach: float
@@ -135,7 +174,8 @@ class OutlineAlignment(nn.Module):
         seen = arm + pose.position[:, None]
         depth = seen[..., 2:].clamp(min=1e-3)
         slope, along = seen[..., :2] / depth, self.outward[view] @ turned
-        across = F.normalize(along[..., :2] - slope * along[..., 2:], dim=-1)
+        across = along[..., :2] - slope * along[..., 2:]
+        across = across / across.norm(dim=-1, keepdim=True).clamp(min=_SHORTEST)
         scale = focal_px[:, None, None]
         edges = _find(colors, scale * slope + (_SIDE - 1) / 2, across, reach)
         by_point = torch.cat([across, -(across * slope).sum(dim=-1, keepdim=True)], dim=-1) * scale / depth
@@ -155,8 +195,7 @@ class OutlineAlignment(nn.Module):
         self, jacobian: Float[Tensor, "batch points 6"], edges: _Edges, moved: Tensor, outlier_px: float
     ) -> Float[Tensor, "batch 6"]:
         """Rotation vector, logarithm of the distance, and shift across the view, diameters."""
-        residual = edges.distance_px
-        step = torch.zeros_like(moved)
+        residual, step = edges.distance_px, moved
         for _ in range(_NUM_REWEIGHTED):
             weight = edges.weight / (1 + (residual / outlier_px).square()).square()
             weighted = jacobian * weight[..., None]
@@ -165,6 +204,17 @@ class OutlineAlignment(nn.Module):
             step = solve(hessian, slope)
             residual = edges.distance_px - (jacobian @ step[..., None])[..., 0]
         return step
+
+
+def _cut(images: Tensor, matrix: Tensor, pose: OutlinePose) -> _Crops:
+    """Crops around poses in images."""
+    focal_px = _FILL * _SIDE * pose.position.norm(dim=1)
+    crops, crop_from_cam = cut_crops(images, matrix, pose.position[:, None], focal_px, _SIDE)
+    return _Crops(crops, focal_px, _turned(crop_from_cam, pose), crop_from_cam)
+
+
+def _turned(rotation: Float[Tensor, "batch 3 3"], pose: OutlinePose) -> OutlinePose:
+    return OutlinePose(rotation @ pose.rotation, (rotation @ pose.position[..., None])[..., 0])
 
 
 def _offsets(reach: float) -> Tensor:
@@ -185,7 +235,7 @@ def _find(
     border = 1 - 1 / colors.shape[-1]
     grid = ((2 * places + 1) / colors.shape[-1] - 1).clamp(-border, border)
     profiles = F.grid_sample(colors, grid, align_corners=False)  # [batch, 3, points, offsets]
-    told = _discriminant(profiles, offsets)
+    told = _discriminant(profiles)
     wide, count = round(far / _STEP_PX) - round(reach / _STEP_PX), len(offsets)
     inner, outer = told[..., wide - 1 : count - wide - 1], told[..., wide + 1 : count - wide + 1]
     candidates = _offsets(reach).to(colors)
@@ -197,14 +247,13 @@ def _find(
     return _Edges(distance, seen / (variance + _EDGE_PX**2))
 
 
-def _discriminant(
-    profiles: Float[Tensor, "batch 3 points offsets"], offsets: Float[Tensor, " offsets"]
-) -> Float[Tensor, "batch points offsets"]:
+def _discriminant(profiles: Float[Tensor, "batch 3 points offsets"]) -> Float[Tensor, "batch points offsets"]:
     """The linear discriminant of the colours inside and outside (Fisher 1936); their means differ by 1 at most."""
-    inside = ((offsets < -_NEAR_PX) & (offsets > -_FAR_PX)).nonzero()[:, 0]
-    outside = ((offsets > _NEAR_PX) & (offsets < _FAR_PX)).nonzero()[:, 0]
+    middle = profiles.shape[3] // 2
+    nearest, farthest = round(_NEAR_PX / _STEP_PX), min(round(_FAR_PX / _STEP_PX) - 1, middle)
     (mean_in, spread_in), (mean_out, spread_out) = (
-        _mean_and_spread(profiles.index_select(3, strip)) for strip in (inside, outside)
+        _mean_and_spread(profiles.narrow(3, first, farthest - nearest))
+        for first in (middle - farthest, middle + nearest + 1)
     )
     apart = mean_in - mean_out
     weights = solve((spread_in + spread_out) / 2, apart)

@@ -11,14 +11,14 @@ _CROSS = [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 
 def solve(matrix: Float[Tensor, "batch n n"], right: Float[Tensor, "batch n"]) -> Float[Tensor, "batch n"]:
     """Solve by Gauss–Jordan elimination, written out: a positive definite matrix needs no pivots.
 
-    ``narrow`` and ``split`` instead of slices, of which an export traces one for each dimension that stays whole.
+    ``narrow`` instead of slices, of which an export traces one for each dimension that stays whole, too.
     """
     count = matrix.shape[1]
-    units = torch.eye(count, dtype=matrix.dtype, device=matrix.device).split(1, dim=1)
+    identity = torch.eye(count, dtype=matrix.dtype, device=matrix.device)
     system = torch.cat([matrix, right.unsqueeze(2)], dim=2)
-    for number, unit in enumerate(units):
+    for number in range(count):
         row, column = system.narrow(1, number, 1), system.narrow(2, number, 1)
-        system = system - (column - unit) * (row / row.narrow(2, number, 1))
+        system = system - (column - identity.narrow(1, number, 1)) * (row / row.narrow(2, number, 1))
     return system.select(2, count)
 
 

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
-from curio_proto.files.onnx_outline_pb2 import OnnxModel, OnnxValue
 
 from curio_serve.errors import InternalError, ModelError
-from curio_serve.imaging.camera import PinholeCamera, scaling
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.crop import cut_crop
 from curio_serve.imaging.rotation import smallest_rotation
 from curio_serve.models.runtime import open_session, runtime_errors
+from curio_serve.models.stages.cut_graph import cut_graph
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -34,8 +34,6 @@ OUTPUTS = (
 )
 """Tensors that the stage reads from crops: pose, its logit and light in each crop's camera, visibility logits of the
 object [n, 16, 16], and each cell's own pose and weight. Positions are (x, y) in diameters and z in expected depths."""
-_FLOAT32 = 1
-_OVERSAMPLING = 2  # as in training: each pixel of a crop is the mean of four samples
 _NUM_CLEAREST = 16  # patches whose mean logit says whether the object is visible
 _FAR_BEHIND = 0.05  # cosine to the optical axis below which nothing is cut out
 _SCALES = (1 / 1.09, 1.09)  # of the expected distance: the errors of two crops are nearly independent
@@ -115,7 +113,8 @@ class CropStage:
             ModelError: The graph has not the tensors of the note.
         """
         self.note, self._where, self._providers = note, where, tuple(providers)
-        self._graph = _cut(data, note, where)
+        outputs = [note.tensors[name] for name in OUTPUTS]
+        self._graph = cut_graph(data, [note.tensors[INPUT]], outputs, f"{where}: {CROP_STAGE_KEY}")
 
     @cached_property
     def _session(self) -> "onnxruntime.InferenceSession":
@@ -206,47 +205,6 @@ class CropStage:
         return correct * _sigmoid(seen)
 
 
-def cut_crop(
-    pixels: Array,
-    camera: PinholeCamera,
-    crop_from_cam: Array,
-    focal_px: float,
-    side_px: int,
-    canonical_focal_px: float,
-) -> Array:
-    """A crop by a virtual camera at the frame's camera, each pixel the mean of four samples.
-
-    Args:
-        pixels: uint8 RGB [height, width, 3].
-        camera: That took them.
-        crop_from_cam: Rotation [3, 3].
-        focal_px: Of the crop; its principal point is its middle.
-        side_px: Of the crop.
-        canonical_focal_px: Frames of a longer focal length are averaged down to this one.
-
-    Returns:
-        uint8 RGB [side_px, side_px, 3]; beyond the frame its edge pixels continue.
-    """
-    fine = _OVERSAMPLING * side_px
-    middle, focal = (fine - 1) / 2, _OVERSAMPLING * focal_px
-    target = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
-    matrix = camera.matrix
-    reduced = round(max(1.0, camera.focal_lengths[0] / canonical_focal_px))
-    if reduced > 1:
-        pixels = cv2.resize(pixels, None, fx=1 / reduced, fy=1 / reduced, interpolation=cv2.INTER_AREA)
-        matrix = scaling(1 / reduced, 1 / reduced) @ matrix
-    if camera.coefficients is not None:
-        maps = cv2.initUndistortRectifyMap(
-            matrix, camera.coefficients, crop_from_cam, target, (fine, fine), cv2.CV_32FC1
-        )
-        image = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    else:
-        frame_from_crop = matrix @ crop_from_cam.T @ np.linalg.inv(target)
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        image = cv2.warpPerspective(pixels, frame_from_crop, (fine, fine), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return cv2.resize(image, (side_px, side_px), interpolation=cv2.INTER_AREA)
-
-
 def rotations_from_6d(values: Array) -> Array:
     """Rotations [n, 3, 3] of 6D vectors [n, 6]: the first two columns, made orthonormal (Zhou et al. 2019)."""
     first, second = values[:, :3].astype(float), values[:, 3:].astype(float)
@@ -273,44 +231,3 @@ def _visibility(logits: Array, num: int) -> float:
 
 def _sigmoid(value: float) -> float:
     return 1 / (1 + math.exp(-min(max(value, -60.0), 60.0)))
-
-
-def _cut(data: bytes, note: CropStageNote, where: str) -> bytes:
-    """The part of a graph between the crops and what is read from them.
-
-    Raises:
-        ModelError: A tensor of the note is none of the graph's, or needs more than the crops.
-    """
-    model = OnnxModel.FromString(data)
-    graph, crops = model.graph, note.tensors[INPUT]
-    outputs = [note.tensors[name] for name in OUTPUTS]
-    number_of = {name: number for number, node in enumerate(graph.node) for name in node.output}
-    constants = {tensor.name for tensor in graph.initializer}
-    needed, pending = set[int](), list(outputs)
-    while pending:
-        name = pending.pop()
-        if not name or name == crops or name in constants:
-            continue
-        if name not in number_of:
-            raise ModelError(f"{where}: {CROP_STAGE_KEY} names tensors that need {name!r} beside the crops")
-        if number_of[name] not in needed:
-            needed.add(number_of[name])
-            pending += graph.node[number_of[name]].input
-    nodes = [graph.node[number] for number in sorted(needed)]
-    used = {name for node in nodes for name in node.input}
-    initializers = [tensor for tensor in graph.initializer if tensor.name in used]
-    part = OnnxModel()
-    part.CopyFrom(model)
-    for field in ("node", "initializer", "sparse_initializer", "input", "output"):
-        part.graph.ClearField(field)
-    part.graph.node.extend(nodes)
-    part.graph.initializer.extend(initializers)
-    part.graph.input.append(_float(crops))
-    part.graph.output.extend(map(_float, outputs))
-    return part.SerializeToString()
-
-
-def _float(name: str) -> OnnxValue:
-    value = OnnxValue(name=name)
-    value.type.tensor_type.elem_type = _FLOAT32
-    return value

@@ -70,7 +70,7 @@ class TemplateNetwork(nn.Module):
     def _finished(self, images: Tensor, code: dict[str, Tensor]) -> dict[str, Tensor]:
         """The code with its pose aligned, and with the colour, where the network has them."""
         if self.outline is not None:
-            code = self.outline.of_code(images, self._matrix, code, self.geometry.diameter_m)
+            code, _ = self.outline.of_code(images, self._matrix, code, self.geometry.diameter_m)
         if not len(self.color):
             return code
         return code | {COLOR: self.color.expand(*code[TRANSLATION].shape[:2], 3)}

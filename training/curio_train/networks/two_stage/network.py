@@ -6,7 +6,9 @@ from typing import Final, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from curio_serve.models.stages.crop_stage import INPUT, CropStageNote
+from curio_serve.models.stages import crop_stage, outline_stage
+from curio_serve.models.stages.crop_stage import CropStageNote
+from curio_serve.models.stages.outline_stage import OutlineStageNote
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -20,6 +22,7 @@ from curio_train.networks.two_stage.localise import TOP_LOG_WEIGHTS, TOP_PROPOSA
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
 _VISIBILITY = "visibility"
+_CROP_STAGE, _OUTLINE_STAGE = "crop_stage.", "outline_stage."  # beginnings of the names of tensors in a graph
 _NUM_CLEAREST = 16  # of 256 patches
 SCALES, _MIDDLE = (1 / 1.18, 1.0, 1.18), 1
 """The crops of the refinement pass assume the object at these multiples of its estimated distance."""
@@ -94,23 +97,30 @@ class TwoStageNetwork(nn.Module):
         code, features, _ = self._estimate(images)
         return self._calibrated(code, features)
 
-    def with_crop_stage(
-        self, images: Float[Tensor, "batch 3 height width"]
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """The codes, and the tensors at which the refinement pass can be cut out of an exported graph."""
-        code, features, (crops, read) = self._estimate(images)
-        stage = {
-            INPUT: crops,
-            "translation": read[TRANSLATION][:, 0],
-            "rotation_6d": read[ROTATION_6D][:, 0],
-            "confidence": read[CONFIDENCE][:, 0],
-            "light": read[LIGHT],
-            "visibility": read[OBJECT_COORDINATES][:, 3],
-            "cell_translation": read[per_cell(TRANSLATION)],
-            "cell_rotation_6d": read[per_cell(ROTATION_6D)],
-            "weights": read[CELL_WEIGHTS],
+    def with_stages(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The codes, and the tensors, by their names in a graph, at which its last stages can be cut out of it."""
+        code, features, stages = self._estimate(images)
+        return self._calibrated(code, features), stages
+
+    def stage_notes(self) -> dict[str, CropStageNote | OutlineStageNote]:
+        """What serving has to know to run the last stages alone, by the metadata's key: refinement and alignment."""
+        optics = self._optics
+        tensors = {name: _CROP_STAGE + name for name in (crop_stage.INPUT, *crop_stage.OUTPUTS)}
+        notes: dict[str, CropStageNote | OutlineStageNote] = {
+            crop_stage.CROP_STAGE_KEY: CropStageNote(
+                tensors,
+                optics.crop_px,
+                optics.fill,
+                optics.diameter_m,
+                optics.near_m,
+                self.rightness.tolist(),
+                self.presence.tolist(),
+            )
         }
-        return self._calibrated(code, features), stage
+        if self.outline is not None:
+            tensors = {name: _OUTLINE_STAGE + name for name in (*outline_stage.INPUTS, *outline_stage.OUTPUTS)}
+            notes[outline_stage.OUTLINE_STAGE_KEY] = self.outline.note(tensors, optics.diameter_m)
+        return notes
 
     def _calibrated(self, code: dict[str, Tensor], features: CalibrationFeatures) -> dict[str, Tensor]:
         pose_correct = _probability(features.pose_correct, self.rightness)
@@ -124,10 +134,8 @@ class TwoStageNetwork(nn.Module):
         code, features, _ = self._estimate(images)
         return code, features
 
-    def _estimate(
-        self, images: Tensor
-    ) -> tuple[dict[str, Tensor], CalibrationFeatures, tuple[Tensor, dict[str, Tensor]]]:
-        """Code and features, and the crops of the refinement pass with what is read from them."""
+    def _estimate(self, images: Tensor) -> tuple[dict[str, Tensor], CalibrationFeatures, dict[str, Tensor]]:
+        """Code and features, and the tensors of the last stages by their names in a graph."""
         located = self.first(F.avg_pool2d(images, self._optics.localisation_stride))
         crops, _ = self._crop_poses(images, located[TOP_PROPOSALS])
         position, log_weight = _likeliest(crops[TRANSLATION], crops[_VISIBILITY], located[TOP_LOG_WEIGHTS])
@@ -135,30 +143,15 @@ class TwoStageNetwork(nn.Module):
         logit, visibility = torch.logit(refined[CONFIDENCE].flatten(), 1e-6), refined.pop(_VISIBILITY)
         logit, visibility = (values.view(-1, len(SCALES)).mean(dim=1, keepdim=True) for values in (logit, visibility))
         features = CalibrationFeatures(logit, torch.cat([visibility, log_weight], dim=1))
-        return self._aligned(images, _mean_position(refined)), features, read
+        code, outline = self._aligned(images, _mean_position(refined))
+        return code, features, _crop_stage_tensors(*read) | outline
 
-    def _aligned(self, images: Tensor, code: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The code with its pose aligned with the object's outline in the images."""
+    def _aligned(self, images: Tensor, code: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The code with its pose aligned with the object's outline in the images, and that stage's tensors."""
         if self.outline is None:
-            return code
-        return self.outline.of_code(images, self._matrix[0], code, self._optics.diameter_m)
-
-    def crop_stage_note(self, tensors: dict[str, str]) -> CropStageNote:
-        """What serving has to know to run the refinement pass alone.
-
-        Args:
-            tensors: Names in the exported graph of what :meth:`with_crop_stage` gives.
-        """
-        optics = self._optics
-        return CropStageNote(
-            tensors,
-            optics.crop_px,
-            optics.fill,
-            optics.diameter_m,
-            optics.near_m,
-            self.rightness.tolist(),
-            self.presence.tolist(),
-        )
+            return code, {}
+        aligned, tensors = self.outline.of_code(images, self._matrix[0], code, self._optics.diameter_m)
+        return aligned, {_OUTLINE_STAGE + name: tensor for name, tensor in tensors.items()}
 
     def _crop_poses(
         self, images: Tensor, centres: Float[Tensor, "batch num 3"]
@@ -186,6 +179,22 @@ class TwoStageNetwork(nn.Module):
             LIGHT: (cam_from_crop @ code[LIGHT][..., None])[..., 0],
         }
         return poses, (crops, code)
+
+
+def _crop_stage_tensors(crops: Tensor, read: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Crops of the refinement pass and what is read from them, by their names in a graph."""
+    values = {
+        crop_stage.INPUT: crops,
+        "translation": read[TRANSLATION][:, 0],
+        "rotation_6d": read[ROTATION_6D][:, 0],
+        "confidence": read[CONFIDENCE][:, 0],
+        "light": read[LIGHT],
+        "visibility": read[OBJECT_COORDINATES][:, 3],
+        "cell_translation": read[per_cell(TRANSLATION)],
+        "cell_rotation_6d": read[per_cell(ROTATION_6D)],
+        "weights": read[CELL_WEIGHTS],
+    }
+    return {_CROP_STAGE + name: value for name, value in values.items()}
 
 
 def _mean_position(crops: dict[str, Tensor]) -> dict[str, Tensor]:
