@@ -27,6 +27,7 @@ class SecondProcess(Generic[Result]):
         """
         self._call = function, arguments
         self._receiver: Connection | None = None
+        self._has_sent = False
 
     def __enter__(self) -> Self:
         context = multiprocessing.get_context("spawn")
@@ -42,7 +43,8 @@ class SecondProcess(Generic[Result]):
     ) -> None:
         if self._receiver is not None:
             self._receiver.close()
-            self._process.terminate()
+            if not self._has_sent:  # ended from here it would leave a warning of Python's behind
+                self._process.terminate()
             self._process.join()
             self._receiver = None
 
@@ -56,7 +58,7 @@ class SecondProcess(Generic[Result]):
             found: Result | CurioError = self._receiver.recv()
         except (EOFError, OSError):  # the second where it was ended while it sent
             return ended
-        self._process.join()  # where it is ended from here, it leaves a warning of Python's behind
+        self._has_sent = True  # it needs some seconds to end, which nobody waits for here
         return found
 
 
