@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matri
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.initial import begin_with
 from curio_train.learning.state import TrainState
+from curio_train.networks import outline_alignment
 from curio_train.networks.outline_alignment import OutlineAlignment, OutlinePose
 from curio_train.networks.pose_steps import solve, turn
 from curio_train.networks.two_stage.network import TwoStageNetwork
@@ -130,6 +133,14 @@ def test_the_network_answers_aligned_poses(world: TwoStageWorld, network: TwoSta
     assert not torch.equal(code[TRANSLATION], as_read[TRANSLATION])
 
 
+@contextmanager
+def one_round() -> Iterator[None]:
+    """Four take long to trace."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(outline_alignment, "_REACHES_PX", (6.0,))
+        yield
+
+
 class Alone(torch.nn.Module):
     """A graph that is nothing but the alignment of a pose that is nearly always the same."""
 
@@ -157,7 +168,8 @@ def stage(
     names = [*outline_stage.INPUTS, *outline_stage.OUTPUTS]
     start, diameter_m = OutlinePose(*(values[:1] for values in scenes[1])), world.object.kind.diameter_m
     graph = Alone(outline, matrix(world), start, diameter_m).eval()
-    data = to_onnx(graph, 640, 480, [ROTATION_6D, TRANSLATION, *names]).SerializeToString()
+    with one_round():
+        data = to_onnx(graph, 640, 480, [ROTATION_6D, TRANSLATION, *names]).SerializeToString()
     note = outline.note({name: name for name in names}, diameter_m)
     return OutlineStage(data, note, "brick.onnx", ("CPUExecutionProvider",)), data, note
 
@@ -172,7 +184,8 @@ def test_the_alignment_alone_moves_poses_as_the_network_does(
     diameter_m, camera = world.object.kind.diameter_m, PinholeCamera(np.asarray(world.camera.matrix))
     images, true = scenes
     start = OutlinePose(turn(torch.tensor([[0.03, -0.03, 0.02]])) @ true.rotation, 1.02 * true.position)
-    expected = outline(images, matrix(world), *start)
+    with one_round():
+        expected = outline(images, matrix(world), *start)
     gaps, moves = [], []
     for number, image in enumerate(images):
         pixels = (image.permute(1, 2, 0) * 255).round().byte().numpy()

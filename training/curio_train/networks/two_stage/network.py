@@ -94,13 +94,13 @@ class TwoStageNetwork(nn.Module):
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
-        code, features, _ = self._estimate(images)
+        code, features, *_ = self._estimate(images)
         return self._calibrated(code, features)
 
     def with_stages(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The codes, and the tensors, by their names in a graph, at which its last stages can be cut out of it."""
-        code, features, stages = self._estimate(images)
-        return self._calibrated(code, features), stages
+        code, features, (crops, read), outline = self._estimate(images)
+        return self._calibrated(code, features), _crop_stage_tensors(crops, read) | outline
 
     def stage_notes(self) -> dict[str, CropStageNote | OutlineStageNote]:
         """What serving has to know to run the last stages alone, by the metadata's key: refinement and alignment."""
@@ -131,11 +131,13 @@ class TwoStageNetwork(nn.Module):
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code with the crop-pose stage's own confidence, and the features to calibrate it with."""
-        code, features, _ = self._estimate(images)
+        code, features, *_ = self._estimate(images)
         return code, features
 
-    def _estimate(self, images: Tensor) -> tuple[dict[str, Tensor], CalibrationFeatures, dict[str, Tensor]]:
-        """Code and features, and the tensors of the last stages by their names in a graph."""
+    def _estimate(
+        self, images: Tensor
+    ) -> tuple[dict[str, Tensor], CalibrationFeatures, tuple[Tensor, dict[str, Tensor]], dict[str, Tensor]]:
+        """Code and features, the refinement pass's crops with what is read from them, and the outline's tensors."""
         located = self.first(F.avg_pool2d(images, self._optics.localisation_stride))
         crops, _ = self._crop_poses(images, located[TOP_PROPOSALS])
         position, log_weight = _likeliest(crops[TRANSLATION], crops[_VISIBILITY], located[TOP_LOG_WEIGHTS])
@@ -144,7 +146,7 @@ class TwoStageNetwork(nn.Module):
         logit, visibility = (values.view(-1, len(SCALES)).mean(dim=1, keepdim=True) for values in (logit, visibility))
         features = CalibrationFeatures(logit, torch.cat([visibility, log_weight], dim=1))
         code, outline = self._aligned(images, _mean_position(refined))
-        return code, features, _crop_stage_tensors(*read) | outline
+        return code, features, read, outline
 
     def _aligned(self, images: Tensor, code: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The code with its pose aligned with the object's outline in the images, and that stage's tensors."""
