@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sized
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -103,17 +103,18 @@ def evaluate(
     held_out = draw(subject.world, split, num_images, cache)
     result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images), "reads": reads}
     progress("the network")
-    predicted, result["metrics"] = _scored(subject.world, subject.predict, held_out)
+    scored = _scored(subject.world, subject.predict, held_out)
+    result["metrics"] = scored.metrics
     if held_out.empty is not None:
-        result["reliability"] = reliability_bins(*_confidences(subject.world, predicted, held_out.code))
+        result["reliability"] = reliability_bins(*_confidences(subject.world, scored.code, held_out.code))
     progress("the same network untrained")
-    _, result["untrained"] = _scored(subject.world, subject.untrained(), held_out)
+    result["untrained"] = _scored(subject.world, subject.untrained(), held_out).metrics
     if data is not None:
         progress(f"real frames in {data}")
         result["real"] = evaluate_real_frames(subject, data, bop_results)
     if better is not None:
         progress("refined poses")
-        result["refined"] = {"metrics": _scored(better.world, better.predict, held_out)[1]}
+        result["refined"] = {"metrics": _scored(better.world, better.predict, held_out).metrics}
         if data is not None:
             result["refined"]["real"] = evaluate_real_frames(better, data, bop_results, "-refined")
     if (judgement := _judged(subject, warn)) is not None:
@@ -121,9 +122,8 @@ def evaluate(
     if reads == 1 and (path / CONFIG_FILE).exists():  # cards and reports are of the model as it answers by itself
         keep(path / EVALUATION_FILE, result)
         progress("the report")
-        errors = scene_errors(subject.world, predicted, held_out.code)
         try:
-            write_report(path, subject, split, cache, errors, result, judgement)
+            write_report(path, subject, split, cache, scored.errors, result, judgement)
         except ReportError as exc:
             warn(str(exc))
     return result
@@ -158,9 +158,11 @@ def draw(world: World, split: Split, num_images: int, cache: Path) -> HeldOut:
     return HeldOut(images[:num_images], code, None if behind is None else (behind.clamp(0, 1) * 255).round().byte())
 
 
-def score(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, float]:
-    """All metrics that mean something in this world."""
-    scores = scene_scores(world, predicted, true)
+def score(
+    world: World, predicted: SceneCode, true: SceneCode, errors: dict[str, Tensor] | None = None
+) -> dict[str, float]:
+    """All metrics that mean something in this world; ``errors``: see :func:`scene_scores`."""
+    scores = scene_scores(world, predicted, true, errors)
     if isinstance(world, SingleObjectWorld):
         info = world.objects[0].info
         scores |= pose_scores(poses(predicted), poses(true), world.object.mesh.vertices_m, info)
@@ -188,12 +190,22 @@ def _confidences(world: World, predicted: SceneCode, true: SceneCode) -> tuple[l
     return predicted[CONFIDENCE].flatten().tolist(), [error < ADD_THRESHOLD for error in errors]
 
 
-def _scored(world: World, predict: Predict, held_out: HeldOut) -> tuple[SceneCode, dict[str, float]]:
+class _Scored(NamedTuple):
+    """What a network says of held-out images."""
+
+    code: SceneCode
+    errors: dict[str, Tensor]
+    """Each single one, see :func:`scene_errors`."""
+    metrics: dict[str, float]
+
+
+def _scored(world: World, predict: Predict, held_out: HeldOut) -> _Scored:
     predicted = predict(held_out.images)
-    scores = score(world, predicted, held_out.code)
+    errors = scene_errors(world, predicted, held_out.code)
+    scores = score(world, predicted, held_out.code, errors)
     if held_out.empty is not None:
         scores |= calibration(world, predicted, held_out.code, predict(held_out.empty))
-    return predicted, scores
+    return _Scored(predicted, errors, scores)
 
 
 def _origin(path: Path, subject: Subject) -> dict[str, Any]:

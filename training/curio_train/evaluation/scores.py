@@ -21,12 +21,15 @@ _MOST_TURNED_DEG = 10.0
 _BATCH_SIZE = 50
 
 
-def scene_scores(world: World, predicted: SceneCode, true: SceneCode) -> dict[str, float]:
+def scene_scores(
+    world: World, predicted: SceneCode, true: SceneCode, errors: dict[str, Tensor] | None = None
+) -> dict[str, float]:
     """Means of :func:`scene_errors` over images or pairs, and what stands beside them.
 
-    Where slots carry a shape, ``scene_error_any_shape`` is Eq. 1 by position alone.
+    Where slots carry a shape, ``scene_error_any_shape`` is Eq. 1 by position alone. ``errors`` are these, if they are
+    known already: they take long.
     """
-    errors = scene_errors(world, predicted, true)
+    errors = scene_errors(world, predicted, true) if errors is None else errors
     scores = {name: float(values.double().mean()) for name, values in errors.items()}
     if len(world.objects) > 1:
         scores["scene_error_any_shape"] = float(scene_error(world.layout, predicted, true).mean())
