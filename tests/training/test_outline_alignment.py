@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from curio_serve.errors import ModelError
+from curio_serve.errors import InternalError, ModelError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.stages import outline_stage
 from curio_serve.models.stages.crop_stage import CropPose
@@ -202,6 +202,13 @@ def test_a_pose_behind_the_camera_stays(stage: tuple[OutlineStage, bytes, Outlin
     read = pose_read(torch.eye(3), torch.tensor([0.0, 0.1, -0.5]))
     camera = PinholeCamera(np.diag([572.4, 572.4, 1.0]))
     assert stage[0].aligned(np.zeros((480, 640, 3), np.uint8), camera, read, 572.4) is read
+
+
+def test_a_pose_that_is_not_finite_is_an_error(stage: tuple[OutlineStage, bytes, OutlineStageNote]) -> None:
+    read = pose_read(torch.full((3, 3), math.nan), torch.tensor([0.0, 0.1, 0.5]))
+    camera = PinholeCamera(np.diag([572.4, 572.4, 1.0]))
+    with pytest.raises(InternalError, match="not finite"):
+        stage[0].aligned(np.zeros((480, 640, 3), np.uint8), camera, read, 572.4)
 
 
 def test_a_note_of_tensors_that_are_not_there_is_refused(stage: tuple[OutlineStage, bytes, OutlineStageNote]) -> None:

@@ -6,24 +6,16 @@ crops and what is read from them; here the graph is cut at these tensors, so tha
 that note have no such stage and read whole frames alone.
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from curio_serve.errors import InternalError, ModelError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.crop import cut_crop
 from curio_serve.imaging.rotation import smallest_rotation
-from curio_serve.models.runtime import open_session, runtime_errors
-from curio_serve.models.stages.cut_graph import cut_graph
-
-if TYPE_CHECKING:
-    import onnxruntime
+from curio_serve.models.stages.graph_part import GraphPart, parse_note
 
 Array = np.ndarray
 CROP_STAGE_KEY = "curio.crop_stage"
@@ -67,16 +59,17 @@ class CropStageNote:
         Raises:
             ModelError: It is not one.
         """
-        try:
-            note = CropStageNote(**json.loads(text))
-            numbers = (note.side_px, note.fill, note.diameter_m, note.near_m, *note.pose_correct, *note.presence)
-            is_valid = all(map(math.isfinite, numbers)) and min(numbers[:4]) > 0 and note.side_px <= 1024
-            is_valid &= (len(note.pose_correct), len(note.presence)) == (2, 3)
-        except (ValueError, TypeError) as exc:
-            raise ModelError(f"{where}: the metadata {CROP_STAGE_KEY} is not what curio-export writes: {exc}") from exc
-        if not is_valid or set(note.tensors) != {INPUT, *OUTPUTS}:
-            raise ModelError(f"{where}: the metadata {CROP_STAGE_KEY} has impossible values; export the model again")
-        return note
+        return parse_note(CropStageNote, text, CropStageNote._is_valid, f"{where}: {CROP_STAGE_KEY}")
+
+    def _is_valid(self) -> bool:
+        numbers = (self.side_px, self.fill, self.diameter_m, self.near_m, *self.pose_correct, *self.presence)
+        return (
+            all(map(math.isfinite, numbers))
+            and min(numbers[:4]) > 0
+            and self.side_px <= 1024
+            and (len(self.pose_correct), len(self.presence)) == (2, 3)
+            and set(self.tensors) == {INPUT, *OUTPUTS}
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,13 +105,8 @@ class CropStage:
         Raises:
             ModelError: The graph has not the tensors of the note.
         """
-        self.note, self._where, self._providers = note, where, tuple(providers)
-        outputs = [note.tensors[name] for name in OUTPUTS]
-        self._graph = cut_graph(data, [note.tensors[INPUT]], outputs, f"{where}: {CROP_STAGE_KEY}")
-
-    @cached_property
-    def _session(self) -> "onnxruntime.InferenceSession":
-        return open_session(self._graph, self._where, self._providers)
+        self.note = note
+        self._part = GraphPart(data, note.tensors, (INPUT,), OUTPUTS, f"{where}: {CROP_STAGE_KEY}", providers)
 
     def read(self, pixels: Array, camera: PinholeCamera, position_m: Array, canonical_focal_px: float) -> CropPose:
         """The pose of the object in crops around a position.
@@ -147,8 +135,8 @@ class CropStage:
             )
             for depth_m in depths_m
         ]
-        found = self._run(np.stack(crops))
-        return self._pose(found, depths_m, crop_from_cam.T)
+        images = np.ascontiguousarray(np.stack(crops).transpose(0, 3, 1, 2), np.float32) / 255
+        return self._pose(self._part.run({INPUT: images}), depths_m, crop_from_cam.T)
 
     def sees(self, camera: PinholeCamera, position_m: Array, width: int, height: int) -> bool:
         """Whether a position is in front of the camera and its pixel within the frame."""
@@ -156,19 +144,6 @@ class CropStage:
             return False
         x, y = camera.pixels([position_m.tolist()])
         return -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
-
-    def _run(self, crops: Array) -> dict[str, Array]:
-        """Outputs by name for uint8 crops [n, side, side, 3]."""
-        images = np.ascontiguousarray(crops.transpose(0, 3, 1, 2), np.float32) / 255
-        try:
-            values = self._session.run(
-                [self.note.tensors[name] for name in OUTPUTS], {self.note.tensors[INPUT]: images}
-            )
-        except runtime_errors() as exc:
-            raise InternalError(f"{self._where}: onnxruntime failed on {len(crops)} crops: {exc}") from exc
-        if not all(np.isfinite(value).all() for value in values):
-            raise InternalError(f"{self._where}: an output of the crop-pose stage is not finite for this image")
-        return dict(zip(OUTPUTS, values, strict=True))
 
     def _pose(self, found: Mapping[str, Array], depths_m: Sequence[float], cam_from_crop: Array) -> CropPose:
         """The mean position of the crops, the rotation of the surest, and how far cells and crops disagree."""

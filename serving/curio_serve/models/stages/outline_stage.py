@@ -5,25 +5,17 @@ read by the crop-pose stage alone, so the alignment is cut out of the graph as w
 at which tensors; models without that note answer what the crop-pose stage reads.
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from curio_serve.errors import InternalError, ModelError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.crop import cut_crop
 from curio_serve.imaging.rotation import smallest_rotation
-from curio_serve.models.runtime import open_session, runtime_errors
 from curio_serve.models.stages.crop_stage import CropPose
-from curio_serve.models.stages.cut_graph import cut_graph
-
-if TYPE_CHECKING:
-    import onnxruntime
+from curio_serve.models.stages.graph_part import GraphPart, parse_note
 
 Array = np.ndarray
 OUTLINE_STAGE_KEY = "curio.outline_stage"
@@ -54,18 +46,16 @@ class OutlineStageNote:
         Raises:
             ModelError: It is not one.
         """
-        try:
-            note = OutlineStageNote(**json.loads(text))
-            numbers = note.side_px, note.fill, note.diameter_m
-            is_valid = all(map(math.isfinite, numbers)) and min(numbers) > 0 and note.side_px <= 1024
-            is_valid &= set(note.tensors) == {*INPUTS, *OUTPUTS}
-        except (ValueError, TypeError) as exc:
-            raise ModelError(
-                f"{where}: the metadata {OUTLINE_STAGE_KEY} is not what curio-export writes: {exc}"
-            ) from exc
-        if not is_valid:
-            raise ModelError(f"{where}: the metadata {OUTLINE_STAGE_KEY} has impossible values; export the model again")
-        return note
+        return parse_note(OutlineStageNote, text, OutlineStageNote._is_valid, f"{where}: {OUTLINE_STAGE_KEY}")
+
+    def _is_valid(self) -> bool:
+        numbers = self.side_px, self.fill, self.diameter_m
+        return (
+            all(map(math.isfinite, numbers))
+            and min(numbers) > 0
+            and self.side_px <= 1024
+            and set(self.tensors) == {*INPUTS, *OUTPUTS}
+        )
 
 
 class OutlineStage:
@@ -83,13 +73,8 @@ class OutlineStage:
         Raises:
             ModelError: The graph has not the tensors of the note.
         """
-        self.note, self._where, self._providers = note, where, tuple(providers)
-        self._inputs, self._outputs = ([note.tensors[name] for name in names] for names in (INPUTS, OUTPUTS))
-        self._graph = cut_graph(data, self._inputs, self._outputs, f"{where}: {OUTLINE_STAGE_KEY}")
-
-    @cached_property
-    def _session(self) -> "onnxruntime.InferenceSession":
-        return open_session(self._graph, self._where, self._providers)
+        self.note = note
+        self._part = GraphPart(data, note.tensors, INPUTS, OUTPUTS, f"{where}: {OUTLINE_STAGE_KEY}", providers)
 
     def aligned(self, pixels: Array, camera: PinholeCamera, pose: CropPose, canonical_focal_px: float) -> CropPose:
         """A pose moved to where the object's outline lies on edges; as it is where it is behind the camera.
@@ -111,19 +96,11 @@ class OutlineStage:
         crop = cut_crop(pixels, camera, crop_from_cam, focal_px, note.side_px, canonical_focal_px)
         position = np.array([0.0, 0.0, distance_m / note.diameter_m])
         given = crop.transpose(2, 0, 1) / 255, focal_px, crop_from_cam @ pose.rotation, position
-        rotation, position = self._run([np.asarray(value, np.float32)[None] for value in given])
+        named = zip(INPUTS, given, strict=True)
+        found = self._part.run({name: np.asarray(value, np.float32)[None] for name, value in named})
+        rotation, position = (found[name][0].astype(float) for name in OUTPUTS)
         return replace(
             pose,
             translation_m=crop_from_cam.T @ position * note.diameter_m,
             rotation=crop_from_cam.T @ rotation,
         )
-
-    def _run(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """Rotation [3, 3] and position [3] for the inputs of one pose."""
-        try:
-            rotation, position = self._session.run(self._outputs, dict(zip(self._inputs, values, strict=True)))
-        except runtime_errors() as exc:
-            raise InternalError(f"{self._where}: onnxruntime failed on the outline of one crop: {exc}") from exc
-        if not (np.isfinite(rotation).all() and np.isfinite(position).all()):
-            raise InternalError(f"{self._where}: a pose aligned with its outline is not finite for this image")
-        return rotation[0].astype(float), position[0].astype(float)
