@@ -57,6 +57,20 @@ class CalibrationFeatures(NamedTuple):
     """Mean visibility logit in the refinement pass, and log weight of the proposal."""
 
 
+class _Estimate(NamedTuple):
+    """A code and what it was made of."""
+
+    code: dict[str, Tensor]
+    """With the crop-pose stage's own confidence."""
+    features: CalibrationFeatures
+    crops: Tensor
+    """Of the refinement pass."""
+    read: dict[str, Tensor]
+    """What the crop-pose stage gives for them."""
+    outline: dict[str, Tensor]
+    """Tensors of the alignment by their names in a graph; none where there is no alignment."""
+
+
 class TwoStageNetwork(nn.Module):
     """Whole frame to scene code, all in one graph.
 
@@ -94,13 +108,12 @@ class TwoStageNetwork(nn.Module):
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, 1, …], light [batch, 3]."""
-        code, features, *_ = self._estimate(images)
-        return self._calibrated(code, features)
+        return self._calibrated(self._estimate(images))
 
     def with_stages(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The codes, and the tensors, by their names in a graph, at which its last stages can be cut out of it."""
-        code, features, (crops, read), outline = self._estimate(images)
-        return self._calibrated(code, features), _crop_stage_tensors(crops, read) | outline
+        found = self._estimate(images)
+        return self._calibrated(found), _crop_stage_tensors(found.crops, found.read) | found.outline
 
     def stage_notes(self) -> dict[str, CropStageNote | OutlineStageNote]:
         """What serving has to know to run the last stages alone, by the metadata's key: refinement and alignment."""
@@ -122,22 +135,19 @@ class TwoStageNetwork(nn.Module):
             notes[outline_stage.OUTLINE_STAGE_KEY] = self.outline.note(tensors, optics.diameter_m)
         return notes
 
-    def _calibrated(self, code: dict[str, Tensor], features: CalibrationFeatures) -> dict[str, Tensor]:
-        pose_correct = _probability(features.pose_correct, self.rightness)
-        confidence = pose_correct * _probability(features.presence, self.presence)
-        return code | {CONFIDENCE: confidence[:, None, None]}
+    def _calibrated(self, found: _Estimate) -> dict[str, Tensor]:
+        pose_correct = _probability(found.features.pose_correct, self.rightness)
+        confidence = pose_correct * _probability(found.features.presence, self.presence)
+        return found.code | {CONFIDENCE: confidence[:, None, None]}
 
     def uncalibrated(
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code with the crop-pose stage's own confidence, and the features to calibrate it with."""
-        code, features, *_ = self._estimate(images)
-        return code, features
+        found = self._estimate(images)
+        return found.code, found.features
 
-    def _estimate(
-        self, images: Tensor
-    ) -> tuple[dict[str, Tensor], CalibrationFeatures, tuple[Tensor, dict[str, Tensor]], dict[str, Tensor]]:
-        """Code and features, the refinement pass's crops with what is read from them, and the outline's tensors."""
+    def _estimate(self, images: Tensor) -> _Estimate:
         located = self.first(F.avg_pool2d(images, self._optics.localisation_stride))
         crops, _ = self._crop_poses(images, located[TOP_PROPOSALS])
         position, log_weight = _likeliest(crops[TRANSLATION], crops[_VISIBILITY], located[TOP_LOG_WEIGHTS])
@@ -146,7 +156,7 @@ class TwoStageNetwork(nn.Module):
         logit, visibility = (values.view(-1, len(SCALES)).mean(dim=1, keepdim=True) for values in (logit, visibility))
         features = CalibrationFeatures(logit, torch.cat([visibility, log_weight], dim=1))
         code, outline = self._aligned(images, _mean_position(refined))
-        return code, features, read, outline
+        return _Estimate(code, features, *read, outline)
 
     def _aligned(self, images: Tensor, code: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The code with its pose aligned with the object's outline in the images, and that stage's tensors."""
