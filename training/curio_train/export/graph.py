@@ -41,6 +41,8 @@ class Graph(nn.Module):
         self.network = network
         self.of_scene = frozenset(field.name for field in world.outputs.fields if not field.per_object)
         self._world = world
+        # Not while it is traced: the notes of stages hold numbers, which a trace would read out of its weights.
+        self._stage_tensors = stage_tensors(network) if isinstance(network, TwoStageNetwork) else []
         self.eval()
 
     def forward(self, image: Tensor, slots: Tensor | None = None) -> tuple[Tensor, ...]:
@@ -49,7 +51,7 @@ class Graph(nn.Module):
             code = self.network(pixels_of(image)) if slots is None else self.network(pixels_of(image), slots)
             return tuple(self._world.outputs.from_code(code).values())
         code, stages = self.network.with_stages(pixels_of(image))
-        return (*self._world.outputs.from_code(code).values(), *(stages[name] for name in stage_tensors(self.network)))
+        return (*self._world.outputs.from_code(code).values(), *(stages[name] for name in self._stage_tensors))
 
     def outputs(self, image: Tensor) -> dict[str, Tensor]:
         """Outputs by name, for uint8 images [batch, height, width, 3]."""
