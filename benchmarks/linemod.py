@@ -97,7 +97,7 @@ def draw(settings: Settings, candidate: Candidate) -> None:
 def main(settings: Settings) -> int:
     """Score what is left."""
     table: Results = load_table(settings.results)
-    for candidate in candidates(settings.runs):
+    for candidate in filter(Candidate.is_of_one_class, candidates(settings.runs)):
         methods = [candidate.method, candidate.method + REFINED] if settings.refine else [candidate.method]
         rows = [table.get(method, {}).get(candidate.name) for method in methods]
         if all(is_current(row, candidate, settings.num_images, settings.data) for row in rows):

@@ -57,7 +57,7 @@ def test_a_fit_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert findings["libLLVM"].startswith("good")
     assert f"disk at {tmp_path}" in findings
     for subject, text in (
-        ("training time of linemod and capture", "--method sleep on the CPU: 240,000 images"),
+        ("training time of capture and linemod --two-stage", "--method sleep on the CPU: 240,000 images"),
         ("training time of circles, the quickest of the generated worlds", "--method our on the CPU: 48,000 images"),
     ):
         assert text in findings[subject]

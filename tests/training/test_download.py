@@ -275,12 +275,15 @@ def test_a_wrong_class_is_refused_before_any_download(
 def test_a_trained_model_is_named(
     hub: Hub, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    version = tmp_path / "models" / "duck" / "1"
-    version.mkdir(parents=True)
-    (version / "model.onnx").write_bytes(b"")
+    for model, objects in (("ape", ("ape",)), ("three", ("ape", "duck", "can"))):
+        (tmp_path / "models" / model).mkdir(parents=True)
+        rows = "".join(f"| {name} | 0.1 m |\n" for name in objects)
+        (tmp_path / "models" / model / "CARD.md").write_text(
+            f"# {model}\n\n| object | diameter |\n| --- | --- |\n{rows}"
+        )
     monkeypatch.chdir(tmp_path)
     assert train("--cache", str(tmp_path)) == 1
-    assert "curio-detect models/duck IMAGES" in capsys.readouterr().err
+    assert "trained for duck already: models/three; to try one, curio-detect models/three" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("typed", "status", "fetched"), [("n\n", 2, 0), ("\n", 1, 2), ("y\n", 1, 2)])

@@ -13,11 +13,14 @@ from curio_train.config import RunConfig
 from curio_train.errors import CameraError, DataError, UsageError
 from curio_train.export.write_model import export
 from curio_train.geometry import matrix_from_rotation_6d
+from curio_train.learning.runs.configuration import from_json, to_json
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds import build
 from curio_train.worlds.linemod import FAR_M, NEAR_M, read_camera_poses
 from curio_train.worlds.options import LinemodOptions
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.viewpoints import MAX_LIGHT, MIN_LIGHT
 from curio_train.worlds.single_object.world import EXPOSURE
 
@@ -140,7 +143,7 @@ def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
     def remember(world):
         return lambda images: read.append(images) or world.sample(len(images), (1,))
 
-    without = build(LinemodOptions("ape", data, photographs))
+    without = build(LinemodOptions("ape", data, photographs, two_stage=True))
     assert (
         PseudoLabels.from_photographs(without, lambda images: read.append(images) or without.sample(len(images), (1,)))
         is None
@@ -152,7 +155,7 @@ def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
     grey = np.full((480, 640, 3), 90, np.uint8)
     for number in range(3):
         cv2.imwrite(str(frames / f"{number}.png"), grey + number)
-    taught = build(LinemodOptions("ape", data, photographs, photos=frames))
+    taught = build(LinemodOptions("ape", data, photographs, photos=frames, two_stage=True))
     assert (
         PseudoLabels.from_photographs(taught, lambda images: read.append(images) or taught.sample(len(images), (1,)))
         is None
@@ -165,6 +168,39 @@ def test_frames_without_labels_teach_a_gaze_alone(data, photographs, tmp_path):
         PseudoLabels.from_photographs(taught, lambda images: taught.sample(len(images), (1,)))
     with pytest.raises(DataError, match=r"9\.png"):  # before an hour is lost, too
         prepared(RunConfig(LinemodOptions("ape", data, photos=frames), method="sleep"), tmp_path, print, print)
+
+
+def test_the_method_decides_which_network_finds_one_object(data, tmp_path):
+    def found(method, **chosen):
+        config = RunConfig(LinemodOptions("ape", data, **chosen), method=method)
+        return build(prepared(config, tmp_path, print, print).world)
+
+    assert isinstance(found("sleep"), SeveralObjectsWorld)
+    assert isinstance(found("sleep", two_stage=True), TwoStageWorld)
+    assert isinstance(found("hypotheses"), TwoStageWorld)
+    assert isinstance(found("templates"), TwoStageWorld)
+    assert not isinstance(found("our", gaze=False), SeveralObjectsWorld | TwoStageWorld)
+
+
+@pytest.mark.parametrize("flags", [{"two_stage": True}, {"gaze": False}])
+@pytest.mark.parametrize("names", ["all", "ape,can"])
+def test_networks_of_one_object_are_refused_for_several(data, flags, names):
+    with pytest.raises(UsageError, match=f"-stage: finds one object, found --class {names}"):
+        LinemodOptions(names, data, **flags)
+    with pytest.raises(UsageError, match="expected one network"):
+        LinemodOptions("ape", data, gaze=False, two_stage=True)
+
+
+def test_runs_that_are_older_than_the_flag_keep_their_network(data):
+    def reread(options):
+        stored = to_json(RunConfig(options, method="sleep"))
+        del stored["world"]["two_stage"]
+        return from_json(stored).world
+
+    assert reread(LinemodOptions("ape", data)).two_stage
+    assert not reread(LinemodOptions("ape", data, gaze=False)).two_stage
+    assert not reread(LinemodOptions("all", data)).two_stage
+    assert not reread(LinemodOptions("ape,can", data)).two_stage
 
 
 def view() -> list[list[float]]:

@@ -205,8 +205,13 @@ def test_networks_that_saw_real_frames_are_a_row_of_their_own(
     (tmp_path / "with" / "config.json").write_text(json.dumps(written))
     methods = {candidate.path.name: candidate.method for candidate in candidates(tmp_path)}
     assert methods == {"with": "noncur, self-trained", "without": "noncur"}
-    for name, expected in (("our", "our, two stages"), ("hypotheses", "hypotheses"), ("sleep", "sleep")):
-        written |= {"method": name, "world": written["world"] | {"gaze": True}}
+    for name, two_stage, expected in (
+        ("our", True, "our, two stages"),
+        ("hypotheses", True, "hypotheses"),
+        ("sleep", True, "sleep"),
+        ("sleep", False, "sleep, templates"),
+    ):
+        written |= {"method": name, "world": written["world"] | {"gaze": True, "two_stage": two_stage}}
         written["recipe"]["self_training"] = 0.0
         (tmp_path / "with" / "config.json").write_text(json.dumps(written))
         assert {one.path.name: one.method for one in candidates(tmp_path)}["with"] == expected

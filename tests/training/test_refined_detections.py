@@ -72,6 +72,7 @@ def constant_model(path: Path, world: str, found: Found) -> None:
         schema_version=1,
         name=path.stem,
         world=world,
+        recipe=json.dumps({"method": "sleep", "world": {"name": world, "class_name": ",".join(found)}}),
         num_slots=len(found),
         fields=[
             Field(name=name, size=size, per_object=True, unit=unit, frame="camera")

@@ -122,6 +122,11 @@ class WorldOptions:
     default_recipe: ClassVar[Mapping[str, Any]] = {}
     """Hyperparameters that were measured to be better for this world than those of the preset laptop."""
 
+    @classmethod
+    def upgraded(cls, stored: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Options of a stored configuration with what it means by leaving out options that are newer than it is."""
+        return stored
+
 
 @dataclass(frozen=True)
 class Recipe:

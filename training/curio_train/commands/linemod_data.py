@@ -60,9 +60,11 @@ def fetched_linemod(cache: Path, report: Callable[[str], None], *, ask: bool, fr
 
 
 def _name_models(name: str, report: Callable[[str], None]) -> None:
-    """A user who only wants to try LineMOD need not train."""
-    if any((MODELS / name).glob("*/model.onnx")):
-        report(f"{MODELS / name} is a trained model of it, to be tried at once: curio-detect {MODELS / name} IMAGES")
+    """A user who only wants to try LineMOD need not train: cards list the objects of their models."""
+    cards = [card for card in sorted(MODELS.glob("*/CARD.md")) if f"\n| {name} |" in card.read_text(encoding="utf-8")]
+    if cards:
+        found = ", ".join(str(card.parent) for card in cards)
+        report(f"trained for {name} already: {found}; to try one, curio-detect {cards[-1].parent} IMAGES")
 
 
 def _offer(archives: list[str], cache: Path, report: Callable[[str], None], *, ask: bool) -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from curio_train.commands.linemod_data import with_linemod
-from curio_train.config import NetworkConfig, RunConfig
+from curio_train.config import MethodName, NetworkConfig, RunConfig
 from curio_train.errors import DataError, UsageError
 from curio_train.learning.runs.configuration import CONFIG_FILE
 from curio_train.worlds.options import CaptureOptions, LinemodOptions
@@ -36,7 +36,7 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
             "which linemod and capture have"
         )
     if isinstance(options, LinemodOptions):
-        options = with_linemod(options, cache, report)
+        options = with_linemod(_with_stages(options, config.method), cache, report)
         config = replace(config, world=options)
         _refuse_unreadable(options)
     if isinstance(options, CaptureOptions):
@@ -46,6 +46,12 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
             warn(doubt)
         return replace(config, world=_with_paint(options, report), network=_usual_network(config, options))
     return config
+
+
+def _with_stages(options: LinemodOptions, method: MethodName) -> LinemodOptions:
+    """One object is read in two stages where a method needs them: only sleep trains a locator beside templates."""
+    needs_stages = method != LinemodOptions.default_method and options.gaze and not options.names_several
+    return replace(options, two_stage=True) if needs_stages else options
 
 
 def with_kept_meshes(config: RunConfig, run: Path) -> RunConfig:

@@ -24,7 +24,7 @@ from curio_train.errors import UsageError, nearest
 from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.worlds import WORLDS
-from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.options import LOCATOR_RECIPE, CaptureOptions
 
 if TYPE_CHECKING:
     from curio_train.capture.structure import Structure
@@ -117,6 +117,9 @@ def _defaults(world: str, typed: list[str]) -> tuple[RunConfig, RunConfig | None
     first.add_argument("--preset", nargs="?", default="laptop")
     first.add_argument("--resume", nargs="?", type=Path)
     first.add_argument("--photos", nargs="?")
+    first.add_argument("--method", nargs="?")
+    first.add_argument("--two-stage", action="store_true")
+    first.add_argument("--one-stage", "--no-gaze", action="store_true")
     seen, _ = first.parse_known_args(typed)
 
     stored = load_config(seen.resume) if seen.resume else None
@@ -127,6 +130,9 @@ def _defaults(world: str, typed: list[str]) -> tuple[RunConfig, RunConfig | None
     recipe = preset_recipe(preset, kind)
     if world == "linemod" and seen.photos is None:  # then --self-training is an error, and its default must be none
         recipe = replace(recipe, self_training=0.0)
+    trains_locator = seen.method in (None, kind.default_method) and not (seen.two_stage or seen.one_stage)
+    if world == "linemod" and preset == "laptop" and trains_locator:
+        recipe = replace(recipe, **LOCATOR_RECIPE)
     return RunConfig(_unset(kind), method=kind.default_method, recipe=recipe), stored
 
 

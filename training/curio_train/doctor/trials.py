@@ -57,7 +57,7 @@ def images_per_second(name: str) -> float:
     Of worlds that read files the object is a sphere of 20,000 faces in frames of 640x480 pixels.
     """
     kind = WORLDS[name]
-    options = LinemodOptions("sphere") if kind is LinemodOptions else kind()
+    options = LinemodOptions("sphere", two_stage=True) if kind is LinemodOptions else kind()
     world = _sphere_over_noise() if kind is LinemodOptions else build(options)
     config = RunConfig(options, kind.default_method, recipe=preset_recipe("laptop", kind))
     sources = [_source(stage) for stage in stages_of(world)]

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -50,7 +50,7 @@ class DetectionRefiner:
         matrix = np.reshape(spec.camera.camera_matrix, (3, 3))
         self._canonical = CanonicalCamera(spec.camera.width, spec.camera.height, matrix)
         camera = Camera(spec.camera.width, spec.camera.height, matrix)
-        from_templates = uses_templates(_method(spec), spec.world, len(spec.objects))
+        from_templates = uses_templates(_recipe(spec))
         excess_m = SCAN_EXCESS_M if from_templates and spec.world == "linemod" else 0.0
         self._corners, self._refiners = {}, {}
         for kind in spec.objects:
@@ -102,13 +102,13 @@ class DetectionRefiner:
         detection.box_px[:] = crop.project(transformed(self._corners[detection.object], rotation, translation))
 
 
-def _method(spec: ModelSpec) -> str:
-    """That the model was trained with; empty where its recipe does not say it."""
+def _recipe(spec: ModelSpec) -> Mapping[str, Any]:
+    """The configuration that the model was trained with; empty where it does not say it."""
     try:
         recipe = json.loads(spec.recipe)
     except ValueError:
-        return ""
-    return str(recipe.get("method", "")) if isinstance(recipe, dict) else ""
+        return {}
+    return recipe if isinstance(recipe, dict) else {}
 
 
 def _code(detections: Sequence[Detection], light: Sequence[float], canonical_from_cam: np.ndarray) -> SceneCode:

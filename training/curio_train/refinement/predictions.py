@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from curio_train.refinement.render_and_compare import RenderAndCompare
-from curio_train.refinement.template_poses import uses_templates
 from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode, of_slot
 from curio_train.worlds.base import World
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
@@ -25,11 +24,11 @@ def with_refinement(
     Raises:
         UsageError: The world is another.
     """
-    refiners = _refiners(world, method)
+    of_slots = refiners(world, method)
 
     def refined(images: Tensor) -> dict[str, Tensor]:
         code = predict(images)
-        slots = [refiner.refine(images, of_slot(code, slot)).code for slot, refiner in enumerate(refiners)]
+        slots = [refiner.refine(images, of_slot(code, slot)).code for slot, refiner in enumerate(of_slots)]
         return dict(code) | {
             name: torch.cat([one[name] for one in slots], dim=1) for name in (TRANSLATION, ROTATION_6D)
         }
@@ -37,12 +36,16 @@ def with_refinement(
     return refined
 
 
-def _refiners(world: World, method: str) -> list[RenderAndCompare]:
-    """One a slot."""
-    from_templates = uses_templates(method, world.name, len(world.objects))
+def refiners(world: World, method: str) -> list[RenderAndCompare]:
+    """Render-and-compare for each object.
+
+    Args:
+        world: Of one object, or of several with a slot each.
+        method: That the network was trained with.
+
+    Raises:
+        UsageError: The world is another.
+    """
     if not isinstance(world, SeveralObjectsWorld):
-        return [RenderAndCompare.in_world(world, from_templates=from_templates)]
-    return [
-        RenderAndCompare(one.mesh, world.camera, one.kind.diameter_m, from_templates=from_templates)
-        for one in world.members
-    ]
+        return [RenderAndCompare.in_world(world, from_templates=method == "templates")]
+    return [RenderAndCompare(one.mesh, world.camera, one.kind.diameter_m, from_templates=True) for one in world.members]

@@ -82,7 +82,7 @@ class PseudoLabels:
             code, found = consensus_poses(refiner, frames, cameras, estimates, symmetries)
             if found.sum() >= MIN_CONSENSUS:
                 return cls(world, frames[found], index(code, found))
-        twice, accepted_again = _refined(refiner, frames, estimates.refined)
+        twice, accepted_again = refined_poses(refiner, frames, estimates.refined)
         accepted = estimates.accepted | accepted_again
         return cls(world, frames[accepted], index(twice, accepted)) if accepted.any() else None
 
@@ -197,12 +197,12 @@ def predict_and_refine(
 ) -> Estimates:
     """A network's predictions for photographs, and the same refined."""
     predicted = joined([predict(chunk.float() / 255) for chunk in frames.split(_BATCH_SIZE)])
-    return Estimates(predicted, *_refined(refiner, frames, predicted))
+    return Estimates(predicted, *refined_poses(refiner, frames, predicted))
 
 
 @torch.enable_grad()
-def _refined(
-    refiner: RenderAndCompare, frames: Tensor, code: SceneCode
+def refined_poses(
+    refiner: RenderAndCompare, frames: UInt8[Tensor, "num 3 height width"], code: SceneCode
 ) -> tuple[dict[str, Tensor], Bool[Tensor, " num"]]:
     """Refined poses, and where they were accepted."""
     batches = [slice(first, first + _BATCH_SIZE) for first in range(0, len(frames), _BATCH_SIZE)]

@@ -1,19 +1,23 @@
 """How poses of template matching are refined, whose errors in depth are of another kind than those of networks."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from torch import Tensor
 
 from curio_train.scene_code import TRANSLATION, SceneCode
+from curio_train.worlds.options import LinemodOptions
 
 
-def uses_templates(method: str, world: str, num_objects: int) -> bool:
+def uses_templates(recipe: Mapping[str, Any]) -> bool:
     """Whether a model reads poses by templates instead of regressing them.
 
     Args:
-        method: That it was trained with.
-        world: Its name, as on the command line.
-        num_objects: Kinds of objects that it finds.
+        recipe: The configuration that it was trained with, as its specification holds it.
     """
-    return method == "templates" or (world == "linemod" and num_objects > 1)
+    world = recipe.get("world", {})
+    by_locator = world.get("name") == "linemod" and not LinemodOptions.upgraded(world)["two_stage"]
+    return recipe.get("method") == "templates" or (by_locator and world.get("gaze", True))
 
 
 def with_mean_depth(estimate: SceneCode, refined: SceneCode) -> dict[str, Tensor]:

@@ -23,6 +23,7 @@ from curio_train.scene_code import index
 from curio_train.worlds import WORLDS
 from curio_train.worlds.base import World
 from curio_train.worlds.generated.mesh_world import MeshWorld
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.viewpoints import AMBIENT
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
@@ -145,6 +146,8 @@ def _context(path: Path, world: World) -> SceneContext:
         return SceneContext.of_world(world)
     if isinstance(world, SingleObjectWorld):
         return SceneContext({"": world.object.mesh}, AMBIENT)
+    if isinstance(world, SeveralObjectsWorld):
+        return SceneContext({one.kind.name: one.mesh for one in world.members}, AMBIENT)
     raise UsageError(f"{path}: world {world.name} is flat; curio-view shows scenes in three dimensions")
 
 

@@ -13,6 +13,7 @@ Constants fixed before any training:
 
 import logging
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -113,7 +114,7 @@ def read_camera_poses(file: Path, paths: Sequence[Path], *, any_unit: bool = Fal
 
 
 def build(options: LinemodOptions) -> World:
-    """The world of one LineMOD class, for a two-stage detector or for the paper's network; or of several classes.
+    """The world of LineMOD classes, for a locator and templates; or of one, for two stages or the paper's network.
 
     Raises:
         UsageError: Unknown class or no data.
@@ -128,23 +129,23 @@ def build(options: LinemodOptions) -> World:
     dataset = BopDataset(options.data)
     names = dataset.classes if options.class_name == ALL_CLASSES else options.class_name.split(",")
 
-    def backgrounds(cache: Path) -> Backgrounds:
+    @cache
+    def backgrounds(folder: Path) -> Backgrounds:
         if options.backgrounds:
             return PhotographBackgrounds(Photographs(options.backgrounds))
         others = [dataset.mesh(other) for other in dataset.classes if other not in names]
-        return ClutterBackgrounds.cached(cache, others)
+        return ClutterBackgrounds.cached(folder, others)
 
     members = [_object(dataset, name, slot, backgrounds) for slot, name in enumerate(names)]
     photographs = None
     if options.photos is not None:
         photographs = LinemodPhotographs(options.photos, dataset.camera, options.views)
-    if len(members) > 1:
-        return SeveralObjectsWorld("linemod", [member.without_scan_excess() for member in members], photographs)
-    (object_,) = members
+    if options.two_stage:
+        return TwoStageWorld("linemod", members[0], photographs)
     if not options.gaze:
-        layout = pose_layout(position_field(object_), confidence=False)
-        return SingleObjectWorld("linemod", object_, squeezed(dataset.camera, SIDE_PX), layout)
-    return TwoStageWorld("linemod", object_, photographs)
+        layout = pose_layout(position_field(members[0]), confidence=False)
+        return SingleObjectWorld("linemod", members[0], squeezed(dataset.camera, SIDE_PX), layout)
+    return SeveralObjectsWorld("linemod", [member.without_scan_excess() for member in members], photographs)
 
 
 def _object(dataset: BopDataset, name: str, slot: int, backgrounds: Callable[[Path], Backgrounds]) -> Object:

@@ -20,6 +20,9 @@ _TWO_STAGE_RECIPE: Mapping[str, Any] = {
     "self_training": 0.5,
 }
 
+LOCATOR_RECIPE: Mapping[str, Any] = {"batch_size": 16, "micro_batch_size": 16, "budget_images": 19_200}
+"""Hyperparameters of linemod where a locator is trained: its trunk is frozen, so it learns from few images."""
+
 
 def _make_absolute(options: WorldOptions, *names: str) -> None:
     """Because a run may be evaluated and exported from other folders than it was started in."""
@@ -66,7 +69,7 @@ ALL_CLASSES = "all"
 
 @dataclass(frozen=True)
 class LinemodOptions(WorldOptions):
-    """One object of the LineMOD data set in six degrees of freedom, over cluttered backgrounds."""
+    """Objects of the LineMOD data set in six degrees of freedom, over cluttered backgrounds."""
 
     default_method: ClassVar[MethodName] = "sleep"
     default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
@@ -82,17 +85,19 @@ class LinemodOptions(WorldOptions):
     photos: Path | None = None
     """Folder of unlabelled frames of the data set's camera. Towards the end of training the detector learns from them,
     with the poses that it estimates there itself (--self-training, which is 0 without them). Frames of one scene from
-    several viewpoints, in the order of their names, correct each other; a detector for several objects learns from no
-    others."""
+    several viewpoints, in the order of their names, correct each other; only --two-stage learns from others, too."""
     views: Path | None = None
     """File with the camera poses of --photos, in metres, as capture --calibrate --views-out writes it. Without it they
     are recovered from the photographs, and their scale from the estimated object poses."""
     gaze: Annotated[
         FlagCreatePairsOff[bool],
-        tyro.conf.arg(aliases=["--one-stage"], help_behavior_hint="(default: the two-stage detector)"),
+        tyro.conf.arg(aliases=["--one-stage"], help_behavior_hint="(default: a trained locator, and templates)"),
     ] = True
-    """Train the paper's network, whose one encoder sees the frame squeezed to 128x128, instead of the two-stage
-    detector: localisation in the whole frame, then pose in a crop around the object."""
+    """Train the paper's network, whose one encoder sees the frame squeezed to 128x128."""
+    two_stage: FlagCreatePairsOff[bool] = False
+    """Train a detector of one object that finds it in the whole frame, then regresses its pose from a crop. Methods
+    other than sleep always do. Without it a trained locator finds objects, and templates, drawn beforehand, tell their
+    poses: photographs are read better so."""
     download: FlagCreatePairsOff[bool] = False
     """Without --data, fetch LineMOD's meshes and cameras from BOP's repository into --cache, once, without asking."""
 
@@ -103,8 +108,25 @@ class LinemodOptions(WorldOptions):
             raise UsageError(f"--views {self.views}: found no photographs that these poses are of; expected --photos")
         if not self.gaze and self.photos is not None:
             raise UsageError(
-                f"--photos {self.photos}: only the two-stage detector learns from them; leave out --one-stage"
+                f"--photos {self.photos}: the paper's network does not learn from them; leave out --one-stage"
             )
+        if not self.gaze and self.two_stage:
+            raise UsageError("found --one-stage and --two-stage, expected one network")
+        if (self.two_stage or not self.gaze) and self.names_several:
+            flag = "--two-stage" if self.two_stage else "--one-stage"
+            raise UsageError(f"{flag}: finds one object, found --class {self.class_name}; expected one class")
+
+    @property
+    def names_several(self) -> bool:
+        """Whether several objects are asked for."""
+        return self.class_name == ALL_CLASSES or "," in self.class_name
+
+    @classmethod
+    def upgraded(cls, stored: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Options of a stored configuration; those that are older than --two-stage always had two for one object."""
+        name = str(stored.get("class_name"))
+        is_two_stage = stored.get("gaze", True) and name != ALL_CLASSES and "," not in name
+        return {"two_stage": is_two_stage, **stored}
 
 
 @dataclass(frozen=True)

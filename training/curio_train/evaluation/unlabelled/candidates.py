@@ -13,7 +13,8 @@ from curio_train.errors import DataError, UsageError
 from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, to_portable
-from curio_train.worlds.options import LinemodOptions
+from curio_train.refinement.template_poses import uses_templates
+from curio_train.worlds.options import ALL_CLASSES, LinemodOptions
 
 SELF_TRAINED = ", self-trained"
 """What follows the method's name where real frames without labels were learned from."""
@@ -21,22 +22,29 @@ SELF_TRAINED = ", self-trained"
 TWO_STAGES = ", two stages"
 """What follows the name of one of the paper's methods where it trained the two-stage detector."""
 
+BY_TEMPLATES = ", templates"
+"""What follows the name of a method that trained a locator, where templates tell the poses."""
+
 ONE_STAGE_METHODS = ("our", "noncur", "super")
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A run or a model of one LineMOD class."""
+    """A run or a model of LineMOD."""
 
     path: Path
     """Its folder."""
     name: str
-    """The class."""
+    """The class; several as on the command line."""
     method: str
-    """That trained it; ``, two stages`` follows where it is one of the paper's and the network is not,
-    ``, self-trained`` where unlabelled real frames took part."""
+    """That trained it; ``, two stages`` follows where it is one of the paper's and the network is not, ``, templates``
+    where a locator was trained, ``, self-trained`` where unlabelled real frames took part."""
     weights_sha256: str
     """Of the last checkpoint's tensors, or of the model file."""
+
+    def is_of_one_class(self) -> bool:
+        """Whether it finds one class, as rows of the table do."""
+        return self.name != ALL_CLASSES and "," not in self.name
 
 
 def candidates(folder: Path, flag: str = "--runs", *, of_any_method: bool = True) -> list[Candidate]:
@@ -80,14 +88,16 @@ def _found(folder: Path) -> Iterator[Candidate]:
             file = find_model(path)
             spec = ExportedModel.open(file).spec
             if spec.world == "linemod":
-                yield Candidate(path, spec.objects[0].name, _method(json.loads(spec.recipe)), files_sha256(file))
+                names = ",".join(one.name for one in spec.objects)
+                yield Candidate(path, names, _method(json.loads(spec.recipe)), files_sha256(file))
 
 
 def _method(provenance: Mapping[str, Any]) -> str:
     """Models that are older than self-training, or than the two stages, say nothing of it."""
     name = str(provenance["method"])
     two_stages = name in ONE_STAGE_METHODS and provenance["world"].get("gaze", False)
-    return name + TWO_STAGES * two_stages + SELF_TRAINED * bool(provenance["recipe"].get("self_training"))
+    kind = TWO_STAGES * two_stages + BY_TEMPLATES * (name != "templates" and uses_templates(provenance))
+    return name + kind + SELF_TRAINED * bool(provenance["recipe"].get("self_training"))
 
 
 def files_sha256(*files: Path) -> str:

@@ -5,7 +5,7 @@ camera are never quite what renderings say. Several objects of one scene share i
 their mean errs less than most of them (decision 68). No label is opened.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +18,10 @@ from curio_train.errors import DataError, UsageError
 from curio_train.evaluation.subject import load_subject
 from curio_train.evaluation.unlabelled.candidates import candidates
 from curio_train.refinement.multi_view import estimate_scale
-from curio_train.refinement.pseudo_labels import predict_and_refine
-from curio_train.refinement.render_and_compare import RenderAndCompare
+from curio_train.refinement.predictions import refiners
+from curio_train.refinement.pseudo_labels import refined_poses
+from curio_train.scene_code import of_slot
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 MOST_PHOTOGRAPHS = 100
@@ -35,7 +37,7 @@ def scale_by_objects(
 
     Args:
         structure: Of any scale.
-        models: Folder with a run or a model for each object, LineMOD's in two stages.
+        models: A run or a model of LineMOD objects, or a folder with one of each object.
         data: Data folder of exported models.
         report: Called with a line after each object, which takes about a minute.
 
@@ -49,10 +51,10 @@ def scale_by_objects(
     """
     scales = {}
     for candidate in candidates(models, "--objects", of_any_method=False):
-        scale = _scale_by(candidate.path, data, structure)
-        report(f"{candidate.name}: {'seen too seldom to tell' if scale is None else f'{scale:.4g} m a unit'}")
-        if scale is not None:
-            scales[candidate.name] = scale
+        for name, scale in _scales_by(candidate.path, data, structure):
+            report(f"{name}: {'seen too seldom to tell' if scale is None else f'{scale:.4g} m a unit'}")
+            if scale is not None:
+                scales[name] = scale
     if not scales:
         raise DataError(
             f"--objects {models}: none of the objects was read alike in enough photographs to tell how large the scene "
@@ -70,12 +72,14 @@ def mean_scale(scales: Mapping[str, float]) -> tuple[float, str]:
     return float(np.exp(logs.mean())), f"scale by each object beside their mean: {each}{error}"
 
 
-def _scale_by(path: Path, data: Path | None, structure: Structure) -> float | None:
+def _scales_by(path: Path, data: Path | None, structure: Structure) -> Iterator[tuple[str, float | None]]:
+    """Metres a unit by each object that a network reads; None where it is read alike too seldom."""
     subject = load_subject(path, data)
     world = subject.world
-    if not isinstance(world, TwoStageWorld):
-        raise UsageError(f"{path}: the paper's network (--one-stage), expected a two-stage detector")
-    camera = world.object.camera
+    if not isinstance(world, TwoStageWorld | SeveralObjectsWorld):
+        raise UsageError(f"{path}: the paper's network (--one-stage), expected one that finds objects in whole frames")
+    objects = world.members if isinstance(world, SeveralObjectsWorld) else (world.object,)
+    camera = objects[0].camera
     if np.abs(camera.matrix - structure.camera.matrix).max() > _SAME_CAMERA * camera.matrix[0, 0]:
         raise UsageError(
             f"{path}: reads frames of a camera with a focal length of {camera.matrix[0, 0]:.1f} pixels, but --camera "
@@ -84,6 +88,7 @@ def _scale_by(path: Path, data: Path | None, structure: Structure) -> float | No
     chosen = spread(structure.photographs, MOST_PHOTOGRAPHS)
     matrices = structure.cam_from_world[[structure.photographs.index(photograph) for photograph in chosen]]
     frames = torch.from_numpy(read_frames(chosen, camera, world.camera.width, world.camera.height))
-    refiner = RenderAndCompare.in_world(world)
-    found = predict_and_refine(refiner, frames, lambda images: subject.predict((images * 255).round().byte()))
-    return estimate_scale(CameraPoses(matrices), found.refined, found.accepted, refiner.diameter_m)
+    code = subject.predict(frames)
+    for slot, refiner in enumerate(refiners(world, subject.config.method)):
+        refined, accepted = refined_poses(refiner, frames, of_slot(code, slot))
+        yield objects[slot].kind.name, estimate_scale(CameraPoses(matrices), refined, accepted, refiner.diameter_m)

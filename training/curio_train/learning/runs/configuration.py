@@ -48,7 +48,7 @@ def _converter() -> "Converter":
             raise ValueError(f"found the world {data.get('name')!r}, expected one of {', '.join(WORLDS)}")
         kind = WORLDS[data["name"]]
         options = {name: value for name, value in data.items() if name != "name"}
-        world: WorldOptions = make_dict_structure_fn(kind, converter)(options, kind)
+        world: WorldOptions = make_dict_structure_fn(kind, converter)(kind.upgraded(options), kind)
         return world
 
     for kind in (bool, int, float, str):

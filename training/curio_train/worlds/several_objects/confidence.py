@@ -13,7 +13,10 @@ from curio_train.networks.templates.reader import CalibrationFeatures
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
 from curio_train.worlds.several_objects.scenes import ObjectScenes
 
-_NUM_FRAMES, _BATCH_SIZE = 160, 2  # larger batches take longer a frame
+NUM_FRAMES = 160
+"""Renderings that the confidence is calibrated on."""
+
+_BATCH_SIZE = 2  # larger batches take longer a frame
 _NUM_POINTS = 500  # vertices that ADD is measured at, about
 
 
@@ -31,7 +34,7 @@ def calibrate(network: ObjectsNetwork, world: ObjectScenes, cache: Path) -> None
     features: list[CalibrationFeatures] = []
     present: list[Tensor] = []
     correct: list[np.ndarray] = []
-    for step in range(_NUM_FRAMES // _BATCH_SIZE):
+    for step in range(NUM_FRAMES // _BATCH_SIZE):
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
         code, found = network.read(world.augment(batch.images, (0, step)).clamp(0, 1))

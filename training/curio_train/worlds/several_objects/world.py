@@ -40,6 +40,11 @@ class SeveralObjectsWorld(ObjectScenes):
         self._stage = LocatorStage(members, self.camera)
 
     @property
+    def model_name(self) -> str:
+        """The name of the only object, or else of the world."""
+        return self.objects[0].name if len(self.objects) == 1 else self.name
+
+    @property
     def stages(self) -> tuple[LocatorStage]:
         """The locator alone."""
         return (self._stage,)
