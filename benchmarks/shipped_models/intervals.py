@@ -1,6 +1,6 @@
 """Whether 90 % intervals hold: on held-out renderings and on real frames, and how often a model is sure of nothing.
 
-    python benchmarks/shipped_models/intervals.py models/ape models/can … [--json] [--data DIR] [--num-images 1000]
+    python benchmarks/shipped_models/intervals.py models/ape … [--json] [--data DIR] [--num-images 1000]
         [--views views.json]
 
 The renderings are of the test split, which neither training nor ``curio-export --intervals`` draws from. The real

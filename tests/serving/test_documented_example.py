@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PRINTED = re.compile(r"duck: confidence (0\.\d\d), at (-?\d\.\d{3}), (-?\d\.\d{3}), (\d\.\d{3}) m")
+PRINTED = re.compile(r"ape: confidence (0\.\d\d), at (-?\d\.\d{3}), (-?\d\.\d{3}), (\d\.\d{3}) m")
 
 
 def test_detection_in_process(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -16,5 +16,5 @@ def test_detection_in_process(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     exec(compile(code, "docs/api/detection.md", "exec"), {})
     (found,) = PRINTED.findall(capsys.readouterr().out)
     poses = json.loads((ROOT / "samples" / "poses.json").read_text())["03.jpg"]
-    (true,) = [pose["translation_m"] for pose in poses if pose["object"] == "duck"]
+    (true,) = [pose["translation_m"] for pose in poses if pose["object"] == "ape"]
     assert [float(value) for value in found[1:]] == pytest.approx(true, abs=0.05)

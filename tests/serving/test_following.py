@@ -178,7 +178,7 @@ def test_a_stream_goes_on_after_frames_that_do_not_belong_to_it(client: PoseClie
 
 @pytest.mark.parametrize("scale", [1, 2])
 def test_a_shipped_model_reads_crops_alone_as_well_as_whole_frames(scale: int) -> None:
-    model = open_model(ROOT / "models" / "duck")
+    model = open_model(ROOT / "models" / "ape")
     assert model.crop_stage is not None
     camera = json.loads((ROOT / "samples" / "camera.json").read_text())
     truths = json.loads((ROOT / "samples" / "poses.json").read_text())
@@ -186,7 +186,7 @@ def test_a_shipped_model_reads_crops_alone_as_well_as_whole_frames(scale: int) -
     errors = []
     for file, poses in truths.items():
         pixels = np.ascontiguousarray(cv2.imread(str(ROOT / "samples" / file))[..., ::-1])
-        near = next(np.array(pose["translation_m"]) for pose in poses if pose["object"] == "duck")
+        near = next(np.array(pose["translation_m"]) for pose in poses if pose["object"] == "ape")
         (found,) = Detector(model).detect(pixels, pinhole)
         larger = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         matrix = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]]) @ pinhole.matrix
@@ -198,7 +198,7 @@ def test_a_shipped_model_reads_crops_alone_as_well_as_whole_frames(scale: int) -
 
 
 def test_following_with_a_shipped_model_keeps_a_still_object() -> None:
-    detector = Detector(open_model(ROOT / "models" / "duck"))
+    detector = Detector(open_model(ROOT / "models" / "ape"))
     camera = PinholeCamera(np.array(json.loads((ROOT / "samples" / "camera.json").read_text())["camera_matrix"]))
     pixels = np.ascontiguousarray(cv2.imread(str(ROOT / "samples" / "01.jpg"))[..., ::-1])
     stream, results = FollowingStream(), messages.DetectResponse().results
@@ -212,7 +212,7 @@ def test_following_with_a_shipped_model_keeps_a_still_object() -> None:
 
 @pytest.mark.parametrize("moved_px", [(45, 30), (-40, 45), (0, -50)])
 def test_an_object_that_moved_while_it_was_hidden_is_found_beside_its_last_place(moved_px: tuple[int, int]) -> None:
-    detector = Detector(open_model(ROOT / "models" / "duck"))
+    detector = Detector(open_model(ROOT / "models" / "ape"))
     camera = PinholeCamera(np.array(json.loads((ROOT / "samples" / "camera.json").read_text())["camera_matrix"]))
     pixels = np.ascontiguousarray(cv2.imread(str(ROOT / "samples" / "01.jpg"))[..., ::-1])
     moved = np.roll(pixels, moved_px[::-1], axis=(0, 1))

@@ -20,5 +20,5 @@ def test_detection_in_process() -> None:
     assert int(error[0]) < 50, printed
     assert int(error[1]) < 25, printed
     assert "ImageError pixels are float64" in printed
-    assert "CameraMissing model duck" in printed
+    assert "CameraMissing model ape" in printed
     assert any("image/jpeg" in output.get("data", {}) for output in outputs)

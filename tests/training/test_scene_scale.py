@@ -27,9 +27,9 @@ def test_objects_count_alike_and_say_how_far_they_differ() -> None:
 def test_two_networks_of_one_object_are_refused(tmp_path: Path) -> None:
     """Neither is to count silently, and nothing is read before."""
     for name in ("first", "second"):
-        (tmp_path / name).symlink_to(MODELS / "cat")
+        (tmp_path / name).symlink_to(MODELS / "ape")
     nothing = Structure((), np.zeros((0, 4, 4)), Intrinsics(np.eye(3), 640, 480), np.zeros((0, 3)), 0.5)
-    with pytest.raises(UsageError, match=r"^--objects .*: found first and second, both cat; expected one of each"):
+    with pytest.raises(UsageError, match=r"^--objects .*: found first and second, both ape; expected one of each"):
         scale_by_objects(nothing, tmp_path, None, pytest.fail)
 
 
@@ -42,15 +42,15 @@ def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, 
 
 @pytest.mark.skipif("CURIO_DATA" not in os.environ, reason="CURIO_DATA is unset: no real data here")
 def test_real_frames_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """By the shipped cat alone, against the labels: as far as an object moved before the camera is known of both."""
+    """By the shipped ape alone, against the labels: as far as an object moved before the camera is known of both."""
     data = Path(os.environ["CURIO_DATA"]) / "lmo"
     frames, models, views = data / "test" / "000002" / "rgb", tmp_path / "models", tmp_path / "views.json"
     models.mkdir()
-    (models / "cat").symlink_to(MODELS / "cat")
+    (models / "ape").symlink_to(MODELS / "ape")
     flags = ["--images", frames, "--every", 2, "--camera", data / "camera.json", "--views-out", views]
     status, out, err = call(capsys, *flags, "--objects", models, "--data", data)
     assert status == 0, err
-    assert "beside their mean: cat +0.0 %" in out
+    assert "beside their mean: ape +0.0 %" in out
     assert "in metres" in out
 
     places = json.loads(views.read_text())
@@ -77,10 +77,10 @@ def test_what_tells_no_scale_is_said(tmp_path: Path) -> None:
     told: list[str] = []
     with pytest.raises(UsageError, match=str(tmp_path)):
         scale_by_objects(still, tmp_path, data, told.append)
-    (tmp_path / "cat").symlink_to(MODELS / "cat")
+    (tmp_path / "ape").symlink_to(MODELS / "ape")
     with pytest.raises(DataError, match=r"none of the objects .*--distance-m"):
         scale_by_objects(still, tmp_path, data, told.append)
-    assert told == ["cat: seen too seldom to tell"]
+    assert told == ["ape: seen too seldom to tell"]
     longer = replace(still, camera=replace(camera, matrix=camera.matrix * [[1.2], [1.2], [1]]))
     with pytest.raises(UsageError, match=r"focal length of 572\.4 pixels, but --camera has 686\.9"):
         scale_by_objects(longer, tmp_path, data, told.append)

@@ -146,8 +146,8 @@ def test_a_hub_that_does_not_answer(at_hub: Call) -> None:
 
 
 def test_a_push_over_another_model_or_version_is_refused(held: Any, push: Push, folder: Path) -> None:
-    with pytest.raises(UsageError, match="holds the model ape; push cat"):
-        push(ROOT / "models" / "cat")
+    with pytest.raises(UsageError, match="holds the model ape; push lmo"):
+        push(ROOT / "models" / "lmo")
     held.commits[-1]["ape/SHA256SUMS"] += b"0" * 64 + b"  100/model.onnx\n"
     with pytest.raises(ExportError, match="its version 100 is missing or another one"):
         push(folder)
