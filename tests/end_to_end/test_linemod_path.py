@@ -18,6 +18,7 @@ import pytest
 from curio_train.commands.evaluate import evaluate
 from curio_train.commands.export import export
 from curio_train.commands.train import train
+from curio_train.data import backgrounds
 from curio_train.export import graph
 from curio_train.learning.runs.configuration import load_config
 from curio_train.networks.templates import geometry
@@ -45,8 +46,9 @@ def status_of(command: Callable[[list[str]], None], *arguments: object) -> int |
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Where runs, models and caches are; calibration and the check of numerical stability are small meanwhile."""
+    """Where runs, models and caches are; backgrounds, calibration and the check of stability are small meanwhile."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(backgrounds, "POOL_SIZE", 10)
         patch.setattr(confidence, "NUM_FRAMES", 25)
         patch.setattr(graph, "NUM_JITTERED", 2)
         yield tmp_path_factory.mktemp("linemod")

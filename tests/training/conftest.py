@@ -62,6 +62,12 @@ def circles_models(tmp_path_factory: pytest.TempPathFactory, circles_run: Path) 
     return export(circles_run, models), export(circles_run, models, half=True)
 
 
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Image sets that many tests read and none changes; the first draws them, which takes ten seconds."""
+    return tmp_path_factory.mktemp("cache")
+
+
 @pytest.fixture
 def small_image_sets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stored image sets of 100 and 50 images instead of 2,000 and 500, which take ten seconds to draw."""

@@ -38,11 +38,6 @@ CONFIG = RunConfig(
 )
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 def train(path: Path, cache: Path, config: RunConfig = CONFIG, *, resume: bool = False) -> None:
     learn(config, path, Interruption(), resume=resume, cache=cache)
 

@@ -83,8 +83,7 @@ def _tensors(path: Path) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("fault", ["kill", "full disk"])
-def test_every_file_operation_may_be_the_last(tmp_path: Path, fault: Fault) -> None:
-    cache = tmp_path / "cache"
+def test_every_file_operation_may_be_the_last(tmp_path: Path, cache: Path, fault: Fault) -> None:
     _train(tmp_path / "begun", cache, 8, resume=False)
     shutil.copytree(tmp_path / "begun", tmp_path / "whole")
     _train(tmp_path / "whole", cache, 16)

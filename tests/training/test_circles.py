@@ -14,12 +14,6 @@ from curio_train.worlds.options import CirclesOptions
 from torch import Tensor
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Image sets that several tests read and none changes."""
-    return tmp_path_factory.mktemp("cache")
-
-
 def at(x: float, y: float, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.tensor([[[x, y, 0.0]]], dtype=dtype, requires_grad=True)
 

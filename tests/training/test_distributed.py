@@ -24,10 +24,10 @@ def call(*command: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def runs(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> dict[str, Path]:
     """A run of one process, and one of two that was stopped half way and resumed; both keep steps 1 and 2."""
     folder = tmp_path_factory.mktemp("runs")
-    common = ["circles", "--cache", folder / "cache", "--checkpoint-minutes", "0"]
+    common = ["circles", "--cache", cache, "--checkpoint-minutes", "0"]
     call(COMMAND, *common, *RECIPE, "--images", "16", "--out", folder / "one")
     call(*TORCHRUN, COMMAND, *common, *RECIPE, "--images", "8", "--out", folder / "two")
     call(*TORCHRUN, COMMAND, *common, "--resume", folder / "two", "--images", "16")

@@ -79,11 +79,11 @@ def begun_anew() -> TrainState:
     return TrainState(CONFIG, Circles(), torch.device("cpu"))
 
 
-def test_images_count_on_over_models_and_in_their_cards(model: Path, tmp_path: Path) -> None:
+def test_images_count_on_over_models_and_in_their_cards(model: Path, tmp_path: Path, cache: Path) -> None:
     path = tmp_path / "run"
     config = replace(CONFIG, images=8, init=model, recipe=replace(CONFIG.recipe, batch_size=4, micro_batch_size=4))
-    learn(config, path, Interruption(), resume=False, cache=tmp_path / "cache")
-    learn(replace(config, images=12), path, Interruption(), resume=True, cache=tmp_path / "cache")
+    learn(config, path, Interruption(), resume=False, cache=cache)
+    learn(replace(config, images=12), path, Interruption(), resume=True, cache=cache)
     (path / EVALUATION_FILE).write_text('{"images_seen": 76, "split": "test", "num_images": 5, "metrics": {"a": 2.0}}')
     version = export(path, tmp_path / "models").path
     spec = ExportedModel.open(version / "model.onnx").spec
@@ -97,11 +97,13 @@ def test_images_count_on_over_models_and_in_their_cards(model: Path, tmp_path: P
     assert begun(version).progress.images_before == 76
 
 
-def test_a_run_killed_before_its_first_checkpoint_begins_with_the_same_network(run: Path, tmp_path: Path) -> None:
+def test_a_run_killed_before_its_first_checkpoint_begins_with_the_same_network(
+    run: Path, tmp_path: Path, cache: Path
+) -> None:
     still = replace(CONFIG.recipe, batch_size=4, micro_batch_size=4, learning_rate=1e-30)
     config = replace(CONFIG, images=4, init=run, recipe=still)
     RunFolder(tmp_path / "run", config).write_config(new=True)
-    learn(config, tmp_path / "run", Interruption(), resume=True, cache=tmp_path / "cache")
+    learn(config, tmp_path / "run", Interruption(), resume=True, cache=cache)
     learned, expected = (network(RunFolder.open(path).trained(Circles())) for path in (tmp_path / "run", run))
     assert torch.equal(learned["encoder.layers.0.weight"], expected["encoder.layers.0.weight"])
 

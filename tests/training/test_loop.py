@@ -62,11 +62,6 @@ def gradients(trainer: Trainer) -> list[Tensor]:
     return [p.grad for one in trainer.state.learners.values() for p in one.network.parameters()]
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.mark.parametrize("method", TRAINED)
 def test_every_method_learns_a_fixed_batch(method: MethodName) -> None:
     one = trainer(configuration(method))

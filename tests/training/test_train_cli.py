@@ -20,11 +20,6 @@ PATIENCE_S = 300  # ends a test that hangs; nothing is measured by it
 SMALL = ["--batch-size", "4", "--micro-batch-size", "2", "--precision", "float32", "--gradient-penalty-every", "2"]
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 def start(*arguments: object) -> subprocess.Popen[str]:
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     return subprocess.Popen(
