@@ -107,6 +107,15 @@ def test_a_part_drawn_in_the_colours_of_its_surroundings_explains_nothing(folder
     assert found.verdict.startswith("Do not trust it")
 
 
+@pytest.mark.parametrize("background", [None, "plate.png"])
+def test_a_part_that_is_found_outside_of_the_frame_explains_nothing(folder: Path, background: str | None) -> None:
+    world = build(options(folder, background=background and folder / background))
+    code = truth(world)
+    found = judged(world, code | {TRANSLATION: code[TRANSLATION] + torch.tensor([9.0, 0.0, 0.0])})
+    assert found.metrics["own_view_agreeing"] == 0
+    assert found.verdict.startswith("Do not trust it")
+
+
 def test_confidence_does_not_hide_what_was_found(folder: Path) -> None:
     world = build(options(folder))
     code = truth(world)

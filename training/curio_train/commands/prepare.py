@@ -40,6 +40,11 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
         config = replace(config, world=options)
         _refuse_unreadable(options)
     if isinstance(options, CaptureOptions):
+        if options.names_several and config.recipe.self_training:
+            raise UsageError(
+                f"--self-training {config.recipe.self_training}: several parts in free space are not learned from "
+                "photographs; leave it out, or train a model of each part"
+            )
         from curio_train.doctor.examine import refuse_unfit
 
         for doubt in refuse_unfit(options, self_training=config.recipe.self_training > 0):
@@ -122,7 +127,7 @@ def _with_paint(options: CaptureOptions, report: Callable[[str], None]) -> Captu
 
     if options.plane is not None or options.paint is not None:
         return options
-    if not is_unpainted(load_mesh(options.mesh[0], options.mesh_unit, options.body)):
+    if not any(is_unpainted(load_mesh(file, options.mesh_unit, options.body)) for file in options.mesh):
         return options
     anyway = "it is learned in any colour, which takes longer; --paint '#8a6f4c' says which it has"
     if options.background is None:

@@ -120,6 +120,8 @@ def _defaults(world: str, typed: list[str]) -> tuple[RunConfig, RunConfig | None
     first.add_argument("--method", nargs="?")
     first.add_argument("--two-stage", action="store_true")
     first.add_argument("--one-stage", "--no-gaze", action="store_true")
+    first.add_argument("--mesh", nargs="*", default=[])
+    first.add_argument("--plane", nargs="?")
     seen, _ = first.parse_known_args(typed)
 
     stored = load_config(seen.resume) if seen.resume else None
@@ -130,10 +132,18 @@ def _defaults(world: str, typed: list[str]) -> tuple[RunConfig, RunConfig | None
     recipe = preset_recipe(preset, kind)
     if world == "linemod" and seen.photos is None:  # then --self-training is an error, and its default must be none
         recipe = replace(recipe, self_training=0.0)
-    trains_locator = seen.method in (None, kind.default_method) and not (seen.two_stage or seen.one_stage)
-    if world == "linemod" and preset == "laptop" and trains_locator:
+    if preset == "laptop" and seen.method in (None, kind.default_method) and _names_locator(world, seen):
         recipe = replace(recipe, **LOCATOR_RECIPE)
+    if world == "capture" and len(seen.mesh) > 1 and seen.plane is None:
+        recipe = replace(recipe, self_training=0.0)
     return RunConfig(_unset(kind), method=kind.default_method, recipe=recipe), stored
+
+
+def _names_locator(world: str, seen: argparse.Namespace) -> bool:
+    """Whether the flags ask for a detector whose poses are told by templates, and whose locator is trained."""
+    if world == "capture":
+        return len(seen.mesh) > 1 and seen.plane is None
+    return world == "linemod" and not (seen.two_stage or seen.one_stage)
 
 
 def _refuse_world(arguments: list[str]) -> NoReturn:

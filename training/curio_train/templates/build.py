@@ -49,7 +49,7 @@ def template_network(world: World) -> TemplateNetwork:
     if not isinstance(world, TwoStageWorld):
         raise UsageError(
             f"--method templates finds one object in six degrees of freedom, which {world.name} does not ask for here: "
-            "expected linemod without --one-stage, or capture without --plane"
+            "expected linemod with one class, or capture with one mesh and without --plane"
         )
     return TemplateNetwork(_geometry(world), has_color=world.object.unpainted, aligns_outlines=world.aligns_outlines)
 

@@ -1,4 +1,6 @@
-"""A part of your own in free space: one mesh, one camera, six degrees of freedom, no labels.
+"""Parts of your own in free space: meshes, one camera, six degrees of freedom, no labels.
+
+One part is detected in two stages, several by a locator and templates.
 
 Images are rendered without end, as for LineMOD. What a data set's authors publish there is given or found out here:
 
@@ -13,6 +15,7 @@ Parts on a plane are the world of ``tabletop``.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -39,6 +42,7 @@ from curio_train.meshes.meshes import Mesh, load_mesh
 from curio_train.meshes.symmetries import find_symmetries
 from curio_train.worlds.base import Camera, ObjectKind, World
 from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.base_colors import MIDDLE_GREY, any_base_color, base_colors_near, srgb_of
 from curio_train.worlds.single_object.crop_pose_stage import MAX_LOG_SCALE
 from curio_train.worlds.single_object.two_stage import TwoStageWorld, frame_camera
@@ -109,7 +113,7 @@ class CapturePhotographs:
 
 
 def build(options: CaptureOptions) -> World:
-    """The world of one part in free space, or of parts on a plane.
+    """The world of parts in free space, or on a plane.
 
     Raises:
         UsageError: The part would reach into the camera, or has two colours.
@@ -119,17 +123,26 @@ def build(options: CaptureOptions) -> World:
     """
     if options.plane is not None:
         return build_tabletop(options)
-    (file,) = options.mesh
-    mesh, camera = load_mesh(file, options.mesh_unit, options.body), load_intrinsics(options.camera)
-    _refuse_collision(options, mesh)
+    camera = load_intrinsics(options.camera)
+    members = [_object(options, camera, file, slot) for slot, file in enumerate(options.mesh)]
+    photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera))
+    if len(members) > 1:
+        name = "-".join(member.kind.name for member in members)
+        return SeveralObjectsWorld("capture", [_painted(member) for member in members], photographs, name)
+    return TwoStageWorld("capture", members[0], photographs, aligns_outlines=True)
+
+
+def _object(options: CaptureOptions, camera: Intrinsics, file: Path, slot: int) -> Object:
+    mesh = load_mesh(file, options.mesh_unit, options.body)
+    _refuse_collision(options, file, mesh)
     if options.paint is not None and not is_unpainted(mesh):
         raise UsageError(f"--paint {options.paint}: {file} has colours of its own; leave it out")
     paint = None if options.paint is None else srgb_of(options.paint)
     found = find_symmetries(mesh)
     kind = ObjectKind(
-        file.stem, (0,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous
+        file.stem, (slot,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous
     )
-    object_ = Object(
+    return Object(
         kind,
         mesh,
         camera,
@@ -142,18 +155,24 @@ def build(options: CaptureOptions) -> World:
         typical_color=paint or MIDDLE_GREY,
         known_scene=options.background is not None,
     )
-    photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera))
-    return TwoStageWorld("capture", object_, photographs, aligns_outlines=True)
 
 
-def _refuse_collision(options: CaptureOptions, mesh: Mesh) -> None:
+def _painted(one: Object) -> Object:
+    """The object in its typical colour, where it has none of its own: templates know no other."""
+    if not one.unpainted:
+        return one
+    colors = np.broadcast_to(np.array(one.typical_color), one.mesh.vertices_m.shape)
+    return replace(one, mesh=replace(one.mesh, vertex_colors_srgb=colors), unpainted=False)
+
+
+def _refuse_collision(options: CaptureOptions, file: Path, mesh: Mesh) -> None:
     """The crop-pose stage sees objects nearer than the nearest, by the largest error of the localisation stage."""
     reach = float(np.linalg.norm(mesh.vertices_m, axis=1).max())
     least = reach * float(np.exp(MAX_LOG_SCALE))
     if options.near_m > least:
         return
     raise UsageError(
-        f"--near-m {options.near_m:g}: {options.mesh[0]} reaches {reach:.3g} m from its origin, so the camera would be "
+        f"--near-m {options.near_m:g}: {file} reaches {reach:.3g} m from its origin, so the camera would be "
         f"inside it; expected more than {least:.3g} m. If the part is smaller than that, check --mesh-unit, and that "
         "the origin lies within the part (curio-doctor --mesh)"
     )

@@ -145,7 +145,8 @@ def build(options: LinemodOptions) -> World:
     if not options.gaze:
         layout = pose_layout(position_field(members[0]), confidence=False)
         return SingleObjectWorld("linemod", members[0], squeezed(dataset.camera, SIDE_PX), layout)
-    return SeveralObjectsWorld("linemod", [member.without_scan_excess() for member in members], photographs)
+    exact = [member.without_scan_excess() for member in members]
+    return SeveralObjectsWorld("linemod", exact, photographs, names[0] if len(names) == 1 else None)
 
 
 def _object(dataset: BopDataset, name: str, slot: int, backgrounds: Callable[[Path], Backgrounds]) -> Object:

@@ -21,7 +21,7 @@ _TWO_STAGE_RECIPE: Mapping[str, Any] = {
 }
 
 LOCATOR_RECIPE: Mapping[str, Any] = {"batch_size": 16, "micro_batch_size": 16, "budget_images": 19_200}
-"""Hyperparameters of linemod where a locator is trained: its trunk is frozen, so it learns from few images."""
+"""Hyperparameters of worlds where a locator is trained: its trunk is frozen, so it learns from few images."""
 
 
 def _make_absolute(options: WorldOptions, *names: str) -> None:
@@ -142,7 +142,8 @@ class CaptureOptions(WorldOptions):
     default_recipe: ClassVar[Mapping[str, Any]] = _TWO_STAGE_RECIPE
 
     mesh: tuple[Path, ...]
-    """Mesh file: STL, OBJ, PLY, GLB, glTF, OFF, STEP or IGES; with --plane one for each kind of part."""
+    """Mesh file: STL, OBJ, PLY, GLB, glTF, OFF, STEP or IGES. Several make one detector with a slot for each, or, with
+    --plane, for each kind of part."""
     camera: Path
     """Camera file of the photographs: camera JSON, or BOP's camera.json."""
     photos: Path
@@ -208,6 +209,11 @@ class CaptureOptions(WorldOptions):
             self._check_with_plane(self.plane)
 
     @property
+    def names_several(self) -> bool:
+        """Whether several parts in free space are asked for."""
+        return self.plane is None and len(self.mesh) > 1
+
+    @property
     def count_ranges(self) -> list[tuple[int, int]]:
         """Minimum and maximum number of each mesh.
 
@@ -223,11 +229,12 @@ class CaptureOptions(WorldOptions):
         names = ("counts", "up", "lying", "held_out", "second", "second_background", "blur_px")
         if flags := self._given_flags(names):
             raise UsageError(f"{flags}: for parts on a plane; expected --plane as well")
-        if isinstance(self.mesh, tuple) and len(self.mesh) != 1:
-            raise UsageError(
-                f"--mesh names {len(self.mesh)} files; several parts are learned on a plane alone: give --plane, or "
-                "train a model for each"
-            )
+        if isinstance(self.mesh, tuple):
+            self._check_names()
+
+    def _check_names(self) -> None:
+        if len({file.stem for file in self.mesh}) < len(self.mesh):
+            raise UsageError(f"--mesh {' '.join(map(str, self.mesh))}: parts are named after their files: rename one")
 
     def _given_flags(self, names: tuple[str, ...]) -> str:
         """The flags of these fields whose values are not the defaults."""
@@ -239,8 +246,7 @@ class CaptureOptions(WorldOptions):
             raise UsageError(f"--plane {plane}: expected --background, a photograph of it without parts, as well")
         if flags := self._given_flags(("backgrounds", "paint", "upright", "near_m", "far_m")):
             raise UsageError(f"{flags}: for a part in free space; leave it out, or --plane {plane}")
-        if len({file.stem for file in self.mesh}) < len(self.mesh):
-            raise UsageError(f"--mesh {' '.join(map(str, self.mesh))}: parts are named after their files: rename one")
+        self._check_names()
         if (self.second is None) != (self.second_background is None):
             raise UsageError("--second and --second-background belong together: expected both, or neither")
         if self.blur_px < 1 or self.blur_px % 2 == 0:

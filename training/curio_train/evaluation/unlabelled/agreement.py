@@ -84,6 +84,8 @@ def inside(photographs: Tensor, drawing: Drawing, backgrounds: Tensor) -> Float[
 def inlier_ratio(photographs: Tensor, drawing: Drawing) -> Float[Tensor, " num"]:
     """Fraction of what the surroundings, continued, do not explain of photographs and the drawing does; 0 at worst.
 
+    Where nothing is drawn it is 0, too.
+
     Differences are robust (Geman and McClure 1987), as in :mod:`~curio_train.refinement.render_and_compare`.
 
     Args:
@@ -96,7 +98,7 @@ def inlier_ratio(photographs: Tensor, drawing: Drawing) -> Float[Tensor, " num"]
     gains = _gains(seen, blurred(drawing.over(photographs)), mask)
     drawn = gains * blurred(drawing.over_black) + blurred(drawing.through * behind)
     left, without = (_residual(image, seen, around[:, 0]) for image in (drawn, blurred(behind)))
-    return (1 - left / without.clamp(min=1)).clamp(0, 1).double()
+    return (1 - left / without.clamp(min=1)).clamp(0, 1).double() * mask.any(dim=2).any(dim=1)
 
 
 def _residual(images: Tensor, photographs: Tensor, where: Tensor) -> Float[Tensor, " num"]:

@@ -27,6 +27,7 @@ from curio_train.metrics.images import blurred, dssim
 from curio_train.scene_code import CONFIDENCE, TRANSLATION, SceneCode
 from curio_train.worlds.base import PhotographSet, World
 from curio_train.worlds.capture import CapturePhotographs
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.tabletop.world import TabletopWorld
 
@@ -35,6 +36,7 @@ _NAMES = ("own_view", "second_view")
 _AGREES = {"overlap": 0.75, "explained": 0.4}
 _NUM_IN_SPACE = 48
 _DRAWN_AT_ONCE = 8  # frames of a camera are larger than images of a plane
+_LIKELY = 0.5  # confidence from which several parts are drawn in free space
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +76,7 @@ def judge(world: World, predict: Predict) -> Judgement | None:
     """
     if isinstance(world, TabletopWorld):
         return _on_plane(world, predict)
-    if isinstance(world, TwoStageWorld) and isinstance(world.photographs, CapturePhotographs):
+    if isinstance(world, TwoStageWorld | SeveralObjectsWorld) and isinstance(world.photographs, CapturePhotographs):
         photographs = world.photographs
         paths, judged = photographs.judged(_NUM_IN_SPACE)
         names = [path.name for path in paths]
@@ -123,8 +125,9 @@ def _in_space(
     world: World, predict: Predict, names: Sequence[str], photographs: Tensor, background_image: Tensor | None
 ) -> Judgement:
     code = dict(predict((photographs * 255).round().byte()))
-    if CONFIDENCE in code:  # drawn however unsure: whether it is right is the question
-        code[CONFIDENCE] = torch.ones_like(code[CONFIDENCE])
+    if CONFIDENCE in code:  # the likeliest is drawn however unsure: whether it is right is the question
+        likeliest = code[CONFIDENCE] == code[CONFIDENCE].amax(dim=1, keepdim=True)
+        code[CONFIDENCE] = (likeliest | (code[CONFIDENCE] >= _LIKELY)).to(code[CONFIDENCE])
     agreed, images, masks = _agreement(world, code, photographs, background_image)
     measure = "explained" if background_image is None else "overlap"
     order = agreed[measure].argsort()

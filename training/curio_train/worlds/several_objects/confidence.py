@@ -24,7 +24,9 @@ _NUM_POINTS = 500  # vertices that ADD is measured at, about
 def calibrate(network: ObjectsNetwork, world: ObjectScenes, cache: Path) -> None:
     """Make each object's confidence the probability of a correct pose, in place.
 
-    Frames that show the object tell whether its pose is correct; those that don't show its absence.
+    Frames that show the object tell whether its pose is correct; those that don't show its absence. They are not
+    augmented: confidence calibrated on augmented ones is farther off in photographs
+    (docs/experiments/real_photographs.md).
 
     Raises:
         DataError: The backgrounds cannot be read.
@@ -37,7 +39,7 @@ def calibrate(network: ObjectsNetwork, world: ObjectScenes, cache: Path) -> None
     for step in range(NUM_FRAMES // _BATCH_SIZE):
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
-        code, found = network.read(world.augment(batch.images, (0, step)).clamp(0, 1))
+        code, found = network.read(batch.images.clamp(0, 1))
         features.append(found)
         present.append(batch.code[CONFIDENCE][..., 0] > 0)
         correct.append(_correct(world, code, batch.code))

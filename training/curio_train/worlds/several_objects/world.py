@@ -26,23 +26,30 @@ class SeveralObjectsWorld(ObjectScenes):
     photographs: TrainingPhotographs | None
     """Photographs of a scene with the objects; None: there are none."""
 
-    def __init__(self, name: str, members: Sequence[Object], photographs: TrainingPhotographs | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        members: Sequence[Object],
+        photographs: TrainingPhotographs | None = None,
+        model_name: str | None = None,
+    ) -> None:
         """Build the stage; photographs are not read before they are needed.
 
         Args:
             name: As on the command line.
             members: The objects, each with the slot of its place in this order.
             photographs: Of a scene with the objects.
+            model_name: Of exported models; ``name`` unless given.
         """
         layout = pose_layout(position_field(members[0]), confidence=True, num_slots=len(members))
         super().__init__(name, members, frame_camera(members[0].camera), layout)
-        self.photographs = photographs
+        self.photographs, self._model_name = photographs, model_name or name
         self._stage = LocatorStage(members, self.camera)
 
     @property
     def model_name(self) -> str:
-        """The name of the only object, or else of the world."""
-        return self.objects[0].name if len(self.objects) == 1 else self.name
+        """Name of exported models unless the user gives one."""
+        return self._model_name
 
     @property
     def stages(self) -> tuple[LocatorStage]:
@@ -69,6 +76,7 @@ class SeveralObjectsWorld(ObjectScenes):
             member.kind.diameter_m,
             member.near_m,
             member.far_m,
+            any_side=member.seen_from_any_side,
         )
 
     def calibrate_confidence(self, network: nn.Module, cache: Path) -> None:
