@@ -52,7 +52,7 @@ def begin_with(state: TrainState, path: Path) -> None:
     except RuntimeError as exc:
         raise UsageError(
             f"--init {path}: its network does not fit this world ({str(exc).splitlines()[-1].strip()}); "
-            "expected a run or a model of the same world and the same network flags"
+            "expected a run or a model of the same world and the same network flags, such as --two-stage"
         ) from exc
     state.progress.images_before, state.progress.seconds_before = images, seconds
 
