@@ -133,6 +133,28 @@ def test_the_network_answers_aligned_poses(world: TwoStageWorld, network: TwoSta
     assert not torch.equal(code[TRANSLATION], as_read[TRANSLATION])
 
 
+@torch.no_grad()
+def test_of_several_objects_each_is_aligned_as_it_would_be_alone(
+    world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, OutlinePose]
+) -> None:
+    """Two objects, asked for in the other order: the second one is half as large, and its outlines are turned over."""
+    images, true = scenes
+    other = OutlineAlignment(len(outline.directions))
+    other.put(-outline.directions, -outline.points, -outline.outward)
+    several = OutlineAlignment(len(outline.directions), 2)
+    for slot, one in enumerate((outline, other)):
+        several.put(one.directions, one.points, one.outward, slot)
+    diameter_m, rotation = torch.tensor([0.2, 0.1]), rotation_6d_from_matrix(true.rotation)
+    codes = [{ROTATION_6D: rotation[:, None], TRANSLATION: size * true.position[:, None]} for size in diameter_m]
+    wanted = torch.tensor([1, 0])
+    both = {name: torch.cat([codes[slot][name] for slot in wanted], dim=1) for name in codes[0]}
+    found = several.of_objects(images, matrix(world), both, diameter_m[wanted], wanted)
+    for place, slot in enumerate(wanted.tolist()):
+        alone, _ = (outline, other)[slot].of_code(images, matrix(world), codes[slot], float(diameter_m[slot]))
+        for name, values in alone.items():
+            torch.testing.assert_close(found[name][:, place], values[:, 0], atol=1e-4, rtol=1e-4)
+
+
 @contextmanager
 def one_round() -> Iterator[None]:
     """Four take long to trace."""

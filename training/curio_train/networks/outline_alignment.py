@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from curio_serve.models.stages.outline_stage import INPUTS, OUTPUTS, OutlineStageNote
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from curio_train.color import linear_from_srgb
@@ -78,33 +78,39 @@ class _Edges(NamedTuple):
 
 
 class OutlineAlignment(nn.Module):
-    """The outline of one object in each viewing direction, and how a pose is aligned by it."""
+    """The outline of an object, or of several, in each viewing direction, and how a pose is aligned by it."""
 
     directions: Tensor
-    """From the camera to the object, object frame, [directions, 3]."""
+    """From the camera to the object, object frame, [directions, 3]; those of several [objects, directions, 3]."""
     points: Tensor
-    """On the surface, object frame, diameters, [directions, points, 3]."""
+    """On the surface, object frame, diameters, [directions, points, 3]; those of several [objects, …]."""
     outward: Tensor
-    """Unit vectors across the line of sight, object frame, [directions, points, 3]."""
+    """Unit vectors across the line of sight, object frame, of the same shape."""
     _prior: Tensor
 
-    def __init__(self, num_directions: int) -> None:
-        """Build with outlines that are still empty."""
+    def __init__(self, num_directions: int, num_objects: int | None = None) -> None:
+        """Build with outlines that are still empty.
+
+        Args:
+            num_directions: Of each object.
+            num_objects: None: one, whose outlines have no dimension for objects.
+        """
         super().__init__()
+        several = () if num_objects is None else (num_objects,)
         for name, shape in {
             "directions": (num_directions, 3),
             "points": (num_directions, NUM_POINTS, 3),
             "outward": (num_directions, NUM_POINTS, 3),
         }.items():
-            self.register_buffer(name, torch.zeros(shape))
+            self.register_buffer(name, torch.zeros(*several, *shape))
         turned, log_distance, shifted = (1 / spread**2 for spread in _SPREAD)
         prior = torch.tensor([turned] * 3 + [log_distance] + [shifted] * 2)
         self.register_buffer("_prior", prior, persistent=False)
 
-    def put(self, directions: Tensor, points: Tensor, outward: Tensor) -> None:
-        """Keep the outlines of an object, in numbers that half precision holds."""
+    def put(self, directions: Tensor, points: Tensor, outward: Tensor, number: int | None = None) -> None:
+        """Keep the outlines of an object, in numbers that half precision holds; of several that of a number."""
         for buffer, values in ((self.directions, directions), (self.points, points), (self.outward, outward)):
-            buffer.copy_(values.half())
+            (buffer if number is None else buffer[number]).copy_(values.half())
 
     def of_code(
         self,
@@ -119,7 +125,8 @@ class OutlineAlignment(nn.Module):
             The code, and the tensors at which the alignment can be cut out of an exported graph.
         """
         rotation, position_m = matrix_from_rotation_6d(code[ROTATION_6D][:, 0]), code[TRANSLATION][:, 0]
-        seen = _cut(images, matrix, OutlinePose(rotation, position_m / diameter_m))
+        position = position_m / diameter_m
+        seen = _cut(images, matrix, OutlinePose(rotation, position), position[:, None])
         pose = self._in_crops(seen)
         in_frame = seen.in_frame(pose)
         aligned = {ROTATION_6D: rotation_6d_from_matrix(in_frame.rotation), TRANSLATION: diameter_m * in_frame.position}
@@ -127,6 +134,31 @@ class OutlineAlignment(nn.Module):
         return code | {name: value[:, None] for name, value in aligned.items()}, dict(
             zip((*INPUTS, *OUTPUTS), tensors, strict=True)
         )
+
+    def of_objects(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        matrix: Float[Tensor, "3 3"],
+        code: dict[str, Tensor],
+        diameter_m: Float[Tensor, " wanted"],
+        objects: Int[Tensor, " wanted"],
+    ) -> dict[str, Tensor]:
+        """A code of several objects, metres and 6D rotation [batch, wanted, …], with its poses aligned.
+
+        Args:
+            images: sRGB in [0, 1].
+            matrix: K of the images.
+            code: What was read.
+            diameter_m: Of each object that the code has.
+            objects: Which ones these are.
+        """
+        position = code[TRANSLATION] / diameter_m[:, None]
+        rotation = matrix_from_rotation_6d(code[ROTATION_6D]).flatten(0, 1)
+        seen = _cut(images, matrix, OutlinePose(rotation, position.flatten(0, 1)), position)
+        found = seen.in_frame(self._in_crops(seen, objects.expand(position.shape[:2]).flatten()))
+        aligned = rotation_6d_from_matrix(found.rotation), found.position
+        rotation_6d, position = (values.unflatten(0, position.shape[:2]) for values in aligned)
+        return code | {ROTATION_6D: rotation_6d, TRANSLATION: position * diameter_m[:, None]}
 
     def note(self, tensors: dict[str, str], diameter_m: float) -> OutlineStageNote:
         """What serving has to know to run the alignment alone.
@@ -152,28 +184,44 @@ class OutlineAlignment(nn.Module):
             rotation: cam_from_obj, right to some degrees.
             position: In front of the camera, diameters, right to some per cent.
         """
-        seen = _cut(images, matrix, OutlinePose(rotation, position))
+        seen = _cut(images, matrix, OutlinePose(rotation, position), position[:, None])
         return seen.in_frame(self._in_crops(seen))
 
-    def _in_crops(self, seen: _Crops) -> OutlinePose:
-        """The poses in the crops' cameras, aligned."""
+    def _in_crops(self, seen: _Crops, objects: Int[Tensor, " batch"] | None = None) -> OutlinePose:
+        """The poses in the crops' cameras, aligned; each crop's object where there are several."""
         colors, pose = linear_from_srgb(seen.crops), seen.pose
         # Nothing here may take its shape from the images, which are not there where this is cut out of a graph.
         moved = torch.cat([pose.position, pose.position], dim=1) * 0
         for reach in _REACHES_PX:
-            pose, moved = self._round(colors, seen.focal_px, pose, moved, reach)
+            pose, moved = self._round(colors, seen.focal_px, pose, moved, reach, objects)
         return pose
 
+    def _nearest(
+        self, sight: Float[Tensor, "batch 3"], objects: Int[Tensor, " batch"] | None
+    ) -> tuple[Float[Tensor, "batch points 3"], Float[Tensor, "batch points 3"]]:
+        """Points and outward vectors of the outlines nearest to lines of sight, object frame."""
+        if objects is None:
+            view = (sight @ self.directions.T).argmax(dim=1)
+            return self.points[view], self.outward[view]
+        view = (self.directions[objects] @ sight[..., None])[..., 0].argmax(dim=1)
+        return self.points[objects, view], self.outward[objects, view]
+
     def _round(
-        self, colors: Tensor, focal_px: Tensor, pose: OutlinePose, moved: Float[Tensor, "batch 6"], reach: float
+        self,
+        colors: Tensor,
+        focal_px: Tensor,
+        pose: OutlinePose,
+        moved: Float[Tensor, "batch 6"],
+        reach: float,
+        objects: Int[Tensor, " batch"] | None,
     ) -> tuple[OutlinePose, Float[Tensor, "batch 6"]]:
         """One look for edges, and the pose that fits them and the network's own best."""
         turned = pose.rotation.transpose(1, 2)
-        view = ((turned @ pose.position[..., None])[..., 0] @ self.directions.T).argmax(dim=1)
-        arm = self.points[view] @ turned
+        points, outward = self._nearest((turned @ pose.position[..., None])[..., 0], objects)
+        arm = points @ turned
         seen = arm + pose.position[:, None]
         depth = seen[..., 2:].clamp(min=1e-3)
-        slope, along = seen[..., :2] / depth, self.outward[view] @ turned
+        slope, along = seen[..., :2] / depth, outward @ turned
         across = along[..., :2] - slope * along[..., 2:]
         across = across / across.norm(dim=-1, keepdim=True).clamp(min=_SHORTEST)
         scale = focal_px[:, None, None]
@@ -206,10 +254,10 @@ class OutlineAlignment(nn.Module):
         return step
 
 
-def _cut(images: Tensor, matrix: Tensor, pose: OutlinePose) -> _Crops:
-    """Crops around poses in images."""
+def _cut(images: Tensor, matrix: Tensor, pose: OutlinePose, position: Float[Tensor, "images num 3"]) -> _Crops:
+    """Crops around poses, whose positions are given image by image, too."""
     focal_px = _FILL * _SIDE * pose.position.norm(dim=1)
-    crops, crop_from_cam = cut_crops(images, matrix, pose.position[:, None], focal_px, _SIDE)
+    crops, crop_from_cam = cut_crops(images, matrix, position, focal_px, _SIDE)
     return _Crops(crops, focal_px, _turned(crop_from_cam, pose), crop_from_cam)
 
 

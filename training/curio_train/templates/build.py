@@ -93,7 +93,7 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> Non
 
 @torch.no_grad()
 def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Path) -> None:
-    """Draw and store the templates of several objects, and load the trunk's weights; what is trained stays.
+    """Draw and store templates and outlines of several objects, and load the trunk's weights; what is trained stays.
 
     Raises:
         CheckpointError: The trunk's weights are missing or damaged.
@@ -105,6 +105,8 @@ def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Pat
     backgrounds = world.members[0].backgrounds(cache).split(True)
     for number, (member, geometry) in enumerate(zip(world.members, network.geometries, strict=True)):
         network.reader.banks.put(number, filled_bank(trunk, geometry, member.mesh, _crops(backgrounds, geometry)))
+        if network.outline is not None:
+            network.outline.put(*_outlines(member.mesh, geometry), number)
 
 
 @torch.no_grad()
@@ -115,9 +117,12 @@ def fill_outline(network: TwoStageNetwork | TemplateNetwork, world: SingleObject
         RendererError: The mesh cannot be rendered.
     """
     if network.outline is not None:
-        geometry = _geometry(world)
-        directions = geometry.outline_rotations[:, 2]
-        network.outline.put(directions, *outlines(world.object.mesh, geometry, NUM_POINTS))
+        network.outline.put(*_outlines(world.object.mesh, _geometry(world)))
+
+
+def _outlines(mesh: Mesh, geometry: Geometry) -> tuple[Tensor, Tensor, Tensor]:
+    """Directions, points and outward vectors of the outlines that poses are aligned by."""
+    return geometry.outline_rotations[:, 2], *outlines(mesh, geometry, NUM_POINTS)
 
 
 def _crops(backgrounds: Backgrounds, geometry: Geometry) -> Float[Tensor, "num 3 side side"]:

@@ -128,7 +128,8 @@ def build(options: CaptureOptions) -> World:
     photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera))
     if len(members) > 1:
         name = "-".join(member.kind.name for member in members)
-        return SeveralObjectsWorld("capture", [_painted(member) for member in members], photographs, name)
+        painted = [_painted(member) for member in members]
+        return SeveralObjectsWorld("capture", painted, photographs, name, aligns_outlines=True)
     return TwoStageWorld("capture", members[0], photographs, aligns_outlines=True)
 
 

@@ -32,6 +32,8 @@ class SeveralObjectsWorld(ObjectScenes):
         members: Sequence[Object],
         photographs: TrainingPhotographs | None = None,
         model_name: str | None = None,
+        *,
+        aligns_outlines: bool = False,
     ) -> None:
         """Build the stage; photographs are not read before they are needed.
 
@@ -40,10 +42,12 @@ class SeveralObjectsWorld(ObjectScenes):
             members: The objects, each with the slot of its place in this order.
             photographs: Of a scene with the objects.
             model_name: Of exported models; ``name`` unless given.
+            aligns_outlines: Whether poses are aligned with the objects' outlines in the end.
         """
         layout = pose_layout(position_field(members[0]), confidence=True, num_slots=len(members))
         super().__init__(name, members, frame_camera(members[0].camera), layout)
         self.photographs, self._model_name = photographs, model_name or name
+        self._aligns_outlines = aligns_outlines
         self._stage = LocatorStage(members, self.camera)
 
     @property
@@ -65,7 +69,8 @@ class SeveralObjectsWorld(ObjectScenes):
         """The locator with templates that are still empty."""
         (locator,) = networks
         assert isinstance(locator, LocatorNetwork)
-        return ObjectsNetwork(locator, [self._geometry(member) for member in self.members])
+        geometries = [self._geometry(member) for member in self.members]
+        return ObjectsNetwork(locator, geometries, aligns_outlines=self._aligns_outlines)
 
     def _geometry(self, member: Object) -> Geometry:
         assert self.camera.matrix is not None
