@@ -45,8 +45,9 @@ def markdown(table: Results, command: str) -> str:
         "bootstrap interval. *Published* is an RGB method trained with labels, given where these are the frames that "
         "its estimates are known for. *Refined* poses are what the network answers after render-and-compare "
         "(`curio-eval --refine`), which needs the mesh and the renderer and is no part of serving. *Self-trained* "
-        "networks have learned from unlabelled real frames, too. Images and minutes count those of the networks that "
-        "one began as (`--init`).",
+        "networks have learned from unlabelled real frames, too. Of *templates* a trained locator finds the object, "
+        "and templates that were drawn before tell its pose; other networks regress it. Images and minutes count those "
+        "of the networks that one began as (`--init`).",
     ]
     for method, rows in table.items():
         parts += [f"## `{method}`", _supervision(rows), _rows(rows)]
