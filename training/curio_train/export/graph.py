@@ -15,8 +15,9 @@ from curio_train.export.parity import LARGEST_PARITY_ERROR
 from curio_train.export.stages import stage_tensors
 from curio_train.networks.layers import fold_batch_norm
 from curio_train.networks.two_stage.network import TwoStageNetwork
-from curio_train.scene_code import TRANSLATION, joined
+from curio_train.scene_code import CONFIDENCE, TRANSLATION, joined
 from curio_train.worlds.base import World
+from curio_train.worlds.several_objects.scenes import ObjectScenes
 
 NUM_JITTERED = 8
 """Rounds of jitter in the check of numerical stability; it misses a tie once in 2 to the power of this."""
@@ -108,6 +109,8 @@ def check_images(world: World) -> Tensor:
     unlikely.
     """
     code = world.sample(_NUM_CHECK_IMAGES, _CHECK_SEED)
+    if isinstance(world, ObjectScenes):
+        code[CONFIDENCE] = torch.ones_like(code[CONFIDENCE])  # each is there
     size = (world.camera.height, world.camera.width)
     coarse = np.random.default_rng(_CHECK_SEED).random((_NUM_CHECK_IMAGES, 3, *(side // 8 for side in size)))
     noise = F.interpolate(torch.from_numpy(coarse).float(), size, mode="bilinear")

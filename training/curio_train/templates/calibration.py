@@ -26,11 +26,9 @@ _NUM_POINTS = 500  # vertices that ADD is measured at, about
 
 @torch.no_grad()
 def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, num_threads: int = 1) -> None:
-    """Fit the two logits of the confidence on whole frames.
+    """Fit the two logits of the confidence on augmented whole frames.
 
-    Frames with the object show whether its pose is correct; as many frames without it show its absence. They are not
-    augmented: confidence calibrated on augmented ones is farther off in photographs
-    (docs/experiments/real_photographs.md).
+    Frames with the object show whether its pose is correct; as many frames without it show its absence.
 
     Raises:
         DataError: The backgrounds cannot be read.
@@ -48,8 +46,8 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, n
             assert batch.code is not None
             assert behind is not None  # these worlds always have some
             true.extend(poses(batch.code))
-            yield batch.images.clamp(0, 1)
-            yield behind.clamp(0, 1)
+            yield world.augment(batch.images, (0, step)).clamp(0, 1)
+            yield world.augment(behind, (1, step)).clamp(0, 1)
 
     answers = list(in_threads(reader.read, frames(), num_threads))
     found = [pose for code, _ in answers[::2] for pose in poses(code)]
