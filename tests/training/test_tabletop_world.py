@@ -276,8 +276,8 @@ def test_a_camera_that_moves_has_a_plate_for_each_photograph(folder: Path, tmp_p
     [
         ({"plane": None}, "--counts, --second, --second-background: for parts on a plane"),
         (
-            {"plane": None, "counts": (), "second": None, "second_background": None, "mesh": ("a.stl", "b.stl")},
-            "--mesh names 2",
+            {"plane": None, "counts": (), "second": None, "second_background": None, "mesh": ("a/b.stl", "b.stl")},
+            "rename one",
         ),
         ({"background": None}, "expected --background"),
         ({"upright": True, "far_m": 2.0}, "--upright, --far-m: for a part in free space"),
