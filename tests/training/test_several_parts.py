@@ -26,9 +26,10 @@ WIDTH, HEIGHT = 160, 120
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A grey block without colours, and a red one, in millimetres; photographs and a background image."""
+    """Two blocks without colours and a red one, in millimetres; photographs and a background image."""
     root = tmp_path_factory.mktemp("parts")
     trimesh.creation.box((80, 40, 20)).export(root / "block.stl")
+    trimesh.creation.box((30, 30, 60)).export(root / "again.stl")
     red = trimesh.creation.box((60, 50, 40))
     red.visual.vertex_colors = np.tile([200, 30, 30, 255], (len(red.vertices), 1))
     red.export(root / "red.ply")
@@ -84,11 +85,6 @@ def test_a_part_without_colours_is_painted_and_others_keep_theirs(folder: Path) 
     assert all(np.allclose(one.mesh.vertex_colors_srgb[0], [0.2, 0.502, 0.302], atol=0.01) for one in only.members)
     with pytest.raises(UsageError, match=r"--paint #33804d: .*red\.ply has colours"):
         build(options(folder, paint="#33804d"))
-
-
-@pytest.fixture(autouse=True, scope="module")
-def again(folder: Path) -> None:
-    trimesh.creation.box((30, 30, 60)).export(folder / "again.stl")
 
 
 def test_calls_that_contradict_themselves_are_refused(folder: Path, tmp_path: Path) -> None:

@@ -67,6 +67,10 @@ ALL_CLASSES = "all"
 """Names every object of a data set."""
 
 
+def _is_several(class_name: str) -> bool:
+    return class_name == ALL_CLASSES or "," in class_name
+
+
 @dataclass(frozen=True)
 class LinemodOptions(WorldOptions):
     """Objects of the LineMOD data set in six degrees of freedom, over cluttered backgrounds."""
@@ -119,13 +123,12 @@ class LinemodOptions(WorldOptions):
     @property
     def names_several(self) -> bool:
         """Whether several objects are asked for."""
-        return self.class_name == ALL_CLASSES or "," in self.class_name
+        return _is_several(self.class_name)
 
     @classmethod
     def upgraded(cls, stored: Mapping[str, Any]) -> Mapping[str, Any]:
         """Options of a stored configuration; those that are older than --two-stage always had two for one object."""
-        name = str(stored.get("class_name"))
-        is_two_stage = stored.get("gaze", True) and name != ALL_CLASSES and "," not in name
+        is_two_stage = stored.get("gaze", True) and not _is_several(str(stored.get("class_name")))
         return {"two_stage": is_two_stage, **stored}
 
 
