@@ -134,7 +134,7 @@ def _defaults(world: str, typed: list[str]) -> tuple[RunConfig, RunConfig | None
         recipe = replace(recipe, self_training=0.0)
     if preset == "laptop" and seen.method in (None, kind.default_method) and _names_locator(world, seen):
         recipe = replace(recipe, **LOCATOR_RECIPE)
-    if world == "capture" and len(seen.mesh) > 1 and seen.plane is None:
+    if world == "capture" and _names_locator(world, seen):
         recipe = replace(recipe, self_training=0.0)
     return RunConfig(_unset(kind), method=kind.default_method, recipe=recipe), stored
 
