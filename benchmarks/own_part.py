@@ -32,6 +32,7 @@ from curio_train.data.bop import ModelInfo
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import load_mesh
 from curio_train.meshes.symmetries import find_symmetries
+from curio_train.metrics.calibration import calibration_error
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, rotation_error_deg
 from synthetic_captures.captures import Amount, make
 
@@ -155,6 +156,7 @@ def _score(files: Path, poses: Path) -> dict[str, Any]:
         "add_median": statistics.median(add),
         "rotation_deg_median": statistics.median(turned),
         "confidence_mean": statistics.mean(confidence),
+        "confidence_ece": calibration_error(confidence, [error < ADD_THRESHOLD for error in add]),
         "num_test": len(found),
     }
 

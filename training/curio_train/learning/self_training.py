@@ -9,13 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from curio_train.networks.several_objects.network import ObjectsNetwork
-from curio_train.refinement.photographed_confidence import calibrate_by, read_by_others
+from curio_train.networks.two_stage.network import TwoStageNetwork
+from curio_train.refinement.photographed_confidence import calibrate_by, calibrate_by_agreement, read_by_others
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.refinement.scene_labels import SceneLabels
 from curio_train.scene_code import SceneCode
 from curio_train.templates.photographed import learn_appearance
 from curio_train.worlds.base import StagedWorld, World
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 ROUNDS, ROUNDS_OF_PRETRAINED = (0.6, 0.8), (0.2, 0.5, 0.8)
 """Fractions of the budget after which a pseudo-labelling round is due: late, when the network's poses are good enough;
@@ -87,6 +89,10 @@ class SelfTraining:
             calibrate_by(network, evidence)
         elif isinstance(world, StagedWorld):
             world.calibrate_confidence(network, cache)
+            # Without outlines wrong reads agree as often as right ones (docs/experiments/real_photographs.md).
+            if isinstance(labels, PseudoLabels) and isinstance(world, TwoStageWorld) and world.aligns_outlines:
+                assert isinstance(network, TwoStageNetwork)
+                calibrate_by_agreement(network, world, self._predict)
 
     def mix_in(self, code: SceneCode, images: Tensor, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:
         """The last stage's codes and images with the first ones replaced by pseudo-labelled photographs, or crops.

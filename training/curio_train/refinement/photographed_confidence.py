@@ -1,23 +1,29 @@
-"""Confidence of a detector for several objects, calibrated on photographs with pseudo-labels."""
+"""Confidence that photographs calibrate: with pseudo-labels of several objects, or where reads of one object agree."""
 
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS
 from jaxtyping import Bool, Float
 
+from curio_train.data.photographs import read_frames, spread
 from curio_train.geometry import Pose
 from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.networks.several_objects.network import ObjectsNetwork
-from curio_train.refinement.scene_labels import SceneLabels
+from curio_train.networks.two_stage.network import TwoStageNetwork
+from curio_train.refinement.agreeing_reads import NUM_READS, all_agree
+from curio_train.refinement.scene_labels import Predict, SceneLabels, read_often
 from curio_train.scene_code import poses
 from curio_train.templates.photographed import learn_appearance
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 _NUM_POINTS = 500  # vertices that ADD is measured at, about
 _FEWEST = 8  # correct poses, and wrong ones, that a calibration needs
 _READ_AT_ONCE = 2
+_NUM_READ = 100  # photographs of one object; each takes a third of a second
 
 
 class Evidence(NamedTuple):
@@ -72,6 +78,37 @@ def calibrate_by(network: ObjectsNetwork, evidence: Evidence) -> None:
     if min(hits.sum(), (~hits).sum()) >= _FEWEST:
         weights = fit_calibration(evidence.features.reshape(-1, evidence.features.shape[2]), hits.tolist())
         network.reader.pose_correct[:] = torch.tensor(weights).float()
+
+
+@torch.no_grad()
+def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld, predict: Predict) -> None:
+    """Make the confidence of a correct pose the share of photographs of which all reads agree, in place.
+
+    Renderings show clutter and parts that the frame's border cuts, which photographs of a part hardly do: calibrated by
+    them, an own part's confidence is a third too low (docs/experiments/captures.md). Agreement is no truth: an error
+    that all reads share is not seen. Absence, which photographs of the object do not show, stays as renderings tell it.
+
+    Args:
+        network: Calibrated on renderings.
+        world: With photographs that show the object.
+        predict: The network, for images [batch, 3, height, width] in [0, 1].
+
+    Raises:
+        DataError: A photograph cannot be read, or is not of the camera's size.
+    """
+    assert world.photographs is not None
+    assert world.camera.matrix is not None
+    paths = spread(world.photographs.unlabelled_paths(), _NUM_READ)
+    frames = torch.from_numpy(read_frames(paths, world.object.camera, world.camera.width, world.camera.height))
+    reads = read_often(frames, world.camera.matrix, predict, VIRTUAL_CAMERAS[:NUM_READS])
+    agrees = all_agree(reads, world.object).tolist()
+    found = [
+        network.uncalibrated(some.to(network.rightness.device).float() / 255)[1].pose_correct.cpu().numpy()
+        for some in frames.split(_READ_AT_ONCE)
+    ]
+    # One right and one wrong answer more (Laplace's rule): that all agree does not make them certain.
+    features = np.concatenate([*found, np.mean(np.concatenate(found), axis=0)[None].repeat(2, axis=0)])
+    network.rightness.copy_(torch.tensor(fit_calibration(features, [*agrees, True, False])))
 
 
 def _correct(

@@ -24,7 +24,7 @@ from curio_train.refinement.turned_frames import in_view, random_camera, seen_by
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, SceneCode, joined
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
-_CAMERAS = VIRTUAL_CAMERAS[:3]  # that photographs are read through
+_THROUGH = VIRTUAL_CAMERAS[:3]  # that photographs are read
 _ELSEWHERE_M = (0.0, 0.0, 1.0)  # where objects are said to be whose place nobody knows
 
 _log = logging.getLogger(__name__)
@@ -83,10 +83,10 @@ class SceneLabels:
         assert world.camera.matrix is not None
         if seconds is not None:
             began = time.monotonic()
-            read_often(frames[:1], world.camera.matrix, predict)
+            read_often(frames[:1], world.camera.matrix, predict, _THROUGH)
             chosen = _affordable(len(frames), time.monotonic() - began, seconds)
             frames, cameras = frames[chosen], cameras._replace(cam_from_world=cameras.cam_from_world[chosen])
-        poses = scene_poses(read_often(frames, world.camera.matrix, predict), cameras, world.objects)
+        poses = scene_poses(read_often(frames, world.camera.matrix, predict, _THROUGH), cameras, world.objects)
         labels = cls(world, frames, poses)
         _log.info("photographs agree on %d poses of %d", labels.num_known, len(frames) * len(world.objects))
         return labels if labels.num_known else None
@@ -120,17 +120,20 @@ class SceneLabels:
         return code, self._stage.augment(small, seed).clamp(0, 1)
 
 
-def read_often(frames: UInt8[Tensor, "num 3 height width"], matrix: np.ndarray, predict: Predict) -> Reads:
-    """What a network reads in photographs through a few slightly turned cameras.
+def read_often(
+    frames: UInt8[Tensor, "num 3 height width"], matrix: np.ndarray, predict: Predict, through: Sequence[VirtualCamera]
+) -> Reads:
+    """What a network reads in photographs through slightly turned cameras.
 
     Args:
         frames: Of the network's camera.
         matrix: Its K.
         predict: Reads images.
+        through: The turned cameras; each photograph is read once through each.
     """
     codes, photograph = [], []
     for number, frame in enumerate(frames):
-        for camera in _CAMERAS:
+        for camera in through:
             pixels = camera.image(frame.permute(1, 2, 0).numpy(), matrix)
             seen = predict(torch.from_numpy(pixels).permute(2, 0, 1)[None].float() / 255)
             codes.append(_brought_back(seen, camera))
