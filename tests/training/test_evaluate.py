@@ -151,6 +151,7 @@ def test_real_frames_are_scored_where_bop_asks(data: Path, tmp_path: Path) -> No
     assert metrics["rotation_deg_median"] == pytest.approx(0, abs=0.05)
     assert metrics["translation_mm_median"] == pytest.approx(np.hypot(60, 100) / 2, rel=1e-3)
     assert metrics["mssd_recall"] == 0.5
+    assert metrics["confidence_ece"] == 0.5  # sure of both
     # In image 4 the farthest corner is at (13.3, ±26.7) px from the centre and found at (-30.1, ±30.2): 43.6 px off,
     # below two of the ten thresholds.
     assert metrics["mspd_recall"] == pytest.approx((1 + 0.2) / 2)

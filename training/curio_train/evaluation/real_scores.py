@@ -51,12 +51,14 @@ def scored(kind: ObjectKind, pairs: Pairs, dataset: BopDataset) -> dict[str, Any
     points, info = dataset.evaluation_mesh(kind.name).vertices_m, kind.info
     seen = [pair for pair in pairs if (pair[1].visible_fraction or 0) >= VISIBLE]
     rows = [_row(e, target, points, info) for e, target in pairs]
+    confidences, correct = _confidences(rows)
+    calibration = {"confidence_ece": calibration_error(confidences, correct)}
     return {
         "num_targets": len(pairs),
         "num_targets_visible_80": len(seen),
-        "metrics": _metrics(pairs, points, info) | _recall_visible(seen, points, info),
+        "metrics": _metrics(pairs, points, info) | _recall_visible(seen, points, info) | calibration,
         "by_visibility": _by_visibility(rows),
-        "reliability": reliability_bins(*_confidences(rows)),
+        "reliability": reliability_bins(confidences, correct),
         "targets": rows,
     }
 
