@@ -102,13 +102,13 @@ def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld, predi
     frames = torch.from_numpy(read_frames(paths, world.object.camera, world.camera.width, world.camera.height))
     reads = read_often(frames, world.camera.matrix, predict, VIRTUAL_CAMERAS[:NUM_READS])
     agrees = all_agree(reads, world.object).tolist()
-    found = [
-        network.uncalibrated(some.to(network.rightness.device).float() / 255)[1].pose_correct.cpu().numpy()
-        for some in frames.split(_READ_AT_ONCE)
-    ]
+    device = network.rightness.device
+    found = [network.uncalibrated(some.to(device).float() / 255)[1] for some in frames.split(_READ_AT_ONCE)]
+    features = torch.cat([of_some.pose_correct for of_some in found]).cpu().numpy()
+    mean = features.mean(axis=0)
     # One right and one wrong answer more (Laplace's rule): that all agree does not make them certain.
-    features = np.concatenate([*found, np.mean(np.concatenate(found), axis=0)[None].repeat(2, axis=0)])
-    network.rightness.copy_(torch.tensor(fit_calibration(features, [*agrees, True, False])))
+    weights = fit_calibration(np.vstack([features, mean, mean]), [*agrees, True, False])
+    network.rightness.copy_(torch.tensor(weights))
 
 
 def _correct(
