@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import torch
 from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS
 from curio_train.config import RunConfig
@@ -66,21 +67,26 @@ class Greys:
     """Photographs of the brick's camera that show nothing."""
 
     def __init__(self, folder: Path) -> None:
+        self.num = NUM
         self._paths = [folder / f"{number:02}.png" for number in range(NUM)]
         for number, path in enumerate(self._paths):
             cv2.imwrite(str(path), np.full((480, 640, 3), 5 * number, np.uint8))
 
+    def paths(self) -> Sequence[Path]:
+        return self._paths[: self.num]
+
     def unlabelled_paths(self) -> Sequence[Path]:
-        return self._paths
+        return []
 
     def unlabelled(self) -> UnlabelledPhotographs:
-        return UnlabelledPhotographs(self._paths)
+        return UnlabelledPhotographs([])
 
 
 @torch.no_grad()
 def test_confidence_is_the_share_of_photographs_whose_reads_agree(brick: Object, tmp_path: Path) -> None:
     """Every fourth photograph is read in another way each time."""
-    world = TwoStageWorld("capture", brick, Greys(tmp_path), aligns_outlines=True)
+    greys = Greys(tmp_path)
+    world = TwoStageWorld("capture", brick, greys, aligns_outlines=True)
     state = TrainState(RunConfig(LinemodOptions("ape", two_stage=True)), world, torch.device("cpu"))
     network = state.pose.network.eval()
     assert isinstance(network, TwoStageNetwork)
@@ -103,3 +109,8 @@ def test_confidence_is_the_share_of_photographs_whose_reads_agree(brick: Object,
     confidence = torch.sigmoid(features @ network.rightness[:1] + network.rightness[1])
     assert abs(float(confidence.mean()) - (0.75 * NUM + 1) / (NUM + 2)) < 0.03
     assert torch.equal(network.presence, presence)
+
+    network.rightness.copy_(torch.tensor([0.7, 0.3]))
+    greys.num = NUM - 1
+    calibrate_by_agreement(network, world, predict)
+    assert network.rightness.tolist() == pytest.approx([0.7, 0.3]), "too few photographs say nothing"

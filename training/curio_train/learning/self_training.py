@@ -89,8 +89,8 @@ class SelfTraining:
             calibrate_by(network, evidence)
         elif isinstance(world, StagedWorld):
             world.calibrate_confidence(network, cache)
-            # Without outlines wrong reads agree as often as right ones (docs/experiments/real_photographs.md).
-            if isinstance(labels, PseudoLabels) and isinstance(world, TwoStageWorld) and world.aligns_outlines:
+            # Without outlines wrong reads agree as often as right ones (docs/experiments/captures.md).
+            if isinstance(world, TwoStageWorld) and world.aligns_outlines:
                 assert isinstance(network, TwoStageNetwork)
                 calibrate_by_agreement(network, world, self._predict)
 

@@ -23,7 +23,7 @@ from curio_train.worlds.single_object.two_stage import TwoStageWorld
 _NUM_POINTS = 500  # vertices that ADD is measured at, about
 _FEWEST = 8  # correct poses, and wrong ones, that a calibration needs
 _READ_AT_ONCE = 2
-_NUM_READ = 100  # photographs of one object; each takes a third of a second
+_NUM_READ, _FEWEST_READ = 100, 20  # photographs of one object; each takes a third of a second
 
 
 class Evidence(NamedTuple):
@@ -89,16 +89,17 @@ def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld, predi
     that all reads share is not seen. Absence, which photographs of the object do not show, stays as renderings tell it.
 
     Args:
-        network: Calibrated on renderings.
-        world: With photographs that show the object.
+        network: Calibrated on renderings; with fewer than twenty photographs it stays as it is.
+        world: Its photographs show the object.
         predict: The network, for images [batch, 3, height, width] in [0, 1].
 
     Raises:
         DataError: A photograph cannot be read, or is not of the camera's size.
     """
-    assert world.photographs is not None
+    paths = spread(world.photographs.paths(), _NUM_READ) if world.photographs is not None else []
+    if len(paths) < _FEWEST_READ:
+        return
     assert world.camera.matrix is not None
-    paths = spread(world.photographs.unlabelled_paths(), _NUM_READ)
     frames = torch.from_numpy(read_frames(paths, world.object.camera, world.camera.width, world.camera.height))
     reads = read_often(frames, world.camera.matrix, predict, VIRTUAL_CAMERAS[:NUM_READS])
     agrees = all_agree(reads, world.object).tolist()

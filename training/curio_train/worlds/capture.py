@@ -65,6 +65,14 @@ class CapturePhotographs:
         """
         self._folder, self._background, self._intrinsics, self._camera = folder, background, intrinsics, camera
 
+    def paths(self) -> Sequence[Path]:
+        """Files of all photographs.
+
+        Raises:
+            DataError: The folder cannot be read.
+        """
+        return Photographs(self._folder).paths
+
     def judged(self, count: int) -> tuple[list[Path], Tensor]:
         """At most ``count`` of those that the model never learns from: files, and [num, 3, height, width] in [0, 1].
 
@@ -101,7 +109,7 @@ class CapturePhotographs:
     @property
     def _split(self) -> tuple[list[Path], list[Path]]:
         """Photographs to judge by, and the others; a model is judged by all if they are few."""
-        paths = list(Photographs(self._folder).paths)
+        paths = list(self.paths())
         if len(paths) < FEWEST_TO_LEARN_FROM:
             return paths, []
         judged = spread(paths, NUM_JUDGED)

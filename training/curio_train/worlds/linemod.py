@@ -53,13 +53,21 @@ class LinemodPhotographs:
         self._folder, self._camera, self._views = folder, camera, views
         self._unlabelled: UnlabelledPhotographs | None = None
 
-    def unlabelled_paths(self) -> Sequence[Path]:
+    def paths(self) -> Sequence[Path]:
         """Files of the frames.
 
         Raises:
             DataError: The folder cannot be read.
         """
-        return spread(Photographs(self._folder).paths, MAX_UNLABELLED)
+        return Photographs(self._folder).paths
+
+    def unlabelled_paths(self) -> Sequence[Path]:
+        """Files of the frames that a network learns from.
+
+        Raises:
+            DataError: The folder cannot be read.
+        """
+        return spread(self.paths(), MAX_UNLABELLED)
 
     def unlabelled(self) -> UnlabelledPhotographs:
         """The frames; the poses of their cameras are recovered once.

@@ -34,6 +34,13 @@ STAGE_SCHEDULE, STAGE_SCHEDULE_IN_KNOWN_SCENE = (0, 1, 1), (0, 1, 1, 1, 1)
 class TrainingPhotographs(Protocol):
     """Photographs of a world's object."""
 
+    def paths(self) -> Sequence[Path]:
+        """Files of all photographs.
+
+        Raises:
+            DataError: The folder of photographs cannot be read.
+        """
+
     def unlabelled_paths(self) -> Sequence[Path]:
         """Files of the photographs that a network may learn from.
 
