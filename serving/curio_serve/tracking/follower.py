@@ -103,8 +103,10 @@ class Follower:
         light = self._read_crops(frame)
         if self._is_look_due(frame, following):
             self._looked_s = time_s
+            missed = [track for track in self._tracks if not track.is_seen]
             light = self._search_around(frame) or light
-            if self._is_whole_needed(frame, following):
+            # What was hidden is mostly found beside its last position; whatever else is looked for may be anywhere.
+            if following.search or not missed or not all(track.is_seen for track in missed):
                 light = self._look(frame, following) or light
         kept = [track for track in self._tracks if time_s - track.seen_s <= following.keep_s]
         self._tracks = without_doubles(kept)[: following.num_objects * len(detector.model.spec.objects)]
@@ -154,10 +156,6 @@ class Follower:
         if num_seen == 0 or num_seen < len(self._tracks):
             return waited_s >= _SEARCH_S
         return waited_s >= (_MORE_S if num_seen < wanted else _VERIFY_S)
-
-    def _is_whole_needed(self, frame: StreamFrame, following: Following) -> bool:
-        """Whether to run the whole model, after the search around objects that are not seen."""
-        return following.search or not self._tracks or not all(track.is_seen for track in self._tracks)
 
     def _look(self, frame: StreamFrame, following: Following) -> Sequence[float]:
         """Run the whole model on the frame; return the light."""
