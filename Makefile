@@ -14,7 +14,7 @@ PROTOS := $(shell cd proto && find curio_proto -name '*.proto' | sort)
 PROTOC := $(BIN)/python -m grpc_tools.protoc -Iproto
 # Those that need no argument, no container engine and no photographs of others, and end within the hour.
 BENCHMARKS := $(addprefix benchmarks/,detection.py image.py own_part.py serving.py video.py closed_form/landscape.py closed_form/validation_experiment.py \
-	closed_form/watching.py paper/basins.py paper/over_images.py pictures/viewing.py rendering/renderer.py rendering/renderer_faces.py rendering/renderer_profile.py rendering/training.py)
+	closed_form/watching.py paper/basins.py pictures/viewing.py rendering/renderer.py rendering/renderer_faces.py rendering/renderer_profile.py rendering/training.py)
 
 # Every recipe is one bash script that stops at the first failure.
 SHELL := /bin/bash

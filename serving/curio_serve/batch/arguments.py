@@ -69,7 +69,7 @@ class DetectArguments:
     track: bool = False
     """Follow objects through the frames of each video, or of each folder's images in order: JSON Lines have tracks."""
     track_objects: int = 1
-    """With --track: most objects of each model at a time."""
+    """With --track: most objects of each kind at a time."""
     frame_rate: float = 30.0
     """With --track: of a folder's images and of videos that say none, frames/s."""
     refine: tyro.conf.FlagCreatePairsOff[bool] = False

@@ -55,7 +55,7 @@ class Settings:
     sources_root: Path = Path("/")
     """Folder that holds all images; drawings repeat the paths below it."""
     track_objects: int | None = None
-    """Follow that many objects of each model from image to image; None: every image on its own."""
+    """Follow that many objects of each kind from image to image; None: every image on its own."""
     frame_rate: float = 30.0
     """Frames per second of images that carry no time."""
     max_instances: int | None = None

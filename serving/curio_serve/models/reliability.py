@@ -102,7 +102,7 @@ def status_of(reliability: Reliability, object_: str, confidence: float) -> Dete
 
 
 def add_interval(detection: Detection, reliability: Reliability) -> None:
-    """Write the interval of a pose of one whole frame into its detection, if the model has one for it."""
+    """Write the interval of a pose of one image into its detection, if the model has one for it."""
     one = _of(reliability, detection.object)
     bounds = None if one is None else bounds_of(one, detection.confidence)
     if bounds is not None:

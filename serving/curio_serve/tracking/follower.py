@@ -41,7 +41,7 @@ class Following:
     keep_s: float = KEEP_S
     """Seconds for which an object that is not seen is answered with its predicted pose."""
     num_objects: int = 1
-    """Largest number of objects followed at a time."""
+    """Largest number of objects of each kind that are followed at a time."""
     search: bool = False
     """Run the whole model on this frame in any case."""
 

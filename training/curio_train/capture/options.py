@@ -31,7 +31,8 @@ class CalibrateCommand:
     distance_m: float | None = None
     """Distance of the first and the last camera, for poses in metres."""
     objects: Path | None = None
-    """For poses in metres, too: folder with a model or run for each LineMOD object that the scene shows."""
+    """For poses in metres, too: model or run of the LineMOD objects that the scene shows, or a folder with one of
+    each."""
     data: Path | None = None
     """Their data folder."""
     rig_out: Path | None = None

@@ -129,7 +129,8 @@ def _with_paint(options: CaptureOptions, report: Callable[[str], None]) -> Captu
         return options
     if not any(is_unpainted(load_mesh(file, options.mesh_unit, options.body)) for file in options.mesh):
         return options
-    anyway = "it is learned in any colour, which takes longer; --paint '#8a6f4c' says which it has"
+    drawn = "it is drawn in grey" if options.names_several else "it is learned in any colour, which takes longer"
+    anyway = f"{drawn}; --paint '#8a6f4c' says which it has"
     if options.background is None:
         report(f"the part's colour is not known without --background, a photograph of the empty scene: {anyway}")
         return options
