@@ -93,7 +93,7 @@ def test_confidence_is_the_share_of_photographs_whose_reads_agree(brick: Object,
     presence = network.presence.clone()
     random, count = np.random.default_rng(1), 0
 
-    def predict(_: Tensor) -> dict[str, Tensor]:
+    def read(_network: object, _images: object, _output: object) -> dict[str, Tensor]:
         nonlocal count
         number, virtual = count // NUM_READS, VIRTUAL_CAMERAS[count % NUM_READS]
         count += 1
@@ -102,7 +102,8 @@ def test_confidence_is_the_share_of_photographs_whose_reads_agree(brick: Object,
         )
         return reads_of([turn], np.array([[0.0, 0.0, 0.8 / virtual.zoom]]))
 
-    calibrate_by_agreement(network, world, predict)
+    network.register_forward_hook(read)
+    calibrate_by_agreement(network, world)
     assert count == NUM * NUM_READS
     frames = torch.stack([torch.full((3, 480, 640), 5 * number / 255) for number in range(NUM)])
     features = torch.cat([network.uncalibrated(frame[None])[1].pose_correct for frame in frames])
@@ -112,5 +113,5 @@ def test_confidence_is_the_share_of_photographs_whose_reads_agree(brick: Object,
 
     network.rightness.copy_(torch.tensor([0.7, 0.3]))
     greys.num = NUM - 1
-    calibrate_by_agreement(network, world, predict)
+    calibrate_by_agreement(network, world)
     assert network.rightness.tolist() == pytest.approx([0.7, 0.3]), "too few photographs say nothing"

@@ -114,7 +114,8 @@ class WorkQueue:
         try:
             yield entry
         finally:
-            self._reserved.pop(entry, None)
+            with self._lock:
+                self._reserved.pop(entry, None)
 
     @contextmanager
     def slot(self, call: Call, entry: QueueEntry | None = None, *, always: bool = False) -> Iterator[float]:

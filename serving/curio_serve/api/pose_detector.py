@@ -20,7 +20,7 @@ from curio_serve.api.streams import Streams
 from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError
 from curio_serve.imaging import image
 from curio_serve.imaging.camera import PinholeCamera
-from curio_serve.models.detector import Detector
+from curio_serve.models.detector import Detector, check_min_confidence
 from curio_serve.models.model import answering
 from curio_serve.models.repository import Repository
 from curio_serve.rigs.detect_views import detect_views
@@ -127,6 +127,7 @@ class PoseService(PoseDetectorServicer):
         camera = camera_from_message(request.camera) if request.HasField("camera") else None
         regions = list(map(region_from_message, request.regions))
         min_confidence = request.min_confidence if request.HasField("min_confidence") else limits.min_confidence
+        check_min_confidence(min_confidence)
         if request.views:
             return self._detect_views(request, detectors, waited_s, context)
         if request.HasField("track"):

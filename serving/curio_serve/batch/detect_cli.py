@@ -69,7 +69,7 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.progress import Progress
     from curio_serve.batch.refinement import outlining, refining
     from curio_serve.batch.rig_images import run_rig
-    from curio_serve.batch.tracked import check_tracking, from_the_first
+    from curio_serve.batch.tracked import check_tracking, from_the_first, timed
     from curio_serve.models.model_check import ChildCheck
 
     models, arguments = _models_first(arguments)
@@ -97,7 +97,7 @@ def run(arguments: DetectArguments) -> int:
     with open_output(arguments, form, estimators) as output:
         remaining = output.unanswered(images(arguments.images, passed_over, topics))
         if arguments.track:
-            remaining = from_the_first(output, remaining)
+            remaining = timed(from_the_first(output, remaining), arguments.frame_rate)
         if arguments.ray is None:
             may_be_remote = any(name == STANDARD_INPUT or is_url(name) for name in arguments.images)
             content = read_ahead(remaining) if may_be_remote else remaining
@@ -185,7 +185,6 @@ def _settings(arguments: DetectArguments) -> "Settings":
         arguments.overlays and Path(os.path.abspath(arguments.overlays)),
         common_folder(arguments.images or ["."]),
         arguments.track_objects if arguments.track else None,
-        arguments.frame_rate,
         arguments.max_instances,
         arguments.reads,
         arguments.object_names,
@@ -198,6 +197,10 @@ def _check_overlays(folder: Path, images: tuple[str, ...]) -> None:
     from curio_serve.batch.images.sources import common_folder
 
     target = Path(os.path.abspath(folder))
+    if target == common_folder(images):  # below which drawings have the images' own names
+        raise UsageError(
+            f"--overlays {folder} is the folder of all images, which drawings would replace; choose another"
+        )
     for argument in images:
         if is_url(argument):
             continue
@@ -238,6 +241,9 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
             raise UsageError(f"--provider {arguments.provider}: found a model on a server, which chooses its own")
         found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
         _check_objects(found[-1].spec, model, settings)
+    versions = [f"{estimator.name}/{estimator.version}" for estimator in found]
+    if twice := next((one for number, one in enumerate(versions) if one in versions[:number]), None):
+        raise UsageError(f"two models are {twice}, and their results could not be told apart; give one another name")
     try:
         check_known([estimator.spec for estimator in found], settings.objects)
     except ArgumentError as exc:
@@ -315,7 +321,7 @@ def _check_camera(arguments: DetectArguments, estimator: "Estimator", recordings
         return
     for recording in recordings:
         recording.refuse_without_info()
-    if len(recordings) < len(arguments.images):
+    if len(recordings) < len(arguments.images) or arguments.video is not None:
         raise UsageError(
             f"model {estimator.name} needs the intrinsics of the camera that took the images; give --camera FILE "
             "(camera JSON, BOP's camera.json or scene_camera.json, or OpenCV YAML)"
@@ -323,6 +329,10 @@ def _check_camera(arguments: DetectArguments, estimator: "Estimator", recordings
 
 
 def _how_to_go_on(arguments: DetectArguments) -> str:
+    if arguments.video is not None:
+        return "The page is gone with it."
+    if arguments.track:
+        return "Following cannot go on in the middle; type the same again, with --overwrite where --out names a file."
     if arguments.out is None:
         return "Standard output cannot be gone on with; give --out FILE to be able to."
     if arguments.out.lower().endswith(".mcap"):

@@ -56,8 +56,6 @@ class Settings:
     """Folder that holds all images; drawings repeat the paths below it."""
     track_objects: int | None = None
     """Follow that many objects of each kind from image to image; None: every image on its own."""
-    frame_rate: float = 30.0
-    """Frames per second of images that carry no time."""
     max_instances: int | None = None
     """Largest number of instances of each kind of object; None: as many as one run of the network gives."""
     num_reads: int = 1
@@ -239,7 +237,7 @@ class LocalEstimator(Estimator):
         model = model.of(settings.objects)
         super().__init__(model.name, model.version, model.spec, settings)
         self._detector = Detector(model, settings.num_reads)
-        self._following, self._stream, self._num_frames = FollowingStream(), "", 0
+        self._following, self._stream = FollowingStream(), ""
 
     def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> Seen:
         started = time.perf_counter()
@@ -277,14 +275,10 @@ class LocalEstimator(Estimator):
             InternalError: The network fails on it.
         """
         if image.stream != self._stream:
-            self._following, self._stream, self._num_frames = FollowingStream(), image.stream, 0
-        time_s = self._num_frames / self.settings.frame_rate if image.time_s is None else image.time_s
-        if image.recorded is not None:
-            time_s = image.recorded.stamp_ns / 1e9
-        self._num_frames += 1
+            self._following, self._stream = FollowingStream(), image.stream
         results = DetectResponse().results
         self._following.follow(
-            Tracking(time_s=time_s, num_objects=num_objects),
+            Tracking(time_s=image.time_s, num_objects=num_objects),
             [self._detector],
             frame.pixels,
             camera,

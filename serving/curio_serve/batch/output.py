@@ -1,5 +1,6 @@
 """Chooses the result file of a call, and its format."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +25,10 @@ def result_format(arguments: DetectArguments, estimators: Sequence[Estimator]) -
         UsageError: The call or a model does not fit the format.
     """
     if arguments.out is not None and is_recording(arguments.out):
+        if is_url(arguments.out):
+            raise UsageError(
+                f"--out {arguments.out}: recordings are written to files alone; name one, or a folder of parts"
+            )
         are_flat = any(not estimator.spec.camera.camera_matrix for estimator in estimators)
         if arguments.format != "jsonl" or not all(map(is_recording, arguments.images)) or are_flat:
             raise UsageError(
@@ -53,6 +58,7 @@ def open_output(
         UsageError: It holds something else, or results of another call.
         OutputError: It cannot be written.
     """
+    _refuse_images(arguments)
     if isinstance(form, ResultFormat):
         names = [(estimator.name, estimator.version) for estimator in estimators]
         if arguments.out is not None and is_url(arguments.out):
@@ -63,3 +69,12 @@ def open_output(
 
     assert arguments.out is not None
     return PoseRecording(Path(arguments.out), overwrite=arguments.overwrite)
+
+
+def _refuse_images(arguments: DetectArguments) -> None:
+    """Refuse to write results over an image or a recording that they are of."""
+    out = arguments.out
+    if out is None or is_url(out) or not os.path.exists(out):
+        return
+    if any(not is_url(name) and os.path.exists(name) and os.path.samefile(name, out) for name in arguments.images):
+        raise UsageError(f"--out {out} is one of the images; choose another file")

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -62,3 +62,19 @@ def from_the_first(
     if first is not None:
         yield first
         yield from remaining
+
+
+def timed(frames: "Iterable[SourceImage]", frame_rate: float) -> "Iterator[SourceImage]":
+    """Frames with the time at which each was taken: as the recording or video says, or one after the other.
+
+    A frame that cannot be read takes its time all the same.
+
+    Args:
+        frames: Those of a stream one after the other.
+        frame_rate: Of frames that carry no time, frames/s.
+    """
+    stream, number = "", 0
+    for frame in frames:
+        stream, number = frame.stream, number + 1 if frame.stream == stream else 0
+        time_s = number / frame_rate if frame.time_s is None else frame.time_s
+        yield replace(frame, time_s=time_s if frame.recorded is None else frame.recorded.stamp_ns / 1e9)

@@ -10,7 +10,7 @@ ROS JSON          a CameraInfo message: k, d, width, height (ROS 1: K, D)
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,11 +130,14 @@ def camera_of_info(content: Mapping[str, Any], name: str) -> PinholeCamera:
         CameraError: It has the lenses of another model than plumb_bob or rational_polynomial.
     """
     distortion = content.get("d" if name == "k" else "D") or []
-    model = content.get("distortion_model", "")
-    if model not in _ROS_MODELS and any(distortion):
-        raise CameraError(f"distortion_model is {model!r}; expected one of {', '.join(filter(None, _ROS_MODELS))}")
+    _refuse_other_lens(content.get("distortion_model", ""), distortion)
     size = _size(content.get("width"), content.get("height"))
     return PinholeCamera(_matrix(content[name]), _distortion(distortion), size)
+
+
+def _refuse_other_lens(model: object, distortion: Iterable[float]) -> None:
+    if model not in _ROS_MODELS and any(distortion):
+        raise CameraError(f"distortion_model is {model!r}; expected one of {', '.join(filter(None, _ROS_MODELS))}")
 
 
 def _from_yaml(text: str) -> PinholeCamera:
@@ -150,6 +153,8 @@ def _from_yaml(text: str) -> PinholeCamera:
         if matrix is None:
             raise CameraError("no matrix camera_matrix; expected a file of OpenCV's or ROS's calibration")
         distortion = _yaml_matrix(storage.getNode("distortion_coefficients"))
+        model = storage.getNode("distortion_model")
+        _refuse_other_lens("" if model.empty() else model.string(), () if distortion is None else distortion.ravel())
         width, height = storage.getNode("image_width"), storage.getNode("image_height")
         size = None if width.empty() or height.empty() else _size(width.real(), height.real())
     finally:

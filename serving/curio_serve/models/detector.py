@@ -243,11 +243,20 @@ def trained_depths_m(spec: ModelSpec) -> tuple[float, float]:
     return field.lower[2] - tolerance, field.upper[2] + tolerance
 
 
+def check_min_confidence(value: float) -> None:
+    """Refuse what is no probability.
+
+    Raises:
+        ArgumentError: It is none.
+    """
+    if not 0 <= value <= 1:
+        raise ArgumentError(f"min_confidence is {value}; expected 0 to 1")
+
+
 def _check_arguments(pixels: Array, regions: Sequence[Region], min_confidence: float) -> None:
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
         raise ImageError(f"pixels are {pixels.dtype} {pixels.shape}; expected uint8 RGB [height, width, 3]")
-    if not 0 <= min_confidence <= 1:
-        raise ArgumentError(f"min_confidence is {min_confidence}; expected 0 to 1")
+    check_min_confidence(min_confidence)
     for index, region in enumerate(regions):
         values = (region.x, region.y, region.width, region.height)
         if not np.isfinite(values).all() or np.abs(values).max() > 1e6 or min(region.width, region.height) < 1:

@@ -63,7 +63,7 @@ class Follower:
     def __init__(self) -> None:
         self._tracks: list[Track] = []
         self._last_number = 0
-        self._looked_s = self._time_s = -math.inf
+        self._looked_s = self._searched_s = self._time_s = -math.inf
 
     def follow(
         self,
@@ -98,18 +98,18 @@ class Follower:
         wanted = [slot.object for slot in detector.model.slots]
         self._tracks = [track for track in self._tracks if track.kind.name in wanted]
         for track in self._tracks:
-            track.predict(min(time_s - self._time_s, following.keep_s))
+            track.predict(time_s - self._time_s)
         self._time_s = time_s
         light = self._read_crops(frame)
-        if self._is_look_due(frame, following):
-            self._looked_s = time_s
-            missed = [track for track in self._tracks if not track.is_seen]
+        is_searched = time_s - self._searched_s >= _SEARCH_S and not all(track.is_seen for track in self._tracks)
+        if is_searched:
+            self._searched_s = time_s
             light = self._search_around(frame) or light
-            # What was hidden is mostly found beside its last position; whatever else is looked for may be anywhere.
-            if following.search or not missed or not all(track.is_seen for track in missed):
-                light = self._look(frame, following) or light
+        if self._is_look_due(frame, following, is_searched):
+            self._looked_s = time_s
+            light = self._look(frame, following) or light
         kept = [track for track in self._tracks if time_s - track.seen_s <= following.keep_s]
-        self._tracks = without_doubles(kept)[: following.num_objects * len(detector.model.spec.objects)]
+        self._tracks = _most_of_each(without_doubles(kept), following.num_objects)
         return self._answer(frame, light, following, min_confidence, results)
 
     def _read_crops(self, frame: StreamFrame) -> Sequence[float]:
@@ -148,14 +148,22 @@ class Follower:
             for other in self._tracks
         )
 
-    def _is_look_due(self, frame: StreamFrame, following: Following) -> bool:
+    def _is_look_due(self, frame: StreamFrame, following: Following, is_searched: bool) -> bool:
+        """Whether to run the whole model.
+
+        Args:
+            frame: Whose crops were read.
+            following: How.
+            is_searched: Whether what is not seen was searched for around its last position.
+        """
         if frame.detector.model.crop_stage is None or following.search:
             return True
-        waited_s, num_seen = frame.time_s - self._looked_s, sum(track.is_seen for track in self._tracks)
+        num_seen = sum(track.is_seen for track in self._tracks)
+        if num_seen < len(self._tracks):
+            return is_searched
         wanted = following.num_objects * len(frame.detector.model.spec.objects)
-        if num_seen == 0 or num_seen < len(self._tracks):
-            return waited_s >= _SEARCH_S
-        return waited_s >= (_MORE_S if num_seen < wanted else _VERIFY_S)
+        interval_s = _SEARCH_S if num_seen == 0 else _MORE_S if num_seen < wanted else _VERIFY_S
+        return frame.time_s - self._looked_s >= interval_s
 
     def _look(self, frame: StreamFrame, following: Following) -> Sequence[float]:
         """Run the whole model on the frame; return the light."""
@@ -211,20 +219,28 @@ class Follower:
         model = frame.detector.model
         result = results.add(model=model.name, model_version=model.version)
         result.light.extend(light)
-        for track in sorted(self._tracks, key=lambda t: (-t.measured.confidence, t.number)):
-            unseen_s = frame.time_s - track.seen_s
-            if track.is_seen and track.measured.confidence < min_confidence:
+        now_s, keep_s = frame.time_s, following.keep_s
+        for track in sorted(self._tracks, key=lambda t: (-t.confidence(now_s, keep_s), t.number)):
+            if track.measured.confidence < min_confidence:
                 continue
             pose = track.filter
             raw = track.measured if track.is_seen else None
-            fading = 1.0 if raw is not None else max(0.0, 1 - unseen_s / max(following.keep_s, 1e-9))
             detection = frame.add_detection(
                 result,
                 track.kind.name,
                 pose.translation_m if raw is None else raw.translation_m,
                 pose.rotation if raw is None else raw.rotation,
-                track.measured.confidence * fading,
+                track.confidence(now_s, keep_s),
             )
             frame.describe(detection.track, track)
         result.status = region_status(result.detections)
         return result
+
+
+def _most_of_each(tracks: Sequence[Track], num: int) -> list[Track]:
+    """At most so many tracks of each kind of object, those that are seen first, in their order."""
+    kept: list[Track] = []
+    for track in sorted(tracks, key=lambda track: not track.is_seen):
+        if sum(other.kind.name == track.kind.name for other in kept) < num:
+            kept.append(track)
+    return [track for track in tracks if track in kept]

@@ -86,11 +86,9 @@ class FollowingStream:
             self._check_same_camera(size, camera)
         if camera is not None:
             camera.check_frame(*size)
-        if request.restart:
-            self._followers.clear()
-        self._time_s, self._size, self._camera = time_s, size, camera
-        return [
-            self._followers.setdefault(detector.model.name, Follower()).follow(
+        followers = {} if request.restart else dict(self._followers)
+        answers = [
+            followers.setdefault(detector.model.label, Follower()).follow(
                 detector,
                 pixels,
                 camera,
@@ -103,6 +101,9 @@ class FollowingStream:
             )
             for detector in detectors
         ]
+        # Only now: a frame that is refused changes nothing.
+        self._followers, self._time_s, self._size, self._camera = followers, time_s, size, camera
+        return answers
 
     def _check_same_camera(self, size: tuple[int, int], camera: PinholeCamera | None) -> None:
         if self._size is None:

@@ -11,7 +11,7 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve import errors as serving
 from curio_serve.imaging.silhouette import Surface
 
-from curio_train.errors import CurioError, MeshError, UsageError
+from curio_train.errors import CheckpointError, CurioError, MeshError, UsageError
 
 if TYPE_CHECKING:
     from curio_train.meshes.meshes import Unit
@@ -135,7 +135,10 @@ def _of_run(model: Path) -> Iterator[_File]:
 
     for folder in list(model.absolute().parents)[: _LEVELS + 1]:
         if (folder / CONFIG_FILE).is_file():
-            world = RunFolder.open(folder).config.world
+            try:
+                world = RunFolder.open(folder).config.world
+            except CheckpointError:  # another program's file, or a run of another version
+                return
             if isinstance(world, CaptureOptions):
                 yield from (_File(path, world.mesh_unit, world.body, str(path)) for path in world.mesh)
             return

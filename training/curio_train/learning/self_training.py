@@ -80,7 +80,7 @@ class SelfTraining:
         Raises:
             DataError: The backgrounds cannot be read.
         """
-        world, network, labels = self._world, self._network, self._labels
+        world, network, labels = self._world, self._network.cpu(), self._labels  # as the frames that it reads here
         if isinstance(labels, SceneLabels) and isinstance(world, SeveralObjectsWorld):
             assert isinstance(network, ObjectsNetwork)
             evidence = read_by_others(network, world, labels)
@@ -92,7 +92,8 @@ class SelfTraining:
             # Without outlines wrong reads agree as often as right ones (docs/experiments/captures.md).
             if isinstance(world, TwoStageWorld) and world.aligns_outlines:
                 assert isinstance(network, TwoStageNetwork)
-                calibrate_by_agreement(network, world, self._predict)
+                calibrate_by_agreement(network, world)
+        network.to(self._device)
 
     def mix_in(self, code: SceneCode, images: Tensor, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:
         """The last stage's codes and images with the first ones replaced by pseudo-labelled photographs, or crops.
@@ -104,8 +105,10 @@ class SelfTraining:
         """
         if self._labels is None:
             return dict(code), images
-        labels, crops = self._labels.draw(round(self._fraction * len(images)), seed)
-        num = len(crops)
+        num = round(self._fraction * len(images))
+        if num == 0:
+            return dict(code), images
+        labels, crops = self._labels.draw(num, seed)
         mixed = {name: torch.cat([code[name][num:], value.to(images.device)]) for name, value in labels.items()}
         return mixed, torch.cat([images[num:], crops.to(images)])
 

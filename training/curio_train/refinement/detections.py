@@ -50,7 +50,7 @@ class DetectionRefiner:
         matrix = np.reshape(spec.camera.camera_matrix, (3, 3))
         self._canonical = CanonicalCamera(spec.camera.width, spec.camera.height, matrix)
         camera = Camera(spec.camera.width, spec.camera.height, matrix)
-        from_templates = uses_templates(_recipe(spec))
+        from_templates = uses_templates(_recipe(spec), len(spec.objects))
         excess_m = SCAN_EXCESS_M if from_templates and spec.world == "linemod" else 0.0
         self._corners, self._refiners = {}, {}
         for kind in spec.objects:

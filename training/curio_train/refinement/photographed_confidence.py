@@ -14,7 +14,7 @@ from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.refinement.agreeing_reads import NUM_READS, all_agree
-from curio_train.refinement.scene_labels import Predict, SceneLabels, read_often
+from curio_train.refinement.scene_labels import SceneLabels, read_often
 from curio_train.scene_code import poses
 from curio_train.templates.photographed import learn_appearance
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
@@ -81,7 +81,7 @@ def calibrate_by(network: ObjectsNetwork, evidence: Evidence) -> None:
 
 
 @torch.no_grad()
-def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld, predict: Predict) -> None:
+def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld) -> None:
     """Make the confidence of a correct pose the share of photographs of which all reads agree, in place.
 
     Renderings show clutter and parts that the frame's border cuts, which photographs of a part hardly do: calibrated by
@@ -91,7 +91,6 @@ def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld, predi
     Args:
         network: Calibrated on renderings; with fewer than twenty photographs it stays as it is.
         world: Its photographs show the object.
-        predict: The network, for images [batch, 3, height, width] in [0, 1].
 
     Raises:
         DataError: A photograph cannot be read, or is not of the camera's size.
@@ -101,11 +100,10 @@ def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld, predi
         return
     assert world.camera.matrix is not None
     frames = torch.from_numpy(read_frames(paths, world.object.camera, world.camera.width, world.camera.height))
-    reads = read_often(frames, world.camera.matrix, predict, VIRTUAL_CAMERAS[:NUM_READS])
+    reads = read_often(frames, world.camera.matrix, network, VIRTUAL_CAMERAS[:NUM_READS])
     agrees = all_agree(reads, world.object).tolist()
-    device = network.rightness.device
-    found = [network.uncalibrated(some.to(device).float() / 255)[1] for some in frames.split(_READ_AT_ONCE)]
-    features = torch.cat([of_some.pose_correct for of_some in found]).cpu().numpy()
+    found = [network.uncalibrated(some.float() / 255)[1] for some in frames.split(_READ_AT_ONCE)]
+    features = torch.cat([of_some.pose_correct for of_some in found]).numpy()
     mean = features.mean(axis=0)
     # One right and one wrong answer more (Laplace's rule): that all agree does not make them certain.
     weights = fit_calibration(np.vstack([features, mean, mean]), [*agrees, True, False])

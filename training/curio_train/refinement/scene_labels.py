@@ -76,9 +76,12 @@ class SceneLabels:
         if world.photographs is None:
             return None
         paths, cameras = world.photographs.unlabelled()
-        if not paths or cameras is None:
+        if not paths or cameras is None or not cameras.known.any():
             _log.warning("photographs are not learned from: it takes several of one scene, from several viewpoints")
             return None
+        # Reads of the others agree with nothing, and are not wrong for it.
+        paths = [path for path, is_known in zip(paths, cameras.known, strict=True) if is_known]
+        cameras = cameras._replace(cam_from_world=cameras.cam_from_world[cameras.known])
         frames = torch.from_numpy(read_frames(paths, world.members[0].camera, world.camera.width, world.camera.height))
         assert world.camera.matrix is not None
         if seconds is not None:

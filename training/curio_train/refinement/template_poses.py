@@ -9,15 +9,17 @@ from curio_train.scene_code import TRANSLATION, SceneCode
 from curio_train.worlds.options import LinemodOptions
 
 
-def uses_templates(recipe: Mapping[str, Any]) -> bool:
+def uses_templates(recipe: Mapping[str, Any], num_objects: int) -> bool:
     """Whether a model reads poses by templates instead of regressing them.
 
     Args:
         recipe: The configuration that it was trained with, as its specification holds it.
+        num_objects: That it knows.
     """
     world = recipe.get("world", {})
     by_locator = world.get("name") == "linemod" and not LinemodOptions.upgraded(world)["two_stage"]
-    return recipe.get("method") == "templates" or (by_locator and world.get("gaze", True))
+    several_parts = world.get("name") == "capture" and num_objects > 1 and world.get("plane") is None
+    return recipe.get("method") == "templates" or (by_locator and world.get("gaze", True)) or several_parts
 
 
 def with_mean_depth(estimate: SceneCode, refined: SceneCode) -> dict[str, Tensor]:

@@ -26,8 +26,17 @@ def in_order(function: Callable[[Item], Answer], items: Iterable[Item], num_jobs
     pool = ThreadPoolExecutor(num_jobs)
     pending: deque[Future[Answer]] = deque()
     most = num_jobs * _IN_FLIGHT_A_JOB
+    failed: Exception | None = None
     try:
-        for item in items:
+        taken = iter(items)
+        while True:
+            try:
+                item = next(taken)
+            except StopIteration:
+                break
+            except Exception as exc:  # noqa: BLE001  # raised after the answers before it
+                failed = exc
+                break
             pending.append(pool.submit(function, item))
             if len(pending) >= most:
                 # Half of them at a time: to wake for each answer costs the workers more than the answer's writing.
@@ -36,5 +45,7 @@ def in_order(function: Callable[[Item], Answer], items: Iterable[Item], num_jobs
                     yield pending.popleft().result()
         while pending:
             yield pending.popleft().result()
+        if failed is not None:
+            raise failed
     finally:
         pool.shutdown(cancel_futures=True)

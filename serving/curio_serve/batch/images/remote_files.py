@@ -7,6 +7,7 @@ not be tried again when the run goes on. Over HTTP every image may lie on anothe
 """
 
 import errno
+import hashlib
 import os
 import posixpath
 import random
@@ -51,7 +52,9 @@ def is_store(url: str) -> bool:
 
 def path_of(url: str) -> str:
     """A relative path made of a URL, unique to it, for files such as drawings."""
-    return posixpath.normpath(re.split(r"[?#]", url)[0].replace("://", "/")).lstrip("./")
+    place, _, query = url.partition("#")[0].partition("?")
+    path, suffix = posixpath.splitext(posixpath.normpath(place.replace("://", "/")).lstrip("./"))
+    return path + (f"-{hashlib.sha256(query.encode()).hexdigest()[:8]}" if query else "") + suffix
 
 
 class RemoteFiles:
@@ -161,7 +164,10 @@ class RemoteFiles:
             last = keys[-1]
 
     def _folders(self, folder: str) -> Iterator[list[str]]:
-        entries = self._persist(folder, lambda limit: self._files.ls(folder, detail=True, **limit))
+        try:
+            entries = self._persist(folder, lambda limit: self._files.ls(folder, detail=True, **limit))
+        except FileNotFoundError:  # nothing is there yet: a store has no folders
+            return
         for entry in sorted(entries, key=lambda entry: entry["name"]):
             url = f"{self._scheme}://{entry['name']}"
             if entry["type"] != "directory":
@@ -182,6 +188,8 @@ class RemoteFiles:
             try:
                 return request({"timeout": patience.timeout_s})
             except self._errors as exc:
+                if isinstance(exc, FileNotFoundError):
+                    raise
                 if _is_final(exc):
                     raise OSError(errno.EIO, _reason(exc)) from exc
                 if attempt == patience.num_attempts:

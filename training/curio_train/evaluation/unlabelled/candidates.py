@@ -96,7 +96,7 @@ def _method(provenance: Mapping[str, Any]) -> str:
     """Models that are older than self-training, or than the two stages, say nothing of it."""
     name = str(provenance["method"])
     two_stages = name in ONE_STAGE_METHODS and provenance["world"].get("gaze", False)
-    kind = TWO_STAGES * two_stages + BY_TEMPLATES * (name != "templates" and uses_templates(provenance))
+    kind = TWO_STAGES * two_stages + BY_TEMPLATES * (name != "templates" and uses_templates(provenance, 1))
     return name + kind + SELF_TRAINED * bool(provenance["recipe"].get("self_training"))
 
 

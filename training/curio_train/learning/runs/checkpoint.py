@@ -111,7 +111,7 @@ class RunFolder:
             CheckpointError: It could not be written (disk full, …). The earlier ones are untouched.
         """
         target = self.path / "checkpoints" / f"{state.progress.step:08d}"
-        draft = target.with_name("draft.tmp")
+        draft, replaced = target.with_name("draft.tmp"), target.with_name("replaced.tmp")
         try:
             shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed while writing
             draft.mkdir(parents=True)
@@ -121,13 +121,15 @@ class RunFolder:
             for name, data in contents.items():
                 _write_synced(draft / name, data)
             _sync_folder(draft)
-            if not target.exists():  # the same step is the same checkpoint
+            if target.exists() and (target / _SUMS).read_bytes() != contents[_SUMS]:  # calibrated since
+                target.rename(replaced)
+            if not target.exists():
                 draft.rename(target)
             _sync_folder(target.parent)
         except OSError as exc:
             shutil.rmtree(draft, ignore_errors=True)
             raise CheckpointError(self._not_written(target, exc)) from exc
-        for old in self.checkpoints()[:-_NUM_KEPT]:
+        for old in (replaced, *self.checkpoints()[:-_NUM_KEPT]):
             shutil.rmtree(old, ignore_errors=True)
 
     def restore(self, state: TrainState) -> None:
