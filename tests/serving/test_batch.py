@@ -48,3 +48,15 @@ def test_what_is_raised_comes_in_its_turn_and_ends_the_rest() -> None:
     with pytest.raises(KeyError):
         next(answers)
     assert threading.active_count() == 1 or not any("ThreadPool" in t.name for t in threading.enumerate())
+
+
+def test_what_the_items_raise_comes_after_the_answers_before_it() -> None:
+    def failing() -> Iterator[int]:
+        yield from range(5)
+        raise OSError("the list ends")
+
+    answers = in_order(lambda item: 2 * item, failing(), 2)
+    found = [next(answers) for _ in range(5)]
+    with pytest.raises(OSError, match="the list ends"):
+        next(answers)
+    assert found == [0, 2, 4, 6, 8]

@@ -191,6 +191,13 @@ def test_opencv_yaml(tmp_path: Path) -> None:
         ("c.json", '{"camera_matrix": [[1, 2], [3]]}', "cannot be understood"),
         ("c.json", '{"camera_matrix": "abc"}', "cannot be understood"),
         ("c.json", '{"camera_matrix": [[500,0,320],[0,500,240],[0,0,0]]}', "last row"),
+        (
+            "c.yaml",
+            "camera_matrix: {rows: 3, cols: 3, data: [500, 0, 320, 0, 500, 240, 0, 0, 1]}\n"
+            "distortion_model: equidistant\n"
+            "distortion_coefficients: {rows: 1, cols: 4, data: [0.1, 0.01, 0, 0]}\n",
+            "distortion_model is 'equidistant'",
+        ),
         ("c.yaml", "nothing: here", "cannot be understood|no matrix camera_matrix"),
         ("c.yaml", "%YAML:1.0\n---\nwidth: 640\n", "no matrix camera_matrix"),
     ],

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -50,6 +51,8 @@ def test_a_folder_a_version_and_a_file_are_the_same_model(models_dir: Path, fram
         ({"images": ()}, "no images given"),
         ({"images": ("missing.png",)}, "missing.png: no such file"),
         ({"model": "pinhole"}, "--camera FILE"),
+        ({"model": "pinhole", "images": (), "video": "clip.mp4", "out": None}, "--camera FILE"),
+        ({"out": "s3://bucket/poses.mcap"}, "recordings are written to files alone"),
         ({"camera": Path("missing.json")}, "--camera: .*missing.json"),
         ({"jobs": 0}, "--jobs 0"),
         ({"min_confidence": 1.5}, "--min-confidence 1.5"),
@@ -111,6 +114,25 @@ def test_several_models_draw_into_one_picture(models_dir: Path, frames: Path, ca
     assert changed["flat"].any()
     assert changed["pinhole"].any()
     assert (changed["."] == (changed["flat"] | changed["pinhole"])).all()
+
+
+def test_nothing_is_written_over_the_images(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    """Two folders beside each other share their parent, below which drawings have the images' own names."""
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "a.png").write_bytes((frames / "000000.png").read_bytes())
+    before = {path: path.read_bytes() for folder in (frames, other) for path in folder.iterdir()}
+    with pytest.raises(UsageError, match="drawings would replace"):
+        detect(models_dir / "flat", frames, other, out=tmp_path / "out.jsonl", overlays=tmp_path)
+    with pytest.raises(UsageError, match="is one of the images"):
+        detect(models_dir / "flat", other / "a.png", out=other / "a.png", overwrite=True)
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_models_whose_results_look_the_same_are_refused(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    shutil.copytree(models_dir / "flat", tmp_path / "again" / "flat")
+    with pytest.raises(UsageError, match=r"two models are flat/\d"):
+        detect(models_dir / "flat", tmp_path / "again" / "flat", frames)
 
 
 def test_a_model_named_twice_is_refused(models_dir: Path, frames: Path) -> None:

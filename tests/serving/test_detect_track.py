@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from curio_serve.errors import UsageError
 
 def _tracks(out: Path) -> list[dict[str, object]]:
     records = [json.loads(line) for line in out.read_text().splitlines()]
-    return [detection["track"] for record in records for detection in record["detections"]]
+    return [detection["track"] for record in records for detection in record.get("detections", ())]
 
 
 def test_each_folder_is_a_stream_of_its_own(models_dir: Path, frames: Path, camera: Path, tmp_path: Path) -> None:
@@ -37,6 +38,19 @@ def test_each_folder_is_a_stream_of_its_own(models_dir: Path, frames: Path, came
     plain = tmp_path / "plain.jsonl"
     run(DetectArguments(str(models_dir / "pinhole"), (str(frames),), camera=camera, out=str(plain)))
     assert "track" not in plain.read_text()
+
+
+def test_a_frame_that_cannot_be_read_takes_its_time(
+    models_dir: Path, frames: Path, camera: Path, tmp_path: Path
+) -> None:
+    (frames / "000002.png").write_bytes(b"no image")
+    (frames / "000003.png").write_bytes(b"")
+    out = tmp_path / "out.jsonl"
+    arguments = DetectArguments(str(models_dir / "pinhole"), (str(frames),), camera=camera, out=str(out), track=True)
+    assert run(replace(arguments, frame_rate=10.0)) == 1
+    tracks = _tracks(out)
+    assert [track["age_s"] for track in tracks] == pytest.approx([0, 0.1, 0.4, 0.5])
+    assert tracks[-1]["velocity_m_s"][0] == pytest.approx(0.83, rel=0.05)  # type: ignore[index]
 
 
 def test_a_video_says_when_its_frames_were_taken(

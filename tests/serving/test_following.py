@@ -210,36 +210,6 @@ def test_following_with_a_shipped_model_keeps_a_still_object() -> None:
     assert [track.predicted for track in tracks] == [False] * 5 + [True] * 2 + [False]
 
 
-@pytest.mark.parametrize(("num_objects", "look_s", "found"), [(1, 2.0, 1), (2, 0.5, 2)])
-def test_the_whole_frame_is_looked_at_for_another_object_and_to_make_sure(
-    num_objects: int, look_s: float, found: int
-) -> None:
-    """The second ape is a copy of the first one's surroundings, 220 pixels to the left."""
-    detector = Detector(open_model(ROOT / "models" / "ape"))
-    camera = PinholeCamera(np.array(json.loads((ROOT / "samples" / "camera.json").read_text())["camera_matrix"]))
-    pixels = np.ascontiguousarray(cv2.imread(str(ROOT / "samples" / "03.jpg"))[..., ::-1])
-    pixels[223:363, 126:266] = pixels[223:363, 346:486]
-    runs_at: list[int] = []
-    stream, results = FollowingStream(), messages.DetectResponse().results
-    for _ in range(round(30 * look_s) + 2):  # 30 frames a second
-        stream.follow(
-            messages.Tracking(num_objects=num_objects),
-            [detector],
-            pixels,
-            camera,
-            min_confidence=0.0,
-            reduction=1,
-            results=results,
-            before_run=lambda: runs_at.append(len(results)),
-        )
-    # One run reads the crops of the object that is followed; one more looks at the whole frame.
-    second = next(number for number in range(len(results)) if runs_at.count(number) == 2)
-    assert second == pytest.approx(30 * look_s, abs=1)
-    assert len(results[-1].detections) == found
-    apart_m = np.ptp([detection.translation_m[0] for detection in results[-1].detections])
-    assert apart_m == pytest.approx(0.3 * (found - 1), abs=0.03)
-
-
 @pytest.mark.parametrize("moved_px", [(45, 30), (-40, 45), (0, -50)])
 def test_an_object_that_moved_while_it_was_hidden_is_found_beside_its_last_place(moved_px: tuple[int, int]) -> None:
     detector = Detector(open_model(ROOT / "models" / "ape"))

@@ -320,3 +320,18 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, cache: Path) ->
     train(tmp_path / "run", cache, resume=True)
     train(tmp_path / "whole", cache)
     assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "run"))
+
+
+def test_what_changes_without_a_step_is_saved(tmp_path: Path, cache: Path) -> None:
+    """As a calibration does, at the end of a run that is gone on with though its budget is spent."""
+    train(tmp_path / "run", cache, replace(CONFIG, images=16))
+    run = RunFolder.open(tmp_path / "run")
+    state = TrainState(run.config, Circles(), torch.device("cpu"))
+    run.restore(state)
+    with torch.no_grad():
+        next(iter(state.pose.network.parameters())).add_(1)
+    names = [path.name for path in run.checkpoints()]
+    run.save(state)
+    assert [path.name for path in run.checkpoints()] == names
+    assert not list((tmp_path / "run" / "checkpoints").glob("*.tmp"))
+    assert_same(last_tensors(tmp_path / "run"), state.tensors())

@@ -1,6 +1,7 @@
 """Faults planted one by one in a good mesh, and meshes of scanned objects, which have none."""
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -115,3 +116,27 @@ def test_an_unreadable_mesh(tmp_path: Path) -> None:
 def test_no_alarm_on_meshes_of_lmo(number: int) -> None:
     path = Path(os.environ["CURIO_DATA"]) / "lmo" / "models" / f"obj_{number:06}.ply"
     assert alarms(Subjects(mesh=path, mesh_unit="mm")) == []
+
+
+def test_a_symmetry_that_moves_the_origin_is_no_mesh_to_learn(tmp_path: Path) -> None:
+    """A plate whose origin is the middle of an edge, as CAD files often have it, and one about its middle."""
+    plate = trimesh.creation.box((100, 60, 20))
+    plate.export(tmp_path / "middle.stl")
+    plate.apply_translation([50, 0, 0])
+    plate.export(tmp_path / "edge.stl")
+    tube = trimesh.creation.cylinder(20, 80)
+    tube.apply_translation([30, 0, 0])
+    tube.export(tmp_path / "tube.stl")
+    faults = {}
+    for name in ("middle", "edge", "tube"):
+        found = alarms(Subjects(mesh=tmp_path / f"{name}.stl", mesh_unit="mm"))
+        faults[name] = {finding.fault: finding for finding in found}.get("symmetry beside origin")
+    assert faults["middle"] is None
+    assert faults["edge"] is not None
+    assert faults["edge"].state == "bad"
+    moved_mm, *place_mm = map(
+        float, re.findall(r"-?[\d.]+(?=[,)]| mm, so)", faults["edge"].text + faults["edge"].remedy)
+    )
+    assert moved_mm == pytest.approx(100, abs=1)
+    assert place_mm == pytest.approx([50, 0, 0], abs=1)
+    assert faults["tube"] is not None

@@ -12,6 +12,7 @@ from curio_train.data.photographs import Photographs, read_photograph
 from curio_train.errors import CameraError, DataError
 
 _FEWEST_VIEWS = 6
+_FEWEST_INNER = 3  # corners a side that OpenCV finds a plain chessboard by
 _FEWEST_CORNERS = 6  # of a board that is partly seen
 _LARGEST_ERROR_PX = 1.5
 _LEAST_SPREAD_DEG = 10.0
@@ -55,7 +56,9 @@ class Board:
         The larger board comes first: a part of it may be taken for the smaller one, but not the other way round.
         """
         larger = replace(self, columns=self.columns + 1, rows=self.rows + 1)
-        return (self,) if self.marker_m is not None else (larger, self)
+        if self.marker_m is not None:
+            return (self,)
+        return tuple(board for board in (larger, self) if min(board.columns, board.rows) > _FEWEST_INNER)
 
     def find(self, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """The board's inner corners in an image.

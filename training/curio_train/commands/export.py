@@ -84,6 +84,9 @@ def _export(command: ExportCommand) -> int:
         if is_written:
             raise
         asked = [*(["--intervals"] if command.intervals else []), *(["--push", command.push] if command.push else [])]
+        for flag in ("data", "photos", "views", "license"):
+            if (given := getattr(command, flag)) is not None:
+                asked += [f"--{flag}", str(given)]
         again = shlex.join(["curio-export", str(folder), *asked])
         raise type(exc)(
             f"{exc}\n{folder} was written; to {'push' if command.push else 'measure'} it again: {again}"

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from curio_train.errors import DataError, ReportError, UsageError
-from curio_train.evaluation.real_frames import evaluate_real_frames
+from curio_train.evaluation.real_frames import evaluate_real_frames, refuse_unscorable
 from curio_train.evaluation.repeated import reading_repeatedly
 from curio_train.evaluation.reporting.report import write_report
 from curio_train.evaluation.results import keep
@@ -96,6 +96,8 @@ def evaluate(
     has_whole_frames = isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld)
     if data is not None and not has_whole_frames:
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
+    if data is not None:
+        refuse_unscorable(subject.world, data)  # before minutes are spent on renderings
     subject = subject if reads == 1 else reading_repeatedly(subject, reads)
     num_images = num_images or (QUICK if has_whole_frames else ALL)
     better = _refining(subject) if refine else None

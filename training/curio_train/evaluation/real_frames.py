@@ -23,7 +23,7 @@ from curio_train.evaluation.real_scores import Estimate, scored, together
 from curio_train.evaluation.subject import Subject
 from curio_train.geometry import Pose
 from curio_train.scene_code import CONFIDENCE, TRANSLATION, SceneCode, poses
-from curio_train.worlds.base import Camera
+from curio_train.worlds.base import Camera, World
 
 _BATCH = 16
 
@@ -56,6 +56,18 @@ def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None,
     if len(each) == 1:
         return about | next(iter(each.values()))
     return about | together(each, _absent(dataset, [kind.name for kind in kinds], found))
+
+
+def refuse_unscorable(world: World, data: Path) -> None:
+    """Refuse a data set without targets of a world's objects.
+
+    Raises:
+        UsageError: The data set does not know an object.
+        DataError: It is incomplete or has no frame of one.
+    """
+    dataset = BopDataset(data)
+    for kind in world.objects:
+        scored_frames(dataset, kind.name)
 
 
 def _absent(dataset: BopDataset, names: Sequence[str], found: Mapping[tuple[int, int], list[Estimate]]) -> list[float]:

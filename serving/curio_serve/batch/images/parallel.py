@@ -5,6 +5,8 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TypeVar
 
+from curio_serve.errors import CurioError
+
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
@@ -34,7 +36,7 @@ def in_order(function: Callable[[Item], Answer], items: Iterable[Item], num_jobs
                 item = next(taken)
             except StopIteration:
                 break
-            except Exception as exc:  # noqa: BLE001  # raised after the answers before it
+            except (CurioError, OSError) as exc:  # raised after the answers before it
                 failed = exc
                 break
             pending.append(pool.submit(function, item))

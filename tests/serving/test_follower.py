@@ -1,0 +1,110 @@
+"""What is followed of the shipped model of an ape: when whole frames are looked at, and what a frame changes."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from curio_proto.v1 import detector_pb2 as messages
+from curio_serve.errors import CameraMissing
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.models.detector import Detector
+from curio_serve.models.model_folder import open_model
+from curio_serve.tracking.stream import FollowingStream
+
+ROOT = Path(__file__).parents[2]
+
+
+def _photograph(name: str) -> tuple[Detector, PinholeCamera, np.ndarray]:
+    camera = PinholeCamera(np.array(json.loads((ROOT / "samples" / "camera.json").read_text())["camera_matrix"]))
+    pixels = np.ascontiguousarray(cv2.imread(str(ROOT / "samples" / name))[..., ::-1])
+    return Detector(open_model(ROOT / "models" / "ape")), camera, pixels
+
+
+@pytest.mark.parametrize(("num_objects", "look_s", "found"), [(1, 2.0, 1), (2, 0.5, 2)])
+def test_the_whole_frame_is_looked_at_for_another_object_and_to_make_sure(
+    num_objects: int, look_s: float, found: int
+) -> None:
+    """The second ape is a copy of the first one's surroundings, 220 pixels to the left."""
+    detector, camera, pixels = _photograph("03.jpg")
+    pixels[223:363, 126:266] = pixels[223:363, 346:486]
+    runs_at: list[int] = []
+    stream, results = FollowingStream(), messages.DetectResponse().results
+    for _ in range(round(30 * look_s) + 2):  # 30 frames a second
+        stream.follow(
+            messages.Tracking(num_objects=num_objects),
+            [detector],
+            pixels,
+            camera,
+            min_confidence=0.0,
+            reduction=1,
+            results=results,
+            before_run=lambda: runs_at.append(len(results)),
+        )
+    # One run reads the crops of the object that is followed; one more looks at the whole frame.
+    second = next(number for number in range(len(results)) if runs_at.count(number) == 2)
+    assert second == pytest.approx(30 * look_s, abs=1)
+    assert len(results[-1].detections) == found
+    apart_m = np.ptp([detection.translation_m[0] for detection in results[-1].detections])
+    assert apart_m == pytest.approx(0.3 * (found - 1), abs=0.03)
+
+
+def test_how_long_a_hidden_object_is_answered_does_not_change_the_filter() -> None:
+    detector, camera, pixels = _photograph("03.jpg")
+    found = []
+    for keep_s in (1.5, 0.0):
+        stream, results = FollowingStream(), messages.DetectResponse().results
+        for number in range(8):
+            frame = np.roll(pixels, -3 * number, axis=1)
+            track = messages.Tracking(keep_s=keep_s)
+            stream.follow(track, [detector], frame, camera, min_confidence=0.0, reduction=1, results=results)
+        found.append([list(result.detections[0].track.velocity_m_s) for result in results])
+    np.testing.assert_allclose(found[0], found[1])
+    assert abs(found[0][-1][0]) > 0.05
+
+
+def test_a_refused_frame_changes_nothing_not_even_with_restart() -> None:
+    detector, camera, pixels = _photograph("03.jpg")
+    stream, results = FollowingStream(), messages.DetectResponse().results
+
+    def follow(known: PinholeCamera | None, time_s: float, restart: bool = False) -> None:
+        track = messages.Tracking(time_s=time_s, restart=restart)
+        stream.follow(track, [detector], pixels, known, min_confidence=0.0, reduction=1, results=results)
+
+    with pytest.raises(CameraMissing):
+        follow(None, 1.0)
+    follow(camera, 0.5)
+    with pytest.raises(CameraMissing):
+        follow(None, 0.6, restart=True)
+    follow(camera, 0.6)
+    assert [result.detections[0].track.age_s for result in results] == pytest.approx([0, 0.1])
+
+
+def test_what_is_found_again_beside_its_place_puts_off_no_look() -> None:
+    """The camera jerks every twelfth frame; the second ape is found all the same."""
+    detector, camera, pixels = _photograph("03.jpg")
+    pixels[223:363, 126:266] = pixels[223:363, 346:486]
+    jerked = np.roll(pixels, (25, 35), axis=(0, 1))
+    stream, results = FollowingStream(), messages.DetectResponse().results
+    for number in range(40):
+        frame = jerked if number // 12 % 2 else pixels
+        track = messages.Tracking(num_objects=2)
+        stream.follow(track, [detector], frame, camera, min_confidence=0.0, reduction=1, results=results)
+    assert max(len(result.detections) for result in results) == 2
+
+
+def test_fewer_objects_keep_those_that_are_seen() -> None:
+    detector, camera, pixels = _photograph("03.jpg")
+    both = pixels.copy()
+    both[223:363, 126:266] = pixels[223:363, 346:486]
+    right_hidden = both.copy()
+    right_hidden[:, 300:] = 0
+    stream, results = FollowingStream(), messages.DetectResponse().results
+    for frame, num_objects in [*[(both, 2)] * 20, (right_hidden, 2), (right_hidden, 1)]:
+        track = messages.Tracking(num_objects=num_objects)
+        stream.follow(track, [detector], frame, camera, min_confidence=0.0, reduction=1, results=results)
+    assert [detection.track.predicted for detection in results[20].detections] == [False, True]
+    (left,) = results[21].detections
+    assert not left.track.predicted
+    assert left.translation_m[0] < 0
