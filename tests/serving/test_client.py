@@ -115,6 +115,32 @@ def test_a_stream_answers_in_order_with_ids(client: PoseClient, png: Path) -> No
     assert next(client.detect_stream(endless, timeout_s=30)).width == 320
 
 
+def test_what_the_requests_raise_comes_after_the_answers_to_those_before(
+    client: PoseClient, server: Any, png: Path
+) -> None:
+    def requests() -> Iterator[messages.DetectRequest]:
+        for path in (png, png, png.with_name("missing.png")):
+            yield detect_request("flat", path)
+
+    answers = client.detect_stream(requests(), timeout_s=30)
+    assert [next(answers).width, next(answers).width] == [320, 320]
+    with pytest.raises(errors.ImageError, match="missing"):
+        next(answers)
+
+    async def talk() -> None:
+        async def each() -> AsyncIterator[messages.DetectRequest]:
+            for request in requests():
+                yield request
+
+        async with AsyncPoseClient(server.address) as asynchronous:
+            answers = asynchronous.detect_stream(each(), timeout_s=30)
+            assert [(await anext(answers)).width, (await anext(answers)).width] == [320, 320]
+            with pytest.raises(errors.ImageError, match="missing"):
+                await anext(answers)
+
+    asyncio.run(talk())
+
+
 @pytest.mark.parametrize(
     ("call", "error"),
     [

@@ -89,6 +89,21 @@ def test_a_shipped_model_sees_one_photograph_twice_and_agrees() -> None:
     np.testing.assert_allclose(found.translation_m, position, atol=0.01)
     assert list(found.views) == [0, 1]
     assert found.confidence > detector.detect(pixels, camera)[0].detections[0].confidence
+    assert not found.outside_trained_range
+
+    longer = PinholeCamera(np.diag([1.8, 1.8, 1]) @ camera.matrix)  # the wrong K: everything is 1.8 times as far
+    detect_views(detector, [RigView(pixels, longer, np.eye(4))] * 2, results=results)
+    assert results[1].detections[0].outside_trained_range
+
+
+def test_a_model_without_rotations_is_refused() -> None:
+    model = open_model(ROOT / "models" / "ape")
+    fields = [field for field in model.spec.fields if not field.name.startswith("rotation")]
+    del model.spec.fields[:]
+    model.spec.fields.extend(fields)
+    view = RigView(np.zeros((480, 640, 3), np.uint8), PinholeCamera(K), np.eye(4))
+    with pytest.raises(ArgumentError, match="answers no rotations"):
+        detect_views(Detector(model), [view, view], results=messages.DetectResponse().results)
 
 
 def test_requests_with_views_are_answered_in_the_rigs_frame(client: PoseClient, spot_image: Spot) -> None:

@@ -22,6 +22,7 @@ from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
 
 from curio_serve.client.request import CameraLike, ImageLike, RegionLike, detect_request, selector, views_request
 from curio_serve.client.retries import Attempts, error_from_call
+from curio_serve.client.sent import Sent
 from curio_serve.errors import UsageError
 from curio_serve.files import read_given
 
@@ -181,14 +182,17 @@ class PoseClient(_Client):
 
         Raises:
             CurioError: The stream as a whole failed, or the server is out of reach.
+            Exception: What the iterable raised, after the answers to the requests before it.
         """
-        call = self._stub.DetectStream(iter(requests), timeout=timeout_s, metadata=self._metadata)
+        sent = Sent()
+        call = self._stub.DetectStream(sent.each(requests), timeout=timeout_s, metadata=self._metadata)
         try:
             yield from call
         except grpc.RpcError as exc:
             raise error_from_call(exc, self.address) from exc
         finally:
             call.cancel()  # the caller may have stopped listening early
+        sent.raise_error()
 
     def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
         """The models that the server has loaded."""
@@ -258,7 +262,8 @@ class AsyncPoseClient(_Client):
         self, requests: AsyncIterable[messages.DetectRequest], *, timeout_s: float
     ) -> AsyncIterator[messages.DetectResponse]:
         """Answers in the order of the requests; see :meth:`PoseClient.detect_stream`."""
-        call = self._stub.DetectStream(requests, timeout=timeout_s, metadata=self._metadata)
+        sent = Sent()
+        call = self._stub.DetectStream(sent.each_async(requests), timeout=timeout_s, metadata=self._metadata)
         try:
             async for answer in call:
                 yield answer
@@ -266,6 +271,7 @@ class AsyncPoseClient(_Client):
             raise error_from_call(exc, self.address) from exc
         finally:
             call.cancel()
+        sent.raise_error()
 
     async def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
         """The models that the server has loaded."""

@@ -81,12 +81,14 @@ def detect_views(
         before_run: Called before each run of a network.
 
     Raises:
-        ArgumentError: The model is of a 2D world.
+        ArgumentError: The model is of a 2D world, or without rotations.
         As :meth:`~curio_serve.models.detector.Detector.detect`.
     """
     model = detector.model
     if model.camera.matrix is None:
         raise ArgumentError(f"model {model.label} is of a 2D world, which several cameras cannot see")
+    if not any(field.name in ("rotation", "rotation_6d") for field in model.spec.fields):
+        raise ArgumentError(f"model {model.label} answers no rotations, which the poses of several cameras need")
     kinds = {kind.name: kind for kind in model.spec.objects}
     seen = [one for number, view in enumerate(views) for one in _whole(detector, number, view, kinds, before_run)]
     found: list[tuple[float, Consensus, list[_Seen]]] = []
@@ -97,10 +99,13 @@ def detect_views(
         found += _explained(own, kind)
     found = sorted((one for one in found if one[0] >= min_confidence), key=lambda one: -one[0])[:max_detections]
     result = results.add(model=model.name, model_version=model.version)
+    nearest, farthest = detector.depths_m
     for confidence, pose, own in found:
         rows, position = pose.rotation.ravel().tolist(), pose.translation_m.tolist()
         in_first = views[0].cam_from_rig @ _matrix(pose.rotation, pose.translation_m)
         slot = next(slot for slot in model.slots if slot.object == own[0].object)
+        agreeing = sorted({own[row].view for row in pose.members})
+        depths_m = [float((views[number].cam_from_rig @ [*position, 1.0])[2]) for number in agreeing]
         corners = transformed(slot.box_corners, in_first[:3, :3].ravel().tolist(), in_first[:3, 3].tolist())
         result.detections.add(
             object=own[0].object,
@@ -110,7 +115,8 @@ def detect_views(
             rotation=rows,
             quaternion_xyzw=quaternion_xyzw(rows),
             box_px=views[0].camera.pixels(corners),
-            views=sorted({own[row].view for row in pose.members}),
+            views=agreeing,
+            outside_trained_range=not any(nearest <= depth_m <= farthest for depth_m in depths_m),
             status=status_of(model.spec.reliability, own[0].object, confidence),
         )
     result.status = region_status(result.detections)

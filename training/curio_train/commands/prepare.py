@@ -26,7 +26,7 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
 
     Raises:
         UsageError: Pseudo-labels are asked for, and there are no photographs; LineMOD has no such class; or a
-            download was declined.
+            download was declined; or there are photographs that the method does not learn from.
         DataError: A download failed, or files of one's own are certain not to work.
     """
     options = config.world
@@ -34,6 +34,15 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
         raise UsageError(
             f"--self-training {config.recipe.self_training}: found no photographs to learn from; expected --photos, "
             "which linemod and capture have"
+        )
+    terms = config.terms
+    if (
+        isinstance(options, LinemodOptions)
+        and options.photos is not None
+        and not (terms.sleep or terms.renders_predictions)
+    ):
+        raise UsageError(
+            f"--photos {options.photos}: --method {config.method} does not learn from photographs; leave it out"
         )
     if isinstance(options, LinemodOptions):
         options = with_linemod(_with_stages(options, config.method), cache, report)

@@ -14,6 +14,7 @@
 
 import hashlib
 import os
+import secrets
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -176,7 +177,7 @@ def triton_config(name: str, image: Sequence[int], outputs: Mapping[str, Sequenc
 @contextmanager
 def _draft(folder: Path) -> Iterator[Path]:
     """An empty folder on the target's disk, which disappears unless it is renamed. Servers pass over its name."""
-    draft = folder.with_name(f".{folder.name}-{os.getpid()}.tmp")
+    draft = folder.with_name(f".{folder.name}-{os.getpid()}-{secrets.token_hex(4)}.tmp")
     draft.mkdir(parents=True)
     try:
         yield draft

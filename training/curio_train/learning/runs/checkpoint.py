@@ -178,7 +178,10 @@ class RunFolder:
         try:
             state.load(tensors, progress)
         except RuntimeError as exc:
-            raise CheckpointError(_unreadable(self.checkpoints()[-1], exc)) from exc
+            raise CheckpointError(
+                f"checkpoint {self.checkpoints()[-1]} is of another network than this version builds for its "
+                f"configuration ({exc}); go on with it in the version that made it"
+            ) from exc
 
     def _not_writable(self, exc: OSError) -> CheckpointError:
         return CheckpointError(f"cannot write the run folder {self.path}: {exc.strerror}; name another: --out")
