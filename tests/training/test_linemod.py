@@ -244,3 +244,5 @@ def test_a_run_without_such_frames_learns_nothing_from_them(data, tmp_path):
         assert prepared(config, tmp_path, print, print).recipe.self_training == fraction
     with pytest.raises(UsageError, match=r"--self-training 0\.5: found no photographs .* expected --photos"):
         prepared(parse([*call, "--self-training", "0.5"]).config, tmp_path, print, print)
+    with pytest.raises(UsageError, match="--method hypotheses does not learn from photographs"):
+        prepared(parse([*call, "--photos", str(frames), "--method", "hypotheses"]).config, tmp_path, print, print)
