@@ -280,3 +280,28 @@ def test_many_threads_leave_nothing_behind() -> None:
     assert max(most) <= 2
     with queue.slot(Caller()), queue.slot(Caller()):
         assert busy == []
+
+
+def test_a_stream_that_waits_for_every_frame_is_registered_once_and_woken_by_its_end() -> None:
+    """Until a stream ends gRPC keeps what is registered with it."""
+    queue, stream = WorkQueue(1, 8, Metrics(CollectorRegistry())), Caller()
+
+    def work() -> None:
+        with queue.slot(stream):
+            pass
+
+    with ThreadPoolExecutor(1) as pool:
+        for _ in range(3):
+            with queue.slot(Caller()):
+                waiting = pool.submit(work)
+                while not queue._waiting:
+                    assert not waiting.done()
+            waiting.result(timeout=10)
+        with queue.slot(Caller()):
+            waiting = pool.submit(work)
+            while not queue._waiting:
+                assert not waiting.done()
+            stream.hang_up()
+            with pytest.raises(CallCancelled):
+                waiting.result(timeout=10)
+    assert len(stream._callbacks) == 1

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NoReturn, Protocol
+from weakref import WeakKeyDictionary
 
 from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
 from curio_serve.telemetry import Metrics
@@ -62,6 +63,16 @@ class QueueEntry:
         return True
 
 
+class _Sleeper:
+    """What the end of a call wakes: the entry that its thread sleeps on at that time."""
+
+    entry: QueueEntry | None = None
+
+    def wake(self) -> None:
+        if self.entry is not None:
+            self.entry.wake()
+
+
 class WorkQueue:
     """A fixed number of slots behind a bounded queue, first come, first served."""
 
@@ -82,6 +93,7 @@ class WorkQueue:
         self._lock = threading.Lock()
         self._num_free = num_slots
         self._waiting: deque[QueueEntry] = deque()
+        self._sleepers: WeakKeyDictionary[Call, _Sleeper] = WeakKeyDictionary()
         self._reserved: dict[QueueEntry, float] = {}  # since when, oldest first
         self._mean_work_s = 0.005
         metrics.waiting.set_function(lambda: len(self._waiting))
@@ -163,7 +175,12 @@ class WorkQueue:
 
     def _wait(self, entry: QueueEntry, call: Call, remaining_s: float | None) -> None:
         """Return with a slot, or raise without one."""
-        if not call.add_callback(entry.wake):
+        with self._lock:
+            sleeper, is_new = self._sleepers.get(call), False
+            if sleeper is None:  # gRPC keeps what is registered until the call ends, and streams wait for each frame
+                sleeper, is_new = self._sleepers.setdefault(call, _Sleeper()), True
+        sleeper.entry = entry
+        if not (call.add_callback(sleeper.wake) if is_new else call.is_active()):
             entry.wake()
         is_woken = entry.sleep(remaining_s)
         with self._lock:
