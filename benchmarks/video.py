@@ -8,7 +8,7 @@ refound_of_100       sequences in which an object is seen again within 5 frames 
                      in which it was followed when it was hidden; refound_of_all: of all, whether it was or not
 swaps                sequences in which two equal objects that do not touch change their numbers
 one_object_ms        CPU a frame of one followed object, beyond decoding, looks at whole frames included
-eight_objects_ms     the same for each of eight objects, one of each model
+eight_objects_ms     the same for each followed one of eight equal objects
 full_look_ms         CPU of one look at a whole frame
 one_camera_depth_mm, two_cameras_depth_mm
                      median error along the first camera's axis, of it alone and with another 60 degrees apart
