@@ -75,6 +75,8 @@ def test_a_video_says_when_its_frames_were_taken(
         ({"max_detections": 2}, "--track-objects"),
         ({"track_objects": 0}, "expected 1 to 16"),
         ({"frame_rate": 0.0}, "more than 0 frames/s"),
+        ({"track": False, "track_objects": 2}, "are for --track"),
+        ({"track": False, "frame_rate": 10.0}, "are for --track"),
     ],
 )
 def test_what_cannot_be_followed_is_refused(

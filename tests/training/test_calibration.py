@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from curio_train.camera import load_intrinsics, save_intrinsics
 from curio_train.capture.calibration import Board, calibrate
+from curio_train.capture.options import CalibrateCommand
+from curio_train.commands.calibrate import run
 from curio_train.commands.train import train
-from curio_train.errors import CameraError, DataError
+from curio_train.errors import CameraError, DataError, UsageError
 from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT = 640, 480
@@ -129,3 +131,10 @@ def _written(folder: Path, other: dict[str, object]) -> Path:
     path = folder / "camera.json"
     path.write_text(json.dumps({"camera_matrix": MATRIX.tolist(), "width": WIDTH, "height": HEIGHT} | other))
     return path
+
+
+def test_photographs_of_a_board_are_no_sequence_and_small_boards_are_read_one_way(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--every 3 is for photographs of a scene"):
+        run(CalibrateCommand(images=tmp_path, board=(6, 4), every=3), lambda *_: pytest.fail("no structure"))
+    assert [(board.columns, board.rows) for board in Board(3, 4, 0.03).readings] == [(4, 5)]
+    assert [(board.columns, board.rows) for board in Board(4, 5, 0.03).readings] == [(5, 6), (4, 5)]

@@ -74,8 +74,7 @@ def run(arguments: DetectArguments) -> int:
 
     models, arguments = _models_first(arguments)
     _check_numbers(arguments)
-    if arguments.track:
-        arguments = check_tracking(arguments, models)
+    arguments = check_tracking(arguments, models)
     if arguments.video is None:
         check_arguments(arguments.images)
     cv2.setNumThreads(1)  # the images are what runs in parallel

@@ -18,11 +18,18 @@ if TYPE_CHECKING:
 
 
 def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectArguments:
-    """The call with one image worked on at a time.
+    """The call with one image worked on at a time, if it follows objects.
 
     Raises:
-        UsageError: It has an option that does not go with following.
+        UsageError: It has an option that does not go with following, or one that needs it.
     """
+    if not arguments.track:
+        if (arguments.track_objects, arguments.frame_rate) != (
+            DetectArguments.track_objects,
+            DetectArguments.frame_rate,
+        ):
+            raise UsageError("--track-objects and --frame-rate are for --track: give it, too, or leave them out")
+        return arguments
     if remote := [model for model in models if not os.path.exists(model)]:
         raise UsageError(
             f"--track: {remote[0]} is behind a server; name a model on this machine, or set `track` in DetectStream"

@@ -35,6 +35,8 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
     """
     if command.every < 1:
         raise UsageError(f"--every {command.every}, expected 1 or more")
+    if command.every > 1 and command.board is not None:
+        raise UsageError(f"--every {command.every} is for photographs of a scene; leave it out, or leave out --board")
     _check_scale(command)
     if command.rig_out is not None:
         return _rig(command, command.rig_out)
