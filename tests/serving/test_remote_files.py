@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from curio_serve.batch.images.remote_files import Patience, RemoteFiles
+from curio_serve.batch.images.remote_files import Patience, RemoteFiles, path_of
 from curio_serve.errors import ImageError, UsageError
 
 pytest.importorskip("aiohttp", reason="aiohttp is not installed: extra `cloud`")
@@ -72,3 +72,39 @@ def test_without_the_extra_it_says_what_to_install_and_files_do_without(models_d
     assert "pip install 'curio-pose[cloud]'" in done.stderr
     done = subprocess.run([sys.executable, "-c", blocked, arguments[0], "samples"], capture_output=True, text=True)
     assert len(done.stdout.splitlines()) == 4, done.stderr
+
+
+def test_a_folder_of_googles_store_where_nothing_is_yet_is_empty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the folder of results is before the first of them."""
+    pytest.importorskip("gcsfs", reason="gcsfs is not installed: extra `cloud`")
+
+    class Empty(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            is_list = self.path.partition("?")[0].endswith("/o")
+            content = b'{"kind": "storage#objects"}' if is_list else b"{}"
+            self.send_response(200 if is_list else 404)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *_: object) -> None: ...
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Empty)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    monkeypatch.setenv("STORAGE_EMULATOR_HOST", f"http://127.0.0.1:{server.server_port}")
+    try:
+        assert list(RemoteFiles("gs", HASTY).below("gs://bucket/poses.jsonl/")) == []
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def test_paths_of_urls_are_their_own() -> None:
+    urls = ("https://h/img?id=1", "https://h/img?id=2", "https://h/img", "s3://h/img", "https://h/img.jpg?v=1")
+    paths = [path_of(url) for url in urls]
+    assert len(set(paths)) == len(urls)
+    assert paths[2:4] == ["https/h/img", "s3/h/img"]
+    assert paths[4].endswith(".jpg"), "drawings keep the kind of image"
