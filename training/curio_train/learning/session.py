@@ -30,11 +30,12 @@ from curio_train.worlds.single_object.two_stage import TwoStageWorld
 def _draw(trainer: Trainer, cache: Path) -> None:
     """Draw what networks read or align poses by, before training begins: templates, or outlines."""
     network, world, begin = trainer.state.pose.network, trainer.world, time.monotonic()
-    network.cpu()  # as what is drawn
     if isinstance(network, ObjectsNetwork) and isinstance(world, SeveralObjectsWorld):
-        fill_objects(network, world, cache)
-    if isinstance(network, TwoStageNetwork) and isinstance(world, TwoStageWorld):
-        fill_outline(network, world)
+        fill_objects(network.cpu(), world, cache)  # where the drawings are
+    elif isinstance(network, TwoStageNetwork) and isinstance(world, TwoStageWorld):
+        fill_outline(network.cpu(), world)
+    else:
+        return
     network.to(trainer.ranks.device)
     trainer.state.progress.seconds += time.monotonic() - begin
 
