@@ -80,6 +80,19 @@ def test_stopped_it_says_how_to_go_on(
     assert len(read(out)) == NUM_MANY
 
 
+def test_stopped_while_it_follows_it_says_to_begin_again(models_dir: Path, many_frames: Path, tmp_path: Path) -> None:
+    camera, out = tmp_path / "camera.json", tmp_path / "out.jsonl"
+    camera.write_text('{"camera_matrix": [[300, 0, 160], [0, 301, 119], [0, 0, 1]]}')
+    arguments = command(models_dir / "pinhole", many_frames, "--camera", camera, "--out", out, "--track")
+    with subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True) as process:
+        wait_for_lines(out, 20, process)
+        process.send_signal(signal.SIGINT)
+        told = process.communicate()[1]
+    assert process.returncode == 130
+    assert "type the same again, with --overwrite" in told
+    assert "to go on" not in told
+
+
 def test_a_reader_that_leaves_is_no_traceback(models_dir: Path, many_frames: Path) -> None:
     with subprocess.Popen(
         command(models_dir / "flat", many_frames), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -15,7 +15,7 @@ from curio_train.config import RunConfig
 from curio_train.data.bop import ModelInfo
 from curio_train.errors import CurioError, DataError, ExportError, UsageError
 from curio_train.evaluation.evaluate import draw, evaluate, score
-from curio_train.evaluation.real_frames import evaluate_real_frames
+from curio_train.evaluation.real_frames import evaluate_real_frames, refuse_unscorable
 from curio_train.evaluation.repeated import reading_repeatedly
 from curio_train.evaluation.reporting.tables import print_evaluation
 from curio_train.evaluation.scores import pose_scores, rotation_errors_deg
@@ -209,6 +209,10 @@ def test_a_data_set_without_the_object_is_refused(data: Path) -> None:
     (data / "test_targets_bop19.json").write_text("[]")
     with pytest.raises(DataError, match="found no labelled frame of ape"):
         evaluate_real_frames(always_at(world, [0.0, 0.0, 0.8]), data, None)
+    with pytest.raises(DataError, match="found no labelled frame of ape"):
+        refuse_unscorable(world, data)
+    with pytest.raises(DataError, match="there is no such folder"):
+        refuse_unscorable(world, data / "none")
 
 
 def test_the_command_prints_one_object_and_keeps_it(

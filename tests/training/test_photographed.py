@@ -105,6 +105,11 @@ def test_what_a_photograph_shows_is_learned_and_the_rest_stays(world: SeveralObj
     assert after[1] > before[1] + 0.1
     assert torch.equal(banks.codes[1], other), "nothing is known of the other object"
 
+    outside = {name: value.clone() for name, value in banks.state_dict().items()}
+    for place_m in ([0.8, 0.04, 0.35], [0.0, 0.0, -DISTANCE_M]):  # beside the frame, behind the camera
+        learn_appearance(network, frames[:1], [Pose(rotation[:1], np.array([place_m])), unknown])
+        assert all(torch.equal(value, outside[name]) for name, value in banks.state_dict().items())
+
     directions = banks.rotations[:, 2]
     far = directions @ directions[VIEW * NUM_ROLLS] < 0.9
     kept = torch.nn.functional.cosine_similarity(banks.described(0)[far], described[far], dim=2)

@@ -15,10 +15,10 @@ def test_a_model_that_could_not_be_pushed_is_kept(
     with socket.create_server(("127.0.0.1", 0)) as closed:
         monkeypatch.setenv("HF_ENDPOINT", f"http://127.0.0.1:{closed.getsockname()[1]}")
     with pytest.raises(SystemExit, match="1"):
-        export.export([str(circles_run), "--out", str(tmp_path), "--push", "acme/circles"])
+        export.export([str(circles_run), "--out", str(tmp_path), "--push", "acme/circles", "--license", "mit"])
     told = " ".join(capsys.readouterr().err.split())
     assert "the hub does not answer" in told
-    assert f"to push it again: curio-export {tmp_path}/circles --push acme/circles" in told
+    assert f"to push it again: curio-export {tmp_path}/circles --push acme/circles --license mit" in told
     assert (tmp_path / "circles" / "1" / "model.onnx").exists()
 
 

@@ -26,6 +26,7 @@ from curio_train.learning.runs.configuration import to_json
 from curio_train.meshes.inset import inset
 from curio_train.meshes.meshes import Mesh, to_ply
 from curio_train.meshes.shapes import chair
+from curio_train.refinement.template_poses import uses_templates
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.options import CaptureOptions
@@ -194,6 +195,32 @@ def test_a_model_apart_from_its_run_needs_a_mesh(place: Path, tmp_path: Path) ->
     copy.write_bytes((place / "models" / "chair.onnx").read_bytes())
     with pytest.raises(UsageError, match=r"found no mesh of chair for .*--mesh FILE"):
         detect_one(place, model=copy, refine=True)
+
+
+def test_a_config_of_another_program_is_no_run(place: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "models" / "chair.onnx"
+    copy.parent.mkdir()
+    copy.write_bytes((place / "models" / "chair.onnx").read_bytes())
+    (tmp_path / "config.json").write_text('{"app": "something else"}')
+    assert detect_one(place, model=copy, overlays=tmp_path / "drawn")["object"] == "chair"
+    assert list((tmp_path / "drawn").iterdir())
+    with pytest.raises(UsageError, match="found no mesh of chair"):
+        detect_one(place, model=copy, refine=True)
+
+
+@pytest.mark.parametrize(
+    ("world", "num_objects", "expected"),
+    [
+        ({"name": "linemod", "class_name": "ape", "two_stage": False}, 1, True),
+        ({"name": "linemod", "class_name": "ape"}, 1, False),
+        ({"name": "capture", "plane": None}, 2, True),
+        ({"name": "capture"}, 2, False),
+        ({"name": "capture", "plane": None}, 1, False),
+    ],
+)
+def test_which_models_read_poses_by_templates(world: dict[str, Any], num_objects: int, expected: bool) -> None:
+    assert uses_templates({"method": "sleep", "world": world}, num_objects) == expected
+    assert uses_templates({"method": "templates", "world": world}, num_objects)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 """Photographs of a scene with several objects teach where those are, from what a network reads there, never labels."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -191,4 +193,29 @@ def test_no_photographs_or_no_camera_poses_give_no_labels(
     assert SceneLabels.from_photographs(world, never) is None
     alone = SeveralObjectsWorld("linemod", [member(0), member(1)], OnePhotographEach(["a.png"], None))
     assert SceneLabels.from_photographs(alone, never) is None
-    assert "not learned from" in caplog.text
+    nowhere = CameraPoses(np.full((1, 4, 4), np.nan))
+    alone = SeveralObjectsWorld("linemod", [member(0), member(1)], OnePhotographEach(["a.png"], nowhere))
+    assert SceneLabels.from_photographs(alone, never) is None
+    assert caplog.text.count("not learned from") == 2
+
+
+def test_photographs_whose_camera_nobody_knows_are_left_out(world: SeveralObjectsWorld, tmp_path: Path) -> None:
+    """They would count as misread, since what is read in them agrees with nothing."""
+    paths = [tmp_path / f"{number}.png" for number in range(6)]
+    for number, path in enumerate(paths):
+        cv2.imwrite(str(path), np.full((480, 640, 3), 40 * number, np.uint8))
+    cam_from_world = np.tile(np.eye(4), (6, 1, 1))
+    cam_from_world[[1, 4]] = np.nan
+    photographs = OnePhotographEach(paths, CameraPoses(cam_from_world, in_metres=True))
+    some = SeveralObjectsWorld("linemod", [member(0), member(1)], photographs)
+
+    def predict(images: torch.Tensor) -> dict[str, torch.Tensor]:
+        code = some.sample(len(images), (1,))
+        code[CONFIDENCE] = torch.ones_like(code[CONFIDENCE])
+        code[TRANSLATION] = torch.tensor([[[0.0, 0.0, 0.8], [0.1, 0.0, 0.8]]])
+        code[ROTATION_6D] = torch.tensor([1.0, 0, 0, 0, 1, 0]).expand(1, 2, 6)
+        return dict(code)
+
+    labels = SceneLabels.from_photographs(some, predict)
+    assert labels is not None
+    assert labels.frames[:, 0, 0, 0].tolist() == [0, 80, 120, 200]

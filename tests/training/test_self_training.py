@@ -186,6 +186,9 @@ def test_photographs_are_mixed_in_after_the_first_round(
     assert not torch.equal(crops[6:], images[:2])
     assert torch.equal(mixed[TRANSLATION][:6], code[TRANSLATION][2:])
     assert look.code_loss(look.network(NetworkConfig())(crops), mixed).isfinite()
+    few, rendered = training.mix_in({name: value[:2] for name, value in code.items()}, images[:2], (2,))
+    assert torch.equal(rendered, images[:2]), "a quarter of two rounds to none"
+    assert torch.equal(few[TRANSLATION], code[TRANSLATION][:2])
 
 
 def test_a_pretrained_network_has_earlier_rounds(world: TwoStageWorld, truth: SceneCode, paths: list[Path]) -> None:

@@ -66,11 +66,11 @@ class QueueEntry:
 class _Sleeper:
     """What the end of a call wakes: the entry that its thread sleeps on at that time."""
 
-    entry: QueueEntry | None = None
+    def __init__(self, entry: QueueEntry) -> None:
+        self.entry = entry
 
     def wake(self) -> None:
-        if self.entry is not None:
-            self.entry.wake()
+        self.entry.wake()
 
 
 class WorkQueue:
@@ -175,12 +175,14 @@ class WorkQueue:
 
     def _wait(self, entry: QueueEntry, call: Call, remaining_s: float | None) -> None:
         """Return with a slot, or raise without one."""
-        with self._lock:
-            sleeper, is_new = self._sleepers.get(call), False
-            if sleeper is None:  # gRPC keeps what is registered until the call ends, and streams wait for each frame
-                sleeper, is_new = self._sleepers.setdefault(call, _Sleeper()), True
-        sleeper.entry = entry
-        if not (call.add_callback(sleeper.wake) if is_new else call.is_active()):
+        # gRPC keeps what is registered until the call ends, and a stream waits for each of its frames.
+        if (sleeper := self._sleepers.get(call)) is not None:
+            sleeper.entry = entry
+            is_active = call.is_active()
+        else:
+            sleeper = self._sleepers[call] = _Sleeper(entry)
+            is_active = call.add_callback(sleeper.wake)
+        if not is_active:
             entry.wake()
         is_woken = entry.sleep(remaining_s)
         with self._lock:

@@ -22,7 +22,7 @@ from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
 
 from curio_serve.client.request import CameraLike, ImageLike, RegionLike, detect_request, selector, views_request
 from curio_serve.client.retries import Attempts, error_from_call
-from curio_serve.client.sent import Sent
+from curio_serve.deferred import DeferredError
 from curio_serve.errors import UsageError
 from curio_serve.files import read_given
 
@@ -184,15 +184,15 @@ class PoseClient(_Client):
             CurioError: The stream as a whole failed, or the server is out of reach.
             Exception: What the iterable raised, after the answers to the requests before it.
         """
-        sent = Sent()
-        call = self._stub.DetectStream(sent.each(requests), timeout=timeout_s, metadata=self._metadata)
+        failed = DeferredError()  # gRPC would call it an unknown error, and drop answers
+        call = self._stub.DetectStream(failed.each(requests), timeout=timeout_s, metadata=self._metadata)
         try:
             yield from call
         except grpc.RpcError as exc:
             raise error_from_call(exc, self.address) from exc
         finally:
             call.cancel()  # the caller may have stopped listening early
-        sent.raise_error()
+        failed.raise_it()
 
     def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
         """The models that the server has loaded."""
@@ -262,8 +262,8 @@ class AsyncPoseClient(_Client):
         self, requests: AsyncIterable[messages.DetectRequest], *, timeout_s: float
     ) -> AsyncIterator[messages.DetectResponse]:
         """Answers in the order of the requests; see :meth:`PoseClient.detect_stream`."""
-        sent = Sent()
-        call = self._stub.DetectStream(sent.each_async(requests), timeout=timeout_s, metadata=self._metadata)
+        failed = DeferredError()  # gRPC would call it an unknown error, and drop answers
+        call = self._stub.DetectStream(failed.each_async(requests), timeout=timeout_s, metadata=self._metadata)
         try:
             async for answer in call:
                 yield answer
@@ -271,7 +271,7 @@ class AsyncPoseClient(_Client):
             raise error_from_call(exc, self.address) from exc
         finally:
             call.cancel()
-        sent.raise_error()
+        failed.raise_it()
 
     async def list_models(self, *, timeout_s: float | None = None) -> list[messages.ModelInfo]:
         """The models that the server has loaded."""

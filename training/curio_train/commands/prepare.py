@@ -35,16 +35,11 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
             f"--self-training {config.recipe.self_training}: found no photographs to learn from; expected --photos, "
             "which linemod and capture have"
         )
-    terms = config.terms
-    if (
-        isinstance(options, LinemodOptions)
-        and options.photos is not None
-        and not (terms.sleep or terms.renders_predictions)
-    ):
-        raise UsageError(
-            f"--photos {options.photos}: --method {config.method} does not learn from photographs; leave it out"
-        )
     if isinstance(options, LinemodOptions):
+        if options.photos is not None and not (config.terms.sleep or config.terms.renders_predictions):
+            raise UsageError(
+                f"--photos {options.photos}: --method {config.method} does not learn from photographs; leave it out"
+            )
         options = with_linemod(_with_stages(options, config.method), cache, report)
         config = replace(config, world=options)
         _refuse_unreadable(options)

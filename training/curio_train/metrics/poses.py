@@ -94,10 +94,17 @@ def mspd_px(estimate: Pose, truth: Pose, points: np.ndarray, symmetries: Sequenc
 
 
 def project(points_in_camera: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Pixels [n, 2] of points [n, 3] in the camera frame; infinite for points behind the camera."""
+    """Pixels [..., 2] of points [..., 3] in the camera frame; infinite for points behind the camera."""
     homogeneous = points_in_camera @ matrix.T
-    in_front = homogeneous[:, 2:] > 0
-    return np.where(in_front, homogeneous[:, :2] / np.where(in_front, homogeneous[:, 2:], 1), np.inf)
+    in_front = homogeneous[..., 2:] > 0
+    return np.where(in_front, homogeneous[..., :2] / np.where(in_front, homogeneous[..., 2:], 1), np.inf)
+
+
+def in_view(positions_m: np.ndarray, matrix: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Whether positions [..., 3] in the camera frame project into the frame of K; false where they are NaN."""
+    pixels = project(positions_m, matrix)
+    inside: np.ndarray = np.all((pixels > 0) & (pixels < (width, height)), axis=-1)
+    return inside
 
 
 def recall(errors: Sequence[float], threshold: float) -> float:

@@ -19,10 +19,11 @@ from torch import Tensor
 
 from curio_train.camera import scale_matrix
 from curio_train.errors import TrainingError
+from curio_train.metrics.poses import in_view
 from curio_train.networks.templates.network import TemplateNetwork
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.refinement.render_and_compare import RenderAndCompare
-from curio_train.refinement.turned_frames import LARGEST_ROLL_DEG, in_view, random_camera, seen_by
+from curio_train.refinement.turned_frames import LARGEST_ROLL_DEG, random_camera, seen_by
 from curio_train.scene_code import CONFIDENCE, LIGHT, TRANSLATION, SceneCode, index, joined
 from curio_train.templates.build import fill, template_network
 from curio_train.worlds.base import Batch, ImageSource

@@ -18,9 +18,10 @@ from torch import Tensor
 
 from curio_train.data.photographs import read_frames
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.metrics.poses import in_view
 from curio_train.networks.templates.geometry import FRAME_STRIDE
 from curio_train.refinement.scene_poses import Reads, scene_poses
-from curio_train.refinement.turned_frames import in_view, random_camera, seen_by
+from curio_train.refinement.turned_frames import random_camera, seen_by
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, SceneCode, joined
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 

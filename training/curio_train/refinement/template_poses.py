@@ -18,7 +18,8 @@ def uses_templates(recipe: Mapping[str, Any], num_objects: int) -> bool:
     """
     world = recipe.get("world", {})
     by_locator = world.get("name") == "linemod" and not LinemodOptions.upgraded(world)["two_stage"]
-    several_parts = world.get("name") == "capture" and num_objects > 1 and world.get("plane") is None
+    is_free = "plane" in world and world["plane"] is None  # a plane's file is left out of what models store
+    several_parts = world.get("name") == "capture" and num_objects > 1 and is_free
     return recipe.get("method") == "templates" or (by_locator and world.get("gaze", True)) or several_parts
 
 

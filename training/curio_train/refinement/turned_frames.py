@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 from curio_serve.imaging.virtual_cameras import VirtualCamera
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from curio_train.networks.crop_camera import about_axis
@@ -50,14 +50,3 @@ def seen_by(
     pixels = camera.image(frame.permute(1, 2, 0).numpy(), matrix)
     turned_m = position_m @ camera.virtual_from_cam.T / (1.0, 1.0, camera.zoom)
     return torch.from_numpy(pixels).permute(2, 0, 1).float() / 255, turned_m
-
-
-def in_view(
-    position_m: Float[np.ndarray, "*batch 3"], matrix: Float[np.ndarray, "3 3"], width: int, height: int
-) -> Bool[np.ndarray, "*batch"]:
-    """Whether positions project into the frame; false where they are NaN."""
-    pixels = position_m @ matrix.T
-    with np.errstate(invalid="ignore", divide="ignore"):
-        pixels = pixels[..., :2] / pixels[..., 2:]
-    inside: np.ndarray = ((pixels > 0) & (pixels < (width, height))).all(axis=-1) & (position_m[..., 2] > 0)
-    return inside

@@ -11,15 +11,16 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from curio_train.geometry import Pose, rotation_between
+from curio_train.metrics.poses import in_view
 from curio_train.networks.crop_camera import about_axis, cut_crops
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.templates.alignment import FeatureMaps
 from curio_train.networks.templates.bank import RANK
-from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS, Geometry
+from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS
 from curio_train.networks.templates.trunk import COARSE_STRIDE, FINE_STRIDE, FINE_WIDTH
 from curio_train.templates.describe import low_rank
 
@@ -74,19 +75,15 @@ def learn_appearance(
     Args:
         network: With templates.
         frames: Photographs of its camera, sRGB.
-        poses: Cam_from_obj of each object in all photographs [num, …], metres; NaN where it is not known.
+        poses: Cam_from_obj of each object in all photographs [num, …], metres; NaN where it is not known. Photographs
+            that do not show the object teach nothing of it.
     """
     for number, pose in enumerate(poses):
-        known = np.isfinite(pose.translation_m).all(axis=1) & _in_view(pose.translation_m, network.geometries[number])
+        geometry = network.geometries[number]
+        known = in_view(pose.translation_m, geometry.matrix, geometry.width, geometry.height)
         if known.any():
             some = Pose(torch.from_numpy(pose.rotation[known]), torch.from_numpy(pose.translation_m[known]))
             _learn(network, number, frames[torch.from_numpy(known)], some)
-
-
-def _in_view(positions_m: Float[np.ndarray, "num 3"], geometry: Geometry) -> Bool[np.ndarray, " num"]:
-    """Whether positions, in the camera frame, are in front of the camera and within its frame; not where NaN."""
-    x, y, z = (positions_m @ geometry.matrix.T).T
-    return (z > 0) & (x >= 0) & (x < geometry.width * z) & (y >= 0) & (y < geometry.height * z)
 
 
 def _learn(network: ObjectsNetwork, number: int, frames: Tensor, cam_from_obj: Pose[Tensor]) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TypeVar
 
-from curio_serve.errors import CurioError
+from curio_serve.deferred import DeferredError
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
@@ -28,17 +28,9 @@ def in_order(function: Callable[[Item], Answer], items: Iterable[Item], num_jobs
     pool = ThreadPoolExecutor(num_jobs)
     pending: deque[Future[Answer]] = deque()
     most = num_jobs * _IN_FLIGHT_A_JOB
-    failed: Exception | None = None
+    failed = DeferredError()
     try:
-        taken = iter(items)
-        while True:
-            try:
-                item = next(taken)
-            except StopIteration:
-                break
-            except (CurioError, OSError) as exc:  # raised after the answers before it
-                failed = exc
-                break
+        for item in failed.each(items):
             pending.append(pool.submit(function, item))
             if len(pending) >= most:
                 # Half of them at a time: to wake for each answer costs the workers more than the answer's writing.
@@ -47,7 +39,6 @@ def in_order(function: Callable[[Item], Answer], items: Iterable[Item], num_jobs
                     yield pending.popleft().result()
         while pending:
             yield pending.popleft().result()
-        if failed is not None:
-            raise failed
+        failed.raise_it()
     finally:
         pool.shutdown(cancel_futures=True)

@@ -123,7 +123,7 @@ class RemoteFiles:
         S3 is asked for a page after another. Of Google's store one folder at a time is held in memory.
 
         Raises:
-            UsageError: The bucket is missing or refuses.
+            UsageError: The bucket refuses, or one of S3 is missing; in Google's store a missing one is empty.
             Unavailable: The store does not answer.
         """
         pages = self._s3_pages(folder) if self._scheme == "s3" else self._folders(folder)

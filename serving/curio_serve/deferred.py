@@ -1,0 +1,44 @@
+"""Errors of an iterable that wait for their turn: what was taken of it before comes first."""
+
+from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
+from types import TracebackType
+from typing import Self, TypeVar
+
+Item = TypeVar("Item")
+
+
+class DeferredError:
+    """What an iterable raises ends it, and is raised once its items are done with."""
+
+    def __init__(self) -> None:
+        self._error: Exception | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> bool:
+        """Keep an error for :meth:`raise_it`."""
+        if not isinstance(error, Exception):
+            return False
+        self._error = error
+        return True
+
+    def each(self, items: Iterable[Item]) -> Iterator[Item]:
+        """The items, up to an error."""
+        with self:
+            yield from items
+
+    async def each_async(self, items: AsyncIterable[Item]) -> AsyncIterator[Item]:
+        """The same for asyncio."""
+        with self:
+            async for item in items:
+                yield item
+
+    def raise_it(self) -> None:
+        """Raise what ended the items, if anything did.
+
+        Raises:
+            Exception: What the iterable raised.
+        """
+        if self._error is not None:
+            raise self._error
