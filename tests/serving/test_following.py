@@ -15,10 +15,10 @@ from curio_serve.errors import ArgumentError, ModelError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
+from curio_serve.models.object_frames import symmetry_rotations
 from curio_serve.models.stages import crop_stage, outline_stage
 from curio_serve.models.stages.crop_stage import CROP_STAGE_KEY, CropStageNote
 from curio_serve.models.stages.outline_stage import OUTLINE_STAGE_KEY, OutlineStageNote
-from curio_serve.models.symmetries import symmetry_rotations
 from curio_serve.tracking.pose_filter import PoseFilter
 from curio_serve.tracking.stream import FollowingStream
 from curio_serve.tracking.tracks import Measurement, Track, assign, without_doubles

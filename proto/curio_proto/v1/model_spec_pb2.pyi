@@ -97,20 +97,22 @@ class Field(_message.Message):
     def __init__(self, name: _Optional[str] = ..., size: _Optional[int] = ..., per_object: bool = ..., unit: _Optional[str] = ..., frame: _Optional[str] = ..., lower: _Optional[_Iterable[float]] = ..., upper: _Optional[_Iterable[float]] = ..., activation: _Optional[str] = ...) -> None: ...
 
 class ObjectModel(_message.Message):
-    __slots__ = ("name", "mesh_sha256", "diameter_m", "box_corners_m", "symmetries", "slots")
+    __slots__ = ("name", "mesh_sha256", "diameter_m", "box_corners_m", "symmetries", "slots", "center_m")
     NAME_FIELD_NUMBER: _ClassVar[int]
     MESH_SHA256_FIELD_NUMBER: _ClassVar[int]
     DIAMETER_M_FIELD_NUMBER: _ClassVar[int]
     BOX_CORNERS_M_FIELD_NUMBER: _ClassVar[int]
     SYMMETRIES_FIELD_NUMBER: _ClassVar[int]
     SLOTS_FIELD_NUMBER: _ClassVar[int]
+    CENTER_M_FIELD_NUMBER: _ClassVar[int]
     name: str
     mesh_sha256: str
     diameter_m: float
     box_corners_m: _containers.RepeatedScalarFieldContainer[float]
     symmetries: _containers.RepeatedCompositeFieldContainer[Symmetry]
     slots: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, name: _Optional[str] = ..., mesh_sha256: _Optional[str] = ..., diameter_m: _Optional[float] = ..., box_corners_m: _Optional[_Iterable[float]] = ..., symmetries: _Optional[_Iterable[_Union[Symmetry, _Mapping]]] = ..., slots: _Optional[_Iterable[int]] = ...) -> None: ...
+    center_m: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, name: _Optional[str] = ..., mesh_sha256: _Optional[str] = ..., diameter_m: _Optional[float] = ..., box_corners_m: _Optional[_Iterable[float]] = ..., symmetries: _Optional[_Iterable[_Union[Symmetry, _Mapping]]] = ..., slots: _Optional[_Iterable[int]] = ..., center_m: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Symmetry(_message.Message):
     __slots__ = ("transform", "axis", "offset_m")

@@ -187,7 +187,7 @@ class Detector:
         Args:
             pixels: uint8 RGB [height, width, 3].
             camera: That took them.
-            position_m: Where the object is expected [3], frame's camera, in front of it.
+            position_m: Where the object's middle is expected [3], frame's camera, in front of it.
 
         Raises:
             InternalError: The network failed.
@@ -311,8 +311,15 @@ def _fill(
             quaternion_xyzw=quaternion_xyzw(rotation) if rotation else (),
             color=values["color"][row] if "color" in values else (),
             box_px=crop.project(transformed(slots[row].box_corners, rotation or _UPRIGHT, translation)),
-            outside_trained_range=not depths_m[0] <= values["translation_m"][row][2] <= depths_m[1],
+            outside_trained_range=not depths_m[0] <= _depth_m(values, row, slots[row]) <= depths_m[1],
         )
+
+
+def _depth_m(values: Values, row: int, slot: Slot) -> float:
+    """Depth of an object's middle along the canonical camera's axis, metres."""
+    towards = values["rotation"][row][2] if "rotation" in values else _UPRIGHT[6:]
+    depth_m: float = values["translation_m"][row][2] + sum(map(float.__mul__, towards, slot.center))
+    return depth_m
 
 
 def _judge(result: RegionResult, reliability: Reliability) -> None:

@@ -93,7 +93,7 @@ class InstanceSearch:
     def take(self, values: Values) -> bool:
         """Keep the outputs for :attr:`image` if they are another instance; whether to read it again."""
         (slot,) = self._model.slots
-        center = self._pixels([values["translation_m"][0]])
+        center = self._pixels([_placed([slot.center], values)[0]])
         is_new = self._is_sure(values) and center is not None and not self._is_covered(center[0])
         if is_new or not self._readings:
             self._readings.append(Rows(values, self._model.slots))
@@ -129,6 +129,11 @@ class InstanceSearch:
 
 def _corners(slot: Slot, values: Values) -> Array:
     """The box around an instance in the canonical camera."""
+    return _placed(enlarged(np.asarray(slot.box_corners, float)), values)
+
+
+def _placed(points: Sequence[Sequence[float]] | Array, values: Values) -> Array:
+    """Points of the first instance's object in the canonical camera."""
     rotation = np.asarray(values["rotation"][0] if "rotation" in values else np.eye(3), float)
-    corners: Array = enlarged(np.asarray(slot.box_corners, float)) @ rotation.T + values["translation_m"][0]
-    return corners
+    placed: Array = np.asarray(points, float) @ rotation.T + values["translation_m"][0]
+    return placed

@@ -16,6 +16,7 @@ from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.view import CanonicalCamera
 from curio_serve.models.batching import Batcher
+from curio_serve.models.object_frames import center_of
 from curio_serve.models.reliability import RELIABILITY_FILE, parse_reliability
 from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime, open_session, runtime_errors
 from curio_serve.models.spec import check_known, part_of, read_metadata, read_spec, wanted_slots
@@ -54,6 +55,8 @@ class Slot:
     """Name of the kind of object that the row describes."""
     box_corners: Sequence[Sequence[float]]
     """8 points (x, y, z), object frame, metres (image widths in 2D worlds); empty if the spec has none."""
+    center: Sequence[float] = (0.0, 0.0, 0.0)
+    """The object's middle, likewise."""
 
 
 class Model:
@@ -304,18 +307,20 @@ def slots(spec: ModelSpec, name: str) -> tuple[Slot, ...]:
     """The object of each row of the outputs, in the order of the rows.
 
     Raises:
-        ModelError: A row belongs to no object or to two, or a box has not 8 corners.
+        ModelError: A row belongs to no object or to two, a box has not 8 corners, or a middle is no point.
     """
     rows: dict[int, Slot] = {}
     for kind in spec.objects:
         values = list(kind.box_corners_m)
         if len(values) not in (0, 24):
             raise ModelError(f"model {name}: the box of {kind.name} has {len(values)} values; expected 8 corners x 3")
+        if len(kind.center_m) not in (0, 3) or not all(map(math.isfinite, kind.center_m)):
+            raise ModelError(f"model {name}: the middle of {kind.name} is {list(kind.center_m)}; expected 3 values")
         corners = list(zip(values[0::3], values[1::3], values[2::3], strict=True))
         for row in kind.slots:
             if row in rows:
                 raise ModelError(f"model {name}: slot {row} belongs to both {rows[row].object} and {kind.name}")
-            rows[row] = Slot(kind.name, corners)
+            rows[row] = Slot(kind.name, corners, center_of(kind).tolist())
     if not rows or len(rows) != spec.num_slots or sorted(rows) != list(range(len(rows))):
         raise ModelError(f"model {name}: {spec.num_slots} slots, but its objects name the slots {sorted(rows)}")
     return tuple(rows[row] for row in range(len(rows)))

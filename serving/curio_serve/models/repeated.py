@@ -13,7 +13,12 @@ from curio_serve.consensus.poses import angles_deg, mean_rotation
 from curio_serve.errors import ArgumentError
 from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS, VirtualCamera
 from curio_serve.models.model import Outputs
-from curio_serve.models.symmetries import symmetry_rotations
+from curio_serve.models.object_frames import (
+    center_of,
+    middle_from_origin,
+    origin_from_middle,
+    symmetry_rotations,
+)
 
 Array = np.ndarray
 MAX_READS = len(VIRTUAL_CAMERAS)
@@ -54,6 +59,7 @@ class RepeatedReader:
         self._matrix = np.reshape(list(spec.camera.camera_matrix), (3, 3))
         kinds = sorted(spec.objects, key=lambda kind: kind.slots[0])
         self._symmetries = [symmetry_rotations(kind) for kind in kinds]
+        self._centers_m = [center_of(kind) for kind in kinds]
         self._diameters_m = [kind.diameter_m for kind in kinds]
 
     def __call__(self, images: Array, before_run: Callable[[], None] = lambda: None) -> Outputs:
@@ -80,13 +86,15 @@ class RepeatedReader:
         found = {name: np.mean([read[name] for read in reads], axis=0) for name in reads[0]}
         for slot, symmetries in enumerate(self._symmetries):
             angle, turned = angles_deg(rotation[:, None, slot], rotation[:, slot], symmetries)
-            apart = np.linalg.norm(position[:, None, slot] - position[:, slot], axis=-1) / self._diameters_m[slot]
+            center_m = self._centers_m[slot]
+            middle = middle_from_origin(position[:, slot], rotation[:, slot], center_m)
+            apart = np.linalg.norm(middle[:, None] - middle, axis=-1) / self._diameters_m[slot]
             agree = (angle < _SAME_ROTATION_DEG) & (apart < _SAME_PLACE) | np.eye(len(reads), dtype=bool)
             best = int((confidence[:, slot] @ agree).argmax())
             members = np.flatnonzero(agree[:, best])
             alike = rotation[members, slot] @ symmetries[turned[members, best]]
-            found["rotation"][slot] = mean_rotation(alike)
-            found["translation_m"][slot] = position[members, slot].mean(axis=0)
+            mean = found["rotation"][slot] = mean_rotation(alike)
+            found["translation_m"][slot] = origin_from_middle(middle[members].mean(axis=0), mean, center_m)
             if "confidence" in found:
                 found["confidence"][slot] = (confidence[members, slot].sum() / len(reads)) ** AGREEMENT_POWER
             if "color" in found:

@@ -17,8 +17,13 @@ from curio_serve.errors import ArgumentError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.models.detector import Detector, transformed
+from curio_serve.models.object_frames import (
+    center_of,
+    middle_from_origin,
+    origin_from_middle,
+    symmetry_rotations,
+)
 from curio_serve.models.reliability import region_status, status_of
-from curio_serve.models.symmetries import symmetry_rotations
 
 if TYPE_CHECKING:
     from curio_serve.models.detector import Results
@@ -51,7 +56,7 @@ class RigView:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """One object in one view, in the rig's frame."""
+    """One object in one view, in the rig's frame; its position is that of its middle."""
 
     view: int
     object: str
@@ -101,11 +106,12 @@ def detect_views(
     result = results.add(model=model.name, model_version=model.version)
     nearest, farthest = detector.depths_m
     for confidence, pose, own in found:
-        rows, position = pose.rotation.ravel().tolist(), pose.translation_m.tolist()
-        in_first = views[0].cam_from_rig @ _matrix(pose.rotation, pose.translation_m)
         slot = next(slot for slot in model.slots if slot.object == own[0].object)
+        origin_m = origin_from_middle(pose.translation_m, pose.rotation, np.array(slot.center))
+        rows, position = pose.rotation.ravel().tolist(), origin_m.tolist()
+        in_first = views[0].cam_from_rig @ _matrix(pose.rotation, origin_m)
         agreeing = sorted({own[row].view for row in pose.members})
-        depths_m = [float((views[number].cam_from_rig @ [*position, 1.0])[2]) for number in agreeing]
+        depths_m = [float((views[number].cam_from_rig @ [*pose.translation_m, 1.0])[2]) for number in agreeing]
         corners = transformed(slot.box_corners, in_first[:3, :3].ravel().tolist(), in_first[:3, 3].tolist())
         result.detections.add(
             object=own[0].object,
@@ -133,10 +139,9 @@ def _whole(
     (result,) = detector.detect(view.pixels, view.camera, reduction=view.reduction, before_run=before_run)
     found = []
     for one in result.detections:
-        translation_m = np.array(one.translation_m)
-        across_m = _ACROSS * kinds[one.object].diameter_m
-        covariance = position_covariance_m2(translation_m[None], across_m, _IN_DEPTH)[0]
-        rotation = np.reshape(one.rotation, (3, 3))
+        kind, rotation = kinds[one.object], np.reshape(one.rotation, (3, 3))
+        translation_m = middle_from_origin(np.array(one.translation_m), rotation, center_of(kind))
+        covariance = position_covariance_m2(translation_m[None], _ACROSS * kind.diameter_m, _IN_DEPTH)[0]
         found.append(_in_rig(number, view, one.object, rotation, translation_m, covariance, one.confidence))
     return found
 

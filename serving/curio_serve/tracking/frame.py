@@ -12,6 +12,7 @@ from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.models.detector import Detector, transformed
 from curio_serve.models.instances import cover, enlarged
+from curio_serve.models.object_frames import center_of, middle_from_origin, origin_from_middle
 from curio_serve.models.reliability import status_of
 from curio_serve.models.stages.crop_stage import CropPose
 from curio_serve.tracking.tracks import Measurement, Track
@@ -64,15 +65,12 @@ class StreamFrame:
                 self._cover(pixels, self.scaled_camera, track)
         (result,) = self.detector.detect(pixels, self.camera, reduction=self.reduction, before_run=self.before_run)
         kinds = {kind.name: kind for kind in self.detector.model.spec.objects}
-        found = [
-            Measurement.of_whole_frame(
-                kinds[detection.object],
-                np.array(detection.translation_m),
-                np.reshape(detection.rotation, (3, 3)) if detection.rotation else np.eye(3),
-                detection.confidence,
-            )
-            for detection in result.detections
-        ]
+        found = []
+        for detection in result.detections:
+            kind = kinds[detection.object]
+            rotation = np.reshape(detection.rotation, (3, 3)) if detection.rotation else np.eye(3)
+            middle_m = middle_from_origin(np.array(detection.translation_m), rotation, center_of(kind))
+            found.append(Measurement.of_whole_frame(kind, middle_m, rotation, detection.confidence))
         return found, result.light
 
     def read(self, position_m: Array) -> CropPose | None:
@@ -86,11 +84,12 @@ class StreamFrame:
         return pose if pose.translation_m[2] > 0 else None
 
     def add_detection(
-        self, result: RegionResult, object_: str, translation_m: Array, rotation: Array, confidence: float
+        self, result: RegionResult, object_: str, middle_m: Array, rotation: Array, confidence: float
     ) -> Detection:
-        """Add a pose in the frame's camera to a result."""
-        rows, position = rotation.ravel().tolist(), translation_m.tolist()
+        """Add a pose in the frame's camera to a result, given where the object's middle is."""
         slot = next(slot for slot in self.detector.model.slots if slot.object == object_)
+        origin_m = origin_from_middle(middle_m, rotation, np.array(slot.center))
+        rows, position = rotation.ravel().tolist(), origin_m.tolist()
         nearest, farthest = self.detector.depths_m
         corners = transformed(slot.box_corners, rows, position)
         return result.detections.add(
@@ -101,7 +100,7 @@ class StreamFrame:
             rotation=rows,
             quaternion_xyzw=quaternion_xyzw(rows),
             box_px=[] if self.known_camera is None else self.known_camera.pixels(corners),
-            outside_trained_range=not nearest <= position[2] <= farthest,
+            outside_trained_range=not nearest <= middle_m[2] <= farthest,
             status=status_of(self.detector.model.spec.reliability, object_, confidence),
         )
 
@@ -110,7 +109,8 @@ class StreamFrame:
         pose = track.filter
         message.track_id, message.predicted = track.number, not track.is_seen
         message.age_s, message.unseen_s = self.time_s - track.first_s, self.time_s - track.seen_s
-        message.translation_m.extend(pose.translation_m.tolist())
+        origin_m = origin_from_middle(pose.translation_m, pose.rotation, center_of(track.kind))
+        message.translation_m.extend(origin_m.tolist())
         rows = pose.rotation.ravel().tolist()
         message.rotation.extend(rows)
         message.quaternion_xyzw.extend(quaternion_xyzw(rows))
@@ -123,6 +123,6 @@ class StreamFrame:
         pose, corners = track.measured, np.reshape(track.kind.box_corners_m, (-1, 3))
         if not len(corners):
             return
-        seen = camera.project(enlarged(corners) @ pose.rotation.T + pose.translation_m)
+        seen = camera.project((enlarged(corners) - center_of(track.kind)) @ pose.rotation.T + pose.translation_m)
         if np.isfinite(seen).all():
             cover(pixels, seen)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectModel
 
+from curio_serve.models.object_frames import symmetry_rotations
 from curio_serve.models.stages.crop_stage import CropPose
-from curio_serve.models.symmetries import symmetry_rotations
 from curio_serve.tracking.assignment import assigned
 from curio_serve.tracking.pose_filter import PoseFilter
 
@@ -28,7 +28,7 @@ class Measurement:
     object: str
     """Name of the kind of object."""
     translation_m: Array
-    """[3]."""
+    """Of the object's middle, [3]."""
     rotation: Array
     """cam_from_obj [3, 3]."""
     confidence: float
@@ -69,7 +69,7 @@ class Track:
     kind: ObjectModel
     """Of the object."""
     filter: PoseFilter
-    """Filter of its pose."""
+    """Filter of its pose, the position of which is that of the object's middle."""
     first_s: float
     """When it was found."""
     seen_s: float

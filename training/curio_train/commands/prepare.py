@@ -51,8 +51,7 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
             )
         from curio_train.doctor.examine import refuse_unfit
 
-        trains_poses = not (config.terms.templates or options.names_several)
-        for doubt in refuse_unfit(options, self_training=config.recipe.self_training > 0, trains_poses=trains_poses):
+        for doubt in refuse_unfit(options, self_training=config.recipe.self_training > 0):
             warn(doubt)
         return replace(config, world=_with_paint(options, report), network=_usual_network(config, options))
     return config

@@ -9,7 +9,7 @@ from curio_train.camera import Intrinsics
 from curio_train.doctor.camera_file import examine_camera
 from curio_train.doctor.finding import Finding
 from curio_train.doctor.machine import examine_machine, examine_resources
-from curio_train.doctor.mesh_file import SYMMETRY_BESIDE_ORIGIN, examine_mesh
+from curio_train.doctor.mesh_file import examine_mesh
 from curio_train.doctor.photographs import TOO_FEW, examine_photographs
 from curio_train.doctor.picture_content import examine_background
 from curio_train.errors import DataError
@@ -97,13 +97,12 @@ _HARMLESS = "no colour"  # colours are part of the code, or estimated
 _BROKEN = "photographs unreadable"  # all that matters about other scenes: they may differ in size and be few
 
 
-def refuse_unfit(options: CaptureOptions, *, self_training: bool = True, trains_poses: bool = True) -> list[str]:
+def refuse_unfit(options: CaptureOptions, *, self_training: bool = True) -> list[str]:
     """Compare the meshes, the camera, the photographs and the background image; read every other background.
 
     Args:
         options: Names the files.
         self_training: Whether the network is to learn from the photographs off the plane, too.
-        trains_poses: Whether a network is to regress poses, instead of matching templates.
 
     Returns:
         What is doubtful about them, a line each.
@@ -119,8 +118,6 @@ def refuse_unfit(options: CaptureOptions, *, self_training: bool = True, trains_
     found = [finding for finding in found if finding.state != "good" and finding.fault != _HARMLESS]
     if not self_training and options.plane is None:
         found = [finding for finding in found if finding.fault != TOO_FEW]
-    if options.plane is not None or not trains_poses:  # there the origin is the shape's middle, or poses have no loss
-        found = [finding for finding in found if finding.fault != SYMMETRY_BESIDE_ORIGIN]
     if options.backgrounds is not None:
         _, scenes = examine_photographs(options.backgrounds, None)
         found += [replace(finding, subject="backgrounds") for finding in scenes if finding.fault == _BROKEN]

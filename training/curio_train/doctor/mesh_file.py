@@ -1,4 +1,4 @@
-"""Examines a mesh file: whether it can be read, its unit, size, origin, colours, symmetries and surface."""
+"""Examines a mesh file: whether it can be read, its unit, size, colours, symmetries and surface."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,12 +16,7 @@ from curio_train.meshes.symmetries import Symmetries, find_symmetries
 
 # What people hold before a camera; outside it a unit was probably mistaken, though such things exist.
 _USUAL_M = (0.01, 3.0)
-_FARTHEST_CENTRE = 0.5  # of the diameter: then the origin lies outside most shapes
 _MOST_FACES = 500_000
-_MOVES_ORIGIN = 0.1  # of the diameter, by a symmetry: then poses that look the same have other positions
-
-SYMMETRY_BESIDE_ORIGIN = "symmetry beside origin"
-"""The fault of a mesh that no network can learn the poses of in free space."""
 
 
 def examine_mesh(path: Path, unit: Unit | None, body: str | None = None) -> tuple[Mesh | None, list[Finding]]:
@@ -33,11 +28,11 @@ def examine_mesh(path: Path, unit: Unit | None, body: str | None = None) -> tupl
         return None, [Finding("mesh", "bad", str(exc), fault=fault)]
     extent = " x ".join(f"{size * 1000:.4g}" for size in np.ptp(mesh.vertices_m, axis=0))
     text = f"{path}: {len(mesh.faces):,} faces, {extent} mm, diameter {mesh.diameter_m * 1000:.4g} mm"
-    findings = [Finding("mesh", "good", text), *_bodies(mesh), *_size(mesh, unit), *_origin(mesh), *_colours(mesh)]
+    findings = [Finding("mesh", "good", text), *_bodies(mesh), *_size(mesh, unit), *_colours(mesh)]
     surface = list(examine_surface(mesh))
     if any(finding.fault == "stray parts" for finding in surface):
         return mesh, [*findings, *surface]  # its diameter is not the object's, and every tolerance is a fraction of it
-    return mesh, [*findings, *surface, _symmetries(find_symmetries(mesh), mesh.diameter_m)]
+    return mesh, [*findings, *surface, _symmetries(find_symmetries(mesh))]
 
 
 def _bodies(mesh: Mesh) -> Iterator[Finding]:
@@ -65,15 +60,6 @@ def _size(mesh: Mesh, unit: Unit | None) -> Iterator[Finding]:
     yield Finding("mesh unit", "warning", text, remedy, "likely" if others else "possible", fault="mesh unit")
 
 
-def _origin(mesh: Mesh) -> Iterator[Finding]:
-    corners = mesh.box_corners_m
-    distance = float(np.linalg.norm((corners[0] + corners[-1]) / 2))
-    if distance > _FARTHEST_CENTRE * mesh.diameter_m:
-        text = f"its middle lies {distance * 1000:.4g} mm from its origin, {distance / mesh.diameter_m:.1f} diameters"
-        remedy = "Move the origin into the object: poses are of the origin, and small turns would move it far"
-        yield Finding("mesh origin", "warning", text, remedy, fault="off-centre")
-
-
 def _colours(mesh: Mesh) -> Iterator[Finding]:
     if mesh.texture is None and mesh.vertex_colors_srgb is None:
         text = "no colours: it will be rendered in one colour"
@@ -89,34 +75,15 @@ def _colours(mesh: Mesh) -> Iterator[Finding]:
     yield Finding("mesh colours", "good", f"it has {kind}")
 
 
-def _symmetries(found: Symmetries, diameter_m: float) -> Finding:
-    """Reports symmetries, which are no fault where they leave the origin in its place."""
+def _symmetries(found: Symmetries) -> Finding:
+    """Reports symmetries, which are no fault."""
     parts = [f"{len(found.discrete)} discrete"] * bool(found.discrete)
     for axis, _ in found.continuous:
         parts.append("any turn about (" + ", ".join(f"{value:.2f}" for value in axis) + ")")
     if not parts:
         return Finding("mesh symmetries", "good", "the shape has none")
     text = f"the shape has symmetries: {' and '.join(parts)}; poses that differ by them look the same without paint"
-    moved_m, middle_m = _moved_origin(found)
-    if moved_m > _MOVES_ORIGIN * diameter_m:
-        text += f", and one moves the origin by {moved_m * 1000:.4g} mm, so that positions differ, too"
-        place = ", ".join(f"{value * 1000:.4g}" for value in middle_m)
-        remedy = f"Move the origin to where all of them leave it, at ({place}) mm"
-        return Finding("mesh symmetries", "bad", text, remedy, fault=SYMMETRY_BESIDE_ORIGIN)
     return Finding("mesh symmetries", "good", text)
-
-
-def _moved_origin(found: Symmetries) -> tuple[float, np.ndarray]:
-    """How far a symmetry moves the origin at most, and the nearest point that all leave in its place; metres."""
-    rows = [np.eye(3) - matrix[:3, :3] for matrix in found.discrete]
-    right = [matrix[:3, 3] for matrix in found.discrete]
-    moved_m = [float(np.linalg.norm(matrix[:3, 3])) for matrix in found.discrete]
-    for axis, point in found.continuous:
-        across = np.eye(3) - np.outer(axis, axis)
-        rows, right = [*rows, across], [*right, across @ point]
-        moved_m.append(2 * float(np.linalg.norm(across @ point)))
-    middle_m, *_ = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=1e-3)
-    return max(moved_m), middle_m
 
 
 # Scanned meshes in daily use have a few of each (up to 0.1 %); one in a hundred is somebody's mistake.

@@ -48,11 +48,13 @@ class Graph(nn.Module):
 
     def forward(self, image: Tensor, slots: Tensor | None = None) -> tuple[Tensor, ...]:
         """The outputs, of the wanted slots alone if given, then the tensors of the last stages, if it has such."""
-        if not isinstance(self.network, TwoStageNetwork):
-            code = self.network(pixels_of(image)) if slots is None else self.network(pixels_of(image), slots)
-            return tuple(self._world.outputs.from_code(code).values())
-        code, stages = self.network.with_stages(pixels_of(image))
-        return (*self._world.outputs.from_code(code).values(), *(stages[name] for name in self._stage_tensors))
+        outputs = self._world.outputs
+        if isinstance(self.network, TwoStageNetwork):
+            code, stages = self.network.with_stages(pixels_of(image))
+            return (*outputs.from_code(code).values(), *(stages[name] for name in self._stage_tensors))
+        if slots is None:
+            return tuple(outputs.from_code(self.network(pixels_of(image))).values())
+        return tuple(outputs.of_slots(slots).from_code(self.network(pixels_of(image), slots)).values())
 
     def outputs(self, image: Tensor) -> dict[str, Tensor]:
         """Outputs by name, for uint8 images [batch, height, width, 3]."""

@@ -51,4 +51,5 @@ def _object_model(kind: ObjectKind) -> ObjectModel:
         box_corners_m=np.asarray(kind.box_corners_m, float).ravel(),
         symmetries=discrete + continuous,
         slots=kind.slots,
+        center_m=kind.center_m if any(kind.center_m) else (),
     )

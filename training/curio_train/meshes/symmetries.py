@@ -41,6 +41,19 @@ class Symmetries:
     continuous: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Each (unit axis [3], point on it in metres [3]); any turn about it counts."""
 
+    def point_left(self, near_m: np.ndarray) -> np.ndarray:
+        """The point [3] nearest to a given one that every symmetry leaves in its place; object frame, metres."""
+        rows, moved_m = [np.zeros((1, 3))], [np.zeros(1)]
+        for matrix in self.discrete:
+            rows.append(np.eye(3) - matrix[:3, :3])
+            moved_m.append(matrix[:3, 3] - rows[-1] @ near_m)
+        for axis, point in self.continuous:
+            rows.append(np.eye(3) - np.outer(axis, axis))
+            moved_m.append(rows[-1] @ (point - near_m))
+        away_m, *_ = np.linalg.lstsq(np.concatenate(rows), np.concatenate(moved_m), rcond=1e-3)
+        result: np.ndarray = near_m + away_m
+        return result
+
     def as_bop(self) -> dict[str, list[object]]:
         """Fields ``symmetries_discrete`` and ``symmetries_continuous`` of BOP, in mm; none that would be empty."""
         fields: dict[str, list[object]] = {}

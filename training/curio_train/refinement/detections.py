@@ -13,6 +13,7 @@ from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import CanonicalCamera, PinholeCrop, PinholeFrame
 from curio_serve.models.detector import transformed
+from curio_serve.models.object_frames import center_of, middle_from_origin, origin_from_middle
 
 from curio_train.geometry import rotation_6d_from_matrix
 from curio_train.meshes.inset import inset
@@ -52,11 +53,13 @@ class DetectionRefiner:
         camera = Camera(spec.camera.width, spec.camera.height, matrix)
         from_templates = uses_templates(_recipe(spec), len(spec.objects))
         excess_m = SCAN_EXCESS_M if from_templates and spec.world == "linemod" else 0.0
-        self._corners, self._refiners = {}, {}
+        self._corners, self._centers_m, self._refiners = {}, {}, {}
         for kind in spec.objects:
             label, mesh = meshes[kind.name]
             refuse_other_mesh(mesh, kind, label)
             self._corners[kind.name] = np.reshape(kind.box_corners_m, (-1, 3)).tolist()
+            self._centers_m[kind.name] = center_of(kind)
+            mesh = mesh.moved(-center_of(kind))
             self._refiners[kind.name] = RenderAndCompare(
                 inset(mesh, excess_m) if excess_m else mesh, camera, kind.diameter_m, from_templates=from_templates
             )
@@ -84,14 +87,16 @@ class DetectionRefiner:
     ) -> None:
         """Those of one object."""
         image = torch.from_numpy(np.ascontiguousarray(crop.image)).permute(2, 0, 1)[None]
-        code = _code(detections, light, crop.canonical_from_cam)
+        center_m = self._centers_m[detections[0].object]
+        code = _code(detections, light, crop.canonical_from_cam, center_m)
         with self._lock:
             refined, accepted, *_ = refiner.refine(image.expand(len(detections), -1, -1, -1), code)
             self.num_detections += len(detections)
             self.num_refined += int(accepted.sum())
         for detection, pose, is_better in zip(detections, poses(refined), accepted.tolist(), strict=True):
             if is_better:
-                self._write(detection, crop, pose.rotation, pose.translation_m)
+                origin_m = origin_from_middle(pose.translation_m, pose.rotation, center_m)
+                self._write(detection, crop, pose.rotation, origin_m)
 
     def _write(self, detection: Detection, crop: PinholeCrop, seen: np.ndarray, position_m: np.ndarray) -> None:
         rotation, translation = crop.rotate(seen.tolist()), crop.translation(position_m.tolist())
@@ -111,11 +116,14 @@ def _recipe(spec: ModelSpec) -> Mapping[str, Any]:
     return recipe if isinstance(recipe, dict) else {}
 
 
-def _code(detections: Sequence[Detection], light: Sequence[float], canonical_from_cam: np.ndarray) -> SceneCode:
-    """Scene codes of the detections in the canonical camera, one a row."""
+def _code(
+    detections: Sequence[Detection], light: Sequence[float], canonical_from_cam: np.ndarray, center_m: np.ndarray
+) -> SceneCode:
+    """Scene codes of the detections in the canonical camera, one a row, with positions of the object's middle."""
     rotation = torch.from_numpy(np.asarray(canonical_from_cam, np.float64))
-    rotations = torch.tensor([list(one.rotation) for one in detections], dtype=torch.float64).reshape(-1, 3, 3)
-    positions = torch.tensor([list(one.translation_m) for one in detections], dtype=torch.float64)
+    turned = np.array([one.rotation for one in detections]).reshape(-1, 3, 3)
+    origins_m = np.array([one.translation_m for one in detections])
+    rotations, positions = map(torch.from_numpy, (turned, middle_from_origin(origins_m, turned, center_m)))
     towards_light = rotation @ torch.tensor(list(light) or DEFAULT_LIGHT, dtype=torch.float64)
     code = {
         ROTATION_6D: rotation_6d_from_matrix(rotation @ rotations)[:, None].float(),

@@ -145,9 +145,9 @@ def _context(path: Path, world: World) -> SceneContext:
     if isinstance(world, MeshWorld):
         return SceneContext.of_world(world)
     if isinstance(world, SingleObjectWorld):
-        return SceneContext({"": world.object.mesh}, AMBIENT)
+        return SceneContext({"": world.object.mesh_of_file}, AMBIENT)
     if isinstance(world, SeveralObjectsWorld):
-        return SceneContext({one.kind.name: one.mesh for one in world.members}, AMBIENT)
+        return SceneContext({one.kind.name: one.mesh_of_file for one in world.members}, AMBIENT)
     raise UsageError(f"{path}: world {world.name} is flat; curio-view shows scenes in three dimensions")
 
 

@@ -46,6 +46,8 @@ class ObjectKind:
     """Discrete ones, each [4, 4], without the identity."""
     symmetry_axes: Sequence[tuple[np.ndarray, np.ndarray]] = ()
     """Continuous ones, each (unit axis [3], point on it in metres [3])."""
+    center_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The object's middle, object frame. Scene codes have its position; outputs have the origin's."""
     attribution: str = ""
     """Source and licence of the mesh if it is not ours; the model's card quotes it."""
 
@@ -124,13 +126,23 @@ class Camera:
 class CameraFrameOutputs:
     """Converts scene codes to the outputs of an exported model and back; here codes are in the camera frame already."""
 
-    def __init__(self, layout: Layout) -> None:
-        self._layout = layout
+    def __init__(self, layout: Layout, centers_m: Float[Tensor, "slots 3"] | None = None) -> None:
+        """Hold the layout.
+
+        Args:
+            layout: Of the scene code.
+            centers_m: The point of each slot's object whose position scene codes have, object frame; None: the origin.
+        """
+        self._layout, self._centers_m = layout, centers_m
 
     @property
     def fields(self) -> tuple[Field, ...]:
         """The outputs in the model's specification; it adds the 3x3 ``rotation`` itself."""
         return self._layout.fields
+
+    def of_slots(self, slots: Tensor) -> "CameraFrameOutputs":
+        """The conversion for these slots alone."""
+        return self if self._centers_m is None else CameraFrameOutputs(self._layout, self._centers_m[slots])
 
     def from_code(self, code: SceneCode) -> dict[str, Tensor]:
         """The outputs for scene codes, all in the camera frame.
@@ -143,6 +155,8 @@ class CameraFrameOutputs:
         if ROTATION_6D in code:
             outputs["rotation"] = matrix_from_rotation_6d(code[ROTATION_6D])
             outputs[ROTATION_6D] = rotation_6d_from_matrix(outputs["rotation"])
+        if self._centers_m is not None:
+            outputs[TRANSLATION] = outputs[TRANSLATION] - self._from_origin(outputs)
         if CONFIDENCE in code:
             outputs[CONFIDENCE] = code[CONFIDENCE].squeeze(-1)
         return outputs
@@ -152,7 +166,14 @@ class CameraFrameOutputs:
         code = {field.name: outputs[field.name] for field in self._layout.fields}
         if CONFIDENCE in code:
             code[CONFIDENCE] = code[CONFIDENCE].unsqueeze(-1)
+        if self._centers_m is not None:
+            code[TRANSLATION] = code[TRANSLATION] + self._from_origin(outputs)
         return code
+
+    def _from_origin(self, outputs: Mapping[str, Tensor]) -> Float[Tensor, "batch slots 3"]:
+        """From the objects' origins to their middles, camera frame."""
+        assert self._centers_m is not None
+        return (outputs["rotation"] @ self._centers_m.to(outputs[TRANSLATION])[..., None])[..., 0]
 
 
 class World(ABC):
@@ -181,7 +202,9 @@ class World(ABC):
     @property
     def outputs(self) -> CameraFrameOutputs:
         """Conversion between scene codes and the outputs of exported models."""
-        return CameraFrameOutputs(self.layout)
+        center_of = {slot: kind.center_m for kind in self.objects for slot in kind.slots}
+        centers_m = [center_of[slot] for slot in range(self.layout.num_slots)]
+        return CameraFrameOutputs(self.layout, torch.tensor(centers_m) if np.any(centers_m) else None)
 
     def network(self, config: NetworkConfig) -> StageNetwork:
         """A new network that predicts scene codes of this world's images.

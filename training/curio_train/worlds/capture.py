@@ -4,7 +4,8 @@ One part is detected in two stages, several by a locator and templates.
 
 Images are rendered without end, as for LineMOD. What a data set's authors publish there is given or found out here:
 
-* distances are given (0.3 to 1 m unless said otherwise), the part's origin is anywhere in the frame;
+* distances are given (0.3 to 1 m unless said otherwise), the part's middle is anywhere in the frame;
+* the network reads where the middle is, wherever a CAD file has its origin, and the graph answers where the origin is;
 * it is seen from all sides alike, or from above alone;
 * its symmetries are found from its shape; poses that differ by one count as equal, whatever is painted on it;
 * a mesh without colours has another base colour in each image, which the code has, too: near the part's colour in the
@@ -142,14 +143,23 @@ def build(options: CaptureOptions) -> World:
 
 
 def _object(options: CaptureOptions, camera: Intrinsics, file: Path, slot: int) -> Object:
-    mesh = load_mesh(file, options.mesh_unit, options.body)
+    of_file = load_mesh(file, options.mesh_unit, options.body)
+    found = find_symmetries(of_file)
+    center_m = found.point_left(of_file.box_corners_m.mean(axis=0)) if options.centered else np.zeros(3)
+    mesh = of_file.moved(-center_m)
     _refuse_collision(options, file, mesh)
     if options.paint is not None and not is_unpainted(mesh):
         raise UsageError(f"--paint {options.paint}: {file} has colours of its own; leave it out")
     paint = None if options.paint is None else srgb_of(options.paint)
-    found = find_symmetries(mesh)
     kind = ObjectKind(
-        file.stem, (slot,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous
+        file.stem,
+        (slot,),
+        of_file.diameter_m,
+        of_file.box_corners_m,
+        of_file.sha256,
+        found.discrete,
+        found.continuous,
+        center_m=(float(center_m[0]), float(center_m[1]), float(center_m[2])),
     )
     return Object(
         kind,
@@ -181,9 +191,8 @@ def _refuse_collision(options: CaptureOptions, file: Path, mesh: Mesh) -> None:
     if options.near_m > least:
         return
     raise UsageError(
-        f"--near-m {options.near_m:g}: {file} reaches {reach:.3g} m from its origin, so the camera would be "
-        f"inside it; expected more than {least:.3g} m. If the part is smaller than that, check --mesh-unit, and that "
-        "the origin lies within the part (curio-doctor --mesh)"
+        f"--near-m {options.near_m:g}: {file} reaches {reach:.3g} m from its middle, so the camera would be "
+        f"inside it; expected more than {least:.3g} m. If the part is smaller than that, check --mesh-unit"
     )
 
 

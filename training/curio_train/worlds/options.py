@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
-from tyro.conf import FlagCreatePairsOff
+from tyro.conf import FlagCreatePairsOff, Suppress
 
 from curio_train.config import MethodName, WorldOptions
 from curio_train.errors import UsageError
@@ -165,7 +165,7 @@ class CaptureOptions(WorldOptions):
     """Colour of a part whose mesh has none, sRGB, such as '#8a6f4c'. Unless given, it is estimated where the
     photographs differ from --background; if it cannot be, the part is learned in any colour."""
     near_m: float = 0.3
-    """Smallest distance of the part's origin along the optical axis, metres."""
+    """Smallest distance of the part's middle along the optical axis, metres."""
     far_m: float = 1.0
     """Largest such distance, metres."""
     upright: FlagCreatePairsOff[bool] = False
@@ -190,6 +190,9 @@ class CaptureOptions(WorldOptions):
     blur_px: int = 9
     """With --plane, side of the Gaussian filter over images and renderings before they are compared (paper: 9); 1
     compares them as they are."""
+    centered: Suppress[bool] = True
+    """Whether the network reads where the part's middle is; networks of older versions read where the file's origin
+    is."""
 
     def __post_init__(self) -> None:
         """Make paths absolute, and refuse what contradicts itself."""
@@ -210,6 +213,11 @@ class CaptureOptions(WorldOptions):
             self._check_without_plane()
         else:
             self._check_with_plane(self.plane)
+
+    @classmethod
+    def upgraded(cls, stored: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Options of a stored configuration; those that are older than ``centered`` are of the file's origin."""
+        return {"centered": False, **stored}
 
     @property
     def names_several(self) -> bool:

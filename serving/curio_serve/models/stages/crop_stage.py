@@ -77,7 +77,7 @@ class CropPose:
     """A pose read around an expected position, in the frame's camera."""
 
     translation_m: Array
-    """[3]."""
+    """Of the object's middle, [3]."""
     rotation: Array
     """cam_from_obj [3, 3]."""
     confidence: float
@@ -114,7 +114,7 @@ class CropStage:
         Args:
             pixels: uint8 RGB [height, width, 3].
             camera: That took them.
-            position_m: Where the object is expected, frame's camera, in front of it.
+            position_m: Where the object's middle is expected, frame's camera, in front of it.
             canonical_focal_px: Of the camera that the model was trained for: larger frames are averaged down to it.
 
         Raises:

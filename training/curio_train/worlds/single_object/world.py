@@ -52,7 +52,7 @@ class Object:
     kind: ObjectKind
     """Name, size and symmetries."""
     mesh: Mesh
-    """Its shape, metres."""
+    """Its shape, metres, with the kind's middle at the origin."""
     camera: Intrinsics
     """The camera that takes the frames."""
     near_m: float
@@ -78,6 +78,11 @@ class Object:
     def seen_from_any_side(self) -> bool:
         """Whether it may be seen from below and rolled in any way."""
         return self.rotations is not upper_hemisphere_rotations
+
+    @property
+    def mesh_of_file(self) -> Mesh:
+        """Its shape with the origin of its file, which the poses of exported models are of."""
+        return self.mesh.moved(np.array(self.kind.center_m))
 
     def without_scan_excess(self) -> "Object":
         """The object as thick as the real one."""
@@ -200,7 +205,7 @@ def pose_code(
 
 
 def position_field(object_: Object) -> Field:
-    """Positions of the object's origin: anywhere in the frame, between the smallest and the largest distance."""
+    """Positions of the object's middle: anywhere in the frame, between the smallest and the largest distance."""
     camera = object_.camera
     center, focal = camera.matrix[[0, 1], 2], camera.matrix[[0, 1], [0, 1]]
     first, last = ((np.array(corner) - center) / focal for corner in ((0, 0), (camera.width - 1, camera.height - 1)))

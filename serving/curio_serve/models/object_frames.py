@@ -1,0 +1,51 @@
+"""What a model says about its objects' own frames: their symmetries, and their middle.
+
+A network reads where an object's middle is, and its graph answers where the origin of the mesh file is. Whatever
+compares or averages poses, or looks for an object in a frame, does so with the middle: every symmetry leaves it in its
+place, and it lies within the object.
+"""
+
+import math
+
+import numpy as np
+from curio_proto.v1.model_spec_pb2 import ObjectModel
+
+from curio_serve.imaging.rotation import from_rotation_vector
+
+Array = np.ndarray
+_SYMMETRY_STEP_RAD = math.radians(5)
+
+
+def symmetry_rotations(kind: ObjectModel) -> Array:
+    """Rotations [n, 3, 3] of an object onto itself, about its middle; continuous symmetries in steps."""
+    discrete = [np.reshape(s.transform, (4, 4))[:3, :3] for s in kind.symmetries if len(s.transform) == 16]
+    found = np.stack([np.eye(3), *discrete])
+    for symmetry in kind.symmetries:
+        if len(symmetry.axis) == 3:
+            angles = np.arange(0, 2 * math.pi, _SYMMETRY_STEP_RAD)
+            rotations = from_rotation_vector(angles[:, None] * np.array(symmetry.axis))
+            found = (found[:, None] @ rotations[None]).reshape(-1, 3, 3)
+    return found
+
+
+def center_of(kind: ObjectModel) -> Array:
+    """An object's middle [3], object frame, metres: the origin, where its model names no other point."""
+    return np.array(kind.center_m) if kind.center_m else np.zeros(3)
+
+
+def middle_from_origin(origin_m: Array, rotation: Array, center_m: Array) -> Array:
+    """Where middles are, [..., 3].
+
+    Args:
+        origin_m: Where the origins are, [..., 3]: the translation of cam_from_obj.
+        rotation: Of cam_from_obj, [..., 3, 3].
+        center_m: Of :func:`center_of`.
+    """
+    result: Array = origin_m + rotation @ center_m
+    return result
+
+
+def origin_from_middle(middle_m: Array, rotation: Array, center_m: Array) -> Array:
+    """Where origins are, [..., 3]; the inverse of :func:`middle_from_origin`."""
+    result: Array = middle_m - rotation @ center_m
+    return result
