@@ -8,20 +8,24 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from curio_proto.v1.detector_pb2 import Detection
+from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.object_frames import center_of
 from curio_train.config import RunConfig
 from curio_train.export.graph import Graph
 from curio_train.export.spec import model_spec
-from curio_train.geometry import Pose
+from curio_train.geometry import Pose, matrix_from_rotation_6d
 from curio_train.learning.runs.configuration import from_json, to_json
 from curio_train.meshes.meshes import load_mesh
 from curio_train.meshes.symmetries import find_symmetries
-from curio_train.scene_code import CONFIDENCE, TRANSLATION
+from curio_train.refinement.detections import DetectionRefiner, NamedMesh
+from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.viewing.pages import _context
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 MOVED_MM = np.array([300.0, 40.0, -25.0])
@@ -159,3 +163,26 @@ def test_meshes_are_drawn_where_their_poses_are(worlds: tuple[TwoStageWorld, Two
     shown = _context(Path("run"), moved).mesh("moved")
     np.testing.assert_allclose(shown.vertices_m.mean(axis=0), moved.object.mesh_of_file.vertices_m.mean(axis=0))
     assert shown.vertices_m[:, 0].min() > 0.2
+
+
+def test_poses_are_refined_alike(worlds: tuple[TwoStageWorld, TwoStageWorld]) -> None:
+    """From a pose that is turned by 8 degrees about the middle."""
+    one, _ = worlds
+    code = one.sample(1, (3,))
+    code[TRANSLATION] = torch.tensor([[[0.01, 0.02, 0.4]]])
+    pixels = (one.render(code)[0].clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+    true = matrix_from_rotation_6d(code[ROTATION_6D][0, 0]).numpy().astype(float)
+    rotation = Rotation.from_rotvec(np.radians([0, 4.8, 6.4])).as_matrix() @ true
+    placed = []
+    for world in worlds:
+        spec, mesh = model_spec(world, "lump"), world.object.mesh_of_file
+        refiner = DetectionRefiner(spec, {world.object.kind.name: NamedMesh("mesh", mesh)})
+        detection = Detection(object=world.object.kind.name, rotation=rotation.ravel(), rotation_6d=[0.0] * 6)
+        detection.translation_m[:] = code[TRANSLATION][0, 0].numpy() - rotation @ world.object.kind.center_m
+        refiner(pixels, PinholeCamera(np.asarray(world.camera.matrix)), [detection], code[LIGHT][0].tolist())
+        assert refiner.num_refined == 1
+        found = np.reshape(detection.rotation, (3, 3))
+        placed.append(mesh.vertices_m @ found.T + detection.translation_m)
+    np.testing.assert_allclose(placed[1], placed[0], atol=1e-3)
+    turned = Rotation.from_matrix(found @ true.T).magnitude()
+    assert np.degrees(turned) < 4

@@ -12,13 +12,11 @@ import onnx
 import pytest
 import torch
 import tyro
-from curio_proto.v1.detector_pb2 import Detection
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, Field, ModelSpec, ObjectModel
 from curio_serve.batch import refinement
 from curio_serve.batch.arguments import DetectArguments
 from curio_serve.batch.detect_cli import run
 from curio_serve.errors import UsageError
-from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.spec import read_spec
 from curio_train.camera import Intrinsics
 from curio_train.config import RunConfig
@@ -28,7 +26,6 @@ from curio_train.learning.runs.configuration import to_json
 from curio_train.meshes.inset import inset
 from curio_train.meshes.meshes import Mesh, to_ply
 from curio_train.meshes.shapes import chair
-from curio_train.refinement.detections import DetectionRefiner, NamedMesh
 from curio_train.refinement.template_poses import uses_templates
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds.base import ObjectKind
@@ -171,29 +168,6 @@ def test_the_pose_comes_nearer_to_the_truth(place: Path, capsys: pytest.CaptureF
     camera = np.array(json.loads((place / "camera.json").read_text())["camera_matrix"])
     seen = (MESH.box_corners_m @ np.array(after["rotation"]).T + after["translation_m"]) @ camera.T
     np.testing.assert_allclose(after["box_px"], seen[:, :2] / seen[:, 2:], atol=0.01)
-
-
-def test_a_files_origin_far_from_the_middle_changes_nothing(place: Path) -> None:
-    """The same part with its origin 25 diameters away: its vertices come to the same places."""
-    center_m, spec = np.array([1.0, 2.0, -2.0]), read_spec((place / "models" / "chair.onnx").read_bytes(), "chair")
-    moved = ModelSpec()
-    moved.CopyFrom(spec)
-    moved.objects[0].center_m[:] = center_m
-    moved.objects[0].box_corners_m[:] = (MESH.box_corners_m + center_m).ravel()
-    found, matrix = detect_one(place), json.loads((place / "camera.json").read_text())["camera_matrix"]
-    pixels = cv2.cvtColor(cv2.imread(str(place / "frame.png")), cv2.COLOR_BGR2RGB)
-    placed = []
-    for of_file, mesh, shift in ((spec, MESH, np.zeros(3)), (moved, MESH.moved(center_m), center_m)):
-        rotation = np.array(found["rotation"])
-        detection = Detection(object="chair", rotation=rotation.ravel(), rotation_6d=rotation[:, :2].T.ravel())
-        detection.translation_m[:] = found["translation_m"] - rotation @ shift
-        refiner = DetectionRefiner(of_file, {"chair": NamedMesh("chair", mesh)})
-        refiner(pixels, PinholeCamera(np.array(matrix)), [detection], [])
-        assert refiner.num_refined == 1
-        turned = np.reshape(detection.rotation, (3, 3))
-        placed.append(mesh.vertices_m @ turned.T + detection.translation_m)
-        assert angle_deg(found, turned) > 3
-    np.testing.assert_allclose(placed[1], placed[0], atol=1e-3)
 
 
 def test_the_mesh_that_is_named_counts(place: Path) -> None:
