@@ -60,3 +60,35 @@ def test_what_the_items_raise_comes_after_the_answers_before_it() -> None:
     with pytest.raises(OSError, match="the list ends"):
         next(answers)
     assert found == [0, 2, 4, 6, 8]
+
+
+def test_answers_do_not_wait_for_a_list_that_is_slow_to_come() -> None:
+    more = threading.Semaphore(1)
+
+    def typed() -> Iterator[int]:
+        for number in range(4):
+            assert more.acquire(timeout=30)
+            yield number
+
+    answers = in_order(lambda number: 2 * number, typed(), 4)
+    for expected in range(4):
+        assert next(answers) == 2 * expected
+        more.release()
+    assert next(answers, None) is None
+
+
+def test_who_waits_for_items_is_left_alone() -> None:
+    """Where the work is ended, a list that never goes on is not waited for."""
+    begun, ever = threading.Event(), threading.Event()
+
+    def stuck() -> Iterator[int]:
+        yield 1
+        begun.set()
+        ever.wait(60)
+
+    answers = in_order(lambda number: number, stuck(), 2)
+    assert next(answers) == 1
+    assert begun.wait(30)
+    answers.close()
+    assert not ever.is_set()
+    ever.set()

@@ -247,3 +247,12 @@ def test_detectors_take_parts(models: Path) -> None:
     (result,) = Detector(part).detect(GREY, PinholeCamera(K))
     assert names(result) == ["plate"]
     assert result.detections[0].translation_m == pytest.approx(PLACES[3], abs=1e-6)
+
+
+def test_calls_for_the_same_objects_share_a_part(models: Path) -> None:
+    """So that their images are batched; of a model's very many parts some are kept."""
+    model = open_model(models / "choosing", Runtime(max_batch=4))
+    part = model.of(["nut"])
+    assert model.of(["nut"]) is part
+    assert model.of(["bolt", "nut"]) is not part
+    assert model.of(["bolt", "nut"]).of(["nut"]) is not part, "which is counted in the part"

@@ -151,3 +151,28 @@ def test_a_terminal_sees_how_far_it_is(models_dir: Path, frames: Path, tmp_path:
         assert process.wait() == 0
     assert f"{len(read(out))} images".encode() in shown
     assert b"0 without an answer" in shown
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, None])
+def test_a_list_on_standard_input_is_answered_as_it_comes(number: int | None, models_dir: Path, frames: Path) -> None:
+    """A name is answered while the list is open; stopped while it waits for the next, or at its end, it ends well."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        command(models_dir / "flat", "-"), stdin=pipe, stdout=pipe, stderr=pipe, text=True
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        for name in ("000000.png", "000001.png"):
+            process.stdin.write(f"{frames / name}\n")
+            process.stdin.flush()
+            assert json.loads(process.stdout.readline())["image"] == str(frames / name)
+        if number is None:
+            process.stdin.write(str(frames / "000002.png"))  # without an end of line
+            more, told = process.communicate(timeout=60)
+            assert json.loads(more)["image"] == str(frames / "000002.png")
+        else:
+            process.send_signal(number)
+            _, told = process.stdout.read(), process.stderr.read() if process.stderr else ""
+    assert process.returncode == (0 if number is None else 130)
+    assert "Traceback" not in told
+    assert "Fatal" not in told

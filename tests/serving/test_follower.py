@@ -5,13 +5,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 from curio_proto.v1 import detector_pb2 as messages
+from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve.errors import CameraMissing
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
+from curio_serve.models.model import from_bytes
 from curio_serve.models.model_folder import open_model
+from curio_serve.models.spec import SPEC_KEY
 from curio_serve.tracking.stream import FollowingStream
+from google.protobuf import json_format
 
 ROOT = Path(__file__).parents[2]
 
@@ -108,3 +113,45 @@ def test_fewer_objects_keep_those_that_are_seen() -> None:
     (left,) = results[21].detections
     assert not left.track.predicted
     assert left.translation_m[0] < 0
+
+
+def test_a_frame_that_one_of_two_models_cannot_take_moves_neither(tmp_path: Path) -> None:
+    """The first has a default camera, the second needs that of the frame."""
+    needs, camera, pixels = _photograph("03.jpg")
+    model = onnx.load(ROOT / "models" / "ape" / "2" / "model.onnx")
+    (entry,) = [entry for entry in model.metadata_props if entry.key == SPEC_KEY]
+    spec = json_format.Parse(entry.value, ModelSpec())
+    spec.name, spec.camera.is_default = "default", True
+    entry.value = json_format.MessageToJson(spec)
+    has_default = Detector(from_bytes(model.SerializeToString(), "default"))
+    stream, results = FollowingStream(), messages.DetectResponse().results
+
+    def follow(known: PinholeCamera | None, time_s: float) -> None:
+        track, both = messages.Tracking(time_s=time_s), [has_default, needs]
+        stream.follow(track, both, pixels, known, min_confidence=0.0, reduction=1, results=results)
+
+    with pytest.raises(CameraMissing):
+        follow(None, 5.0)
+    assert not results
+    follow(camera, 1.0)
+    follow(camera, 1.1)
+    assert [result.detections[0].track.age_s for result in results] == pytest.approx([0, 0, 0.1, 0.1])
+
+
+def test_a_clearly_surer_object_takes_the_place_of_one_that_is_seen() -> None:
+    """Two are followed, one of them blurred; a third that is not is found when the whole frame is looked at again."""
+    detector, camera, pixels = _photograph("03.jpg")
+    ape = pixels[223:363, 346:486].copy()
+    pixels[223:363, 126:266] = ape
+    pixels[223:363, 346:486] = cv2.GaussianBlur(ape, (0, 0), 6.5)
+    three = pixels.copy()
+    three[40:180, 236:376] = ape
+    stream, results = FollowingStream(), messages.DetectResponse().results
+    for frame in [pixels] * 25 + [three] * 70:
+        track = messages.Tracking(num_objects=2)
+        stream.follow(track, [detector], frame, camera, min_confidence=0.0, reduction=1, results=results)
+    before, after = ({one.track.track_id: one for one in results[number].detections} for number in (24, 94))
+    assert set(before) == {1, 2}
+    assert set(after) == {1, 3}
+    assert after[3].translation_m[1] < -0.1
+    assert after[3].confidence > before[2].confidence + 0.2

@@ -286,3 +286,39 @@ def test_the_bridge_is_python(tmp_path: Path) -> None:
     """ROS is not there to run it in."""
     source = Path(__file__).parents[2] / "examples" / "ros2" / "pose_bridge.py"
     py_compile.compile(str(source), cfile=str(tmp_path / "bridge.pyc"), doraise=True)
+
+
+def test_a_glob_of_recordings_has_their_cameras(models_dir: Path, spots: list[np.ndarray], tmp_path: Path) -> None:
+    for name, number in (("a", 0), ("b", 1)):
+        with recording(tmp_path / f"{name}.mcap") as write:
+            write("/camera/image_raw", IMAGE, number, raw(spots[number]))
+            write("/camera/camera_info", INFO, number, info())
+    out = tmp_path / "poses.jsonl"
+    assert detect(models_dir / "pinhole", tmp_path / "*.mcap", out=out, topic="/camera/image_raw") == 0
+    assert [line["image"].partition("#")[0] for line in lines(out)] == [str(tmp_path / f"{n}.mcap") for n in "ab"]
+    cv2.imwrite(str(tmp_path / "c.png"), spots[0])
+    with pytest.raises(UsageError, match="needs the intrinsics"):
+        detect(models_dir / "pinhole", tmp_path / "*", out=tmp_path / "more.jsonl")
+    (tmp_path / "c.mcap").write_bytes(b"torn")
+    with pytest.raises(UsageError, match=r"c\.mcap"):
+        detect(models_dir / "pinhole", tmp_path / "*.mcap", out=tmp_path / "more.jsonl")
+
+
+def test_the_topic_of_a_rigs_recordings(models_dir: Path, spots: list[np.ndarray], tmp_path: Path) -> None:
+    """Each camera's recording has two topics of images, of which --topic names one."""
+    for name in ("left", "right"):
+        with recording(tmp_path / f"{name}.mcap") as write:
+            write("/raw", IMAGE, 0, raw(spots[0]))
+            write("/small", IMAGE, 0, raw(spots[0][::2, ::2]))
+    camera = {"camera_matrix": np.reshape(K, (3, 3)).tolist(), "width": WIDTH, "height": HEIGHT}
+    rig = {"cameras": [camera | {"name": name, "cam_from_rig": np.eye(4).tolist()} for name in ("left", "right")]}
+    (tmp_path / "rig.json").write_text(json.dumps(rig))
+    sources, out = (tmp_path / "left.mcap", tmp_path / "right.mcap"), tmp_path / "poses.jsonl"
+    model, given = models_dir / "pinhole", {"rig": tmp_path / "rig.json", "out": out}
+    assert detect(model, *sources, **given, topic="/raw") == 0
+    (line,) = lines(out)
+    assert [view.partition("@")[0] for view in line["views"]] == [f"{source}#/raw" for source in sources]
+    with pytest.raises(UsageError, match="--topic names the one to read"):
+        detect(model, *sources, **given)
+    with pytest.raises(UsageError, match=r"no \.mcap among the images"):
+        detect(model, tmp_path, tmp_path, **given, topic="/raw")

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from curio_proto.v1.model_spec_pb2 import ModelSpec
 
     from curio_serve.batch.estimators import Estimator, Settings
-    from curio_serve.batch.images.recordings import Recording
     from curio_serve.batch.images.source_image import SourceImage
     from curio_serve.batch.results.formats import ImageLines, ResultFormat
     from curio_serve.batch.results.recorded_poses import Detection3DArrays
@@ -59,6 +58,7 @@ def run(arguments: DetectArguments) -> int:
     # Heavy packages only now: --help does without.
     import cv2
 
+    from curio_serve.batch.checks import check_camera, check_numbers, named_recordings
     from curio_serve.batch.cluster import over_cluster
     from curio_serve.batch.images.parallel import in_order
     from curio_serve.batch.images.read_ahead import read_ahead
@@ -73,7 +73,7 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.models.model_check import ChildCheck
 
     models, arguments = _models_first(arguments)
-    _check_numbers(arguments)
+    check_numbers(arguments)
     arguments = check_tracking(arguments, models)
     if arguments.video is None:
         check_arguments(arguments.images)
@@ -84,11 +84,11 @@ def run(arguments: DetectArguments) -> int:
     for model in models:
         if os.path.exists(model):
             ChildCheck()(Path(model))
-    estimators, recordings = _estimators(arguments, models, settings), _recordings(arguments)
+    estimators, recordings = _estimators(arguments, models, settings), named_recordings(arguments)
     refiner = refining(arguments, models[0], estimators)
     outlining(arguments, models, estimators)
     for estimator in estimators:
-        _check_camera(arguments, estimator, recordings)
+        check_camera(arguments, estimator, recordings)
     if arguments.video is not None:
         return _live(arguments, estimators)
     form = result_format(arguments, estimators)
@@ -146,26 +146,8 @@ def _live(arguments: DetectArguments, estimators: "Sequence[Estimator]") -> int:
     return 0 if show_live(estimator, arguments.video, arguments.host, arguments.port) else 1
 
 
-def _check_numbers(arguments: DetectArguments) -> None:
-    from curio_serve.models.repeated import MAX_READS
-
-    if arguments.video is not None and (arguments.images or arguments.out or arguments.overlays or arguments.ray):
-        raise UsageError("--video shows a video and writes nothing: leave out IMAGES, --out, --overlays and --ray")
-    if arguments.jobs < 1:
-        raise UsageError(f"--jobs {arguments.jobs}: expected at least 1")
-    if not 0 <= arguments.min_confidence <= 1:
-        raise UsageError(f"--min-confidence {arguments.min_confidence}: expected 0 to 1")
-    if arguments.max_detections is not None and arguments.max_detections < 1:
-        raise UsageError(f"--max-detections {arguments.max_detections}: expected at least 1")
-    if arguments.max_instances is not None and not 1 <= arguments.max_instances <= 16:
-        raise UsageError(f"--max-instances {arguments.max_instances}: expected 1 to 16")
-    if not 1 <= arguments.reads <= MAX_READS:
-        raise UsageError(f"--reads {arguments.reads}: expected 1 to {MAX_READS}")
-    if arguments.obj_id is not None and (arguments.format != "bop" or arguments.obj_id < 1):
-        raise UsageError(f"--obj-id {arguments.obj_id}: expected a number from 1, together with --format bop")
-
-
 def _settings(arguments: DetectArguments) -> "Settings":
+    from curio_serve.batch.checks import check_overlays
     from curio_serve.batch.estimators import Settings
     from curio_serve.batch.images.sources import common_folder
     from curio_serve.imaging.camera_files import read_camera_file
@@ -175,7 +157,7 @@ def _settings(arguments: DetectArguments) -> "Settings":
     except CameraError as exc:
         raise UsageError(f"--camera: {exc}") from exc
     if arguments.overlays is not None:
-        _check_overlays(arguments.overlays, arguments.images)
+        check_overlays(arguments.overlays, arguments.images)
     return Settings(
         cameras,
         arguments.min_confidence,
@@ -188,28 +170,6 @@ def _settings(arguments: DetectArguments) -> "Settings":
         arguments.reads,
         arguments.object_names,
     )
-
-
-def _check_overlays(folder: Path, images: tuple[str, ...]) -> None:
-    """Refuse drawings that would land on the images, or be taken for images by this run or the next."""
-    from curio_serve.batch.images.remote_files import is_url
-    from curio_serve.batch.images.sources import common_folder
-
-    target = Path(os.path.abspath(folder))
-    if target == common_folder(images):  # below which drawings have the images' own names
-        raise UsageError(
-            f"--overlays {folder} is the folder of all images, which drawings would replace; choose another"
-        )
-    for argument in images:
-        if is_url(argument):
-            continue
-        source = common_folder([argument])
-        if target == source or (not os.path.isfile(argument) and argument != "-" and target.is_relative_to(source)):
-            raise UsageError(f"--overlays {folder} lies within the images' own folder {source}; choose one outside it")
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as exc:
-        raise UsageError(f"--overlays {folder}: cannot be made: {exc.strerror}") from exc
 
 
 def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "Settings") -> "list[Estimator]":
@@ -295,36 +255,6 @@ def _client(arguments: DetectArguments, address: str) -> "PoseClient":
         raise UsageError(f"--token-file {arguments.token_file} cannot be read: {exc}") from exc
     # Patient: a busy or restarting server shall not end a run over many images.
     return PoseClient(address, timeout_s=60.0, max_attempts=50, tls=tls, token=token)
-
-
-def _recordings(arguments: DetectArguments) -> "list[Recording]":
-    """Open the recordings among the images, so that a bad one is refused before any work."""
-    from curio_serve.batch.images.source_image import Topics
-    from curio_serve.batch.images.sources import STANDARD_INPUT, is_recording
-
-    if not any(map(is_recording, arguments.images)):
-        if (arguments.topic or arguments.info_topic) and STANDARD_INPUT not in arguments.images:
-            raise UsageError("--topic and --info-topic are for recordings; found no .mcap among the images")
-        return []
-    from curio_serve.batch.images.recordings import Recording  # of an extra
-
-    topics = Topics(arguments.topic, arguments.info_topic)
-    return [Recording(path, topics) for path in arguments.images if is_recording(path) and os.path.exists(path)]
-
-
-def _check_camera(arguments: DetectArguments, estimator: "Estimator", recordings: "list[Recording]") -> None:
-    canonical = estimator.canonical
-    if arguments.max_instances is not None and canonical.matrix is None:
-        raise UsageError(f"--max-instances is for poses in space; the world of {estimator.name} is flat")
-    if arguments.camera is not None or canonical.matrix is None or canonical.is_default:
-        return
-    for recording in recordings:
-        recording.refuse_without_info()
-    if len(recordings) < len(arguments.images) or arguments.video is not None:
-        raise UsageError(
-            f"model {estimator.name} needs the intrinsics of the camera that took the images; give --camera FILE "
-            "(camera JSON, BOP's camera.json or scene_camera.json, or OpenCV YAML)"
-        )
 
 
 def _how_to_go_on(arguments: DetectArguments) -> str:

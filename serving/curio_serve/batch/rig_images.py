@@ -13,10 +13,11 @@ from pathlib import Path
 from curio_proto.v1.detector_pb2 import DetectResponse
 
 from curio_serve.batch.arguments import DetectArguments
+from curio_serve.batch.checks import named_recordings
 from curio_serve.batch.images.parallel import in_order
 from curio_serve.batch.images.remote_files import is_url
-from curio_serve.batch.images.source_image import SourceImage
-from curio_serve.batch.images.sources import PassedOver, images
+from curio_serve.batch.images.source_image import SourceImage, Topics
+from curio_serve.batch.images.sources import ANY_TOPICS, PassedOver, images
 from curio_serve.batch.progress import Progress
 from curio_serve.batch.results.formats import ImageLines, ImageResult, JsonLines
 from curio_serve.batch.results.result_file import ResultFile
@@ -131,13 +132,18 @@ def read_rig(arguments: DetectArguments, models: Sequence[str]) -> list[RigCamer
     return cameras
 
 
-def instants(arguments: Sequence[str], passed_over: PassedOver) -> Iterator[RigImage]:
+def instants(arguments: Sequence[str], passed_over: PassedOver, topics: Topics = ANY_TOPICS) -> Iterator[RigImage]:
     """The images of each instant. Those of each camera are taken in the order of their names.
+
+    Args:
+        arguments: One of each camera.
+        passed_over: Counts the other files.
+        topics: What to read of recordings.
 
     Raises:
         UsageError: One camera has more images than another.
     """
-    for number, found in enumerate(zip_longest(*(images([argument], passed_over) for argument in arguments))):
+    for number, found in enumerate(zip_longest(*(images([argument], passed_over, topics) for argument in arguments))):
         there = [image for image in found if image is not None]
         if len(there) < len(arguments):
             ended = arguments[next(index for index, image in enumerate(found) if image is None)]
@@ -158,6 +164,7 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
         CurioError: The work as a whole failed.
     """
     cameras = read_rig(arguments, models)
+    named_recordings(arguments)
     for model in models:
         ChildCheck()(Path(model))
     runtime = Runtime(read_providers(arguments.provider))
@@ -166,11 +173,11 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
     except ArgumentError as exc:
         raise UsageError(f"--objects: {exc}") from exc
     estimators = [RigEstimator(model, cameras, arguments.min_confidence, arguments.max_detections) for model in opened]
-    form, passed_over = JsonLines(), PassedOver()
+    form, passed_over, topics = JsonLines(), PassedOver(), Topics(arguments.topic, arguments.info_topic)
     names = [(model.name, model.version) for model in opened]
     path = None if arguments.out is None else Path(arguments.out)
     with ResultFile(path, form, names, overwrite=arguments.overwrite) as output:
-        remaining = output.unanswered(instants(arguments.images, passed_over))
+        remaining = output.unanswered(instants(arguments.images, passed_over, topics))
         results = in_order(partial(answer_instant, estimators, form), remaining, arguments.jobs)
         with closing(results), Progress(output.num_images, output.num_errors, is_shown=path is not None) as progress:
             for result in results:

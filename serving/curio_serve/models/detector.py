@@ -222,13 +222,22 @@ class Detector:
         canonical = self.model.camera
         if canonical.matrix is None:
             return FlatFrame(pixels, canonical, reduction)
-        camera = camera or canonical.for_frame(pixels.shape[1] * reduction, pixels.shape[0] * reduction)
+        camera = self.camera_of(camera, pixels.shape[1] * reduction, pixels.shape[0] * reduction)
+        return PinholeFrame(pixels, camera, canonical, reduction)
+
+    def camera_of(self, camera: PinholeCamera | None, width: int, height: int) -> PinholeCamera:
+        """The camera of a frame for a model of poses in space: the given one, or the model's default.
+
+        Raises:
+            CameraMissing: There is neither.
+        """
+        camera = camera or self.model.camera.for_frame(width, height)
         if camera is None:
             raise CameraMissing(
                 f"model {self.model.label} needs the camera matrix K of the frame and none was given; "
                 "set `camera` in the request, or --camera FILE on the command line"
             )
-        return PinholeFrame(pixels, camera, canonical, reduction)
+        return camera
 
 
 def trained_depths_m(spec: ModelSpec) -> tuple[float, float]:

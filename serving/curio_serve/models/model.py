@@ -32,6 +32,7 @@ SLOTS = "slots"
 
 MAX_BYTES = 1 << 30
 _MAX_RELIABILITY_BYTES = 1 << 20
+_MOST_PARTS = 64  # of a model of many objects, which are kept
 Outputs = Mapping[str, np.ndarray]
 
 # Shape of each output after [batch, num_slots] or [batch], and whether it is one a slot.
@@ -95,6 +96,7 @@ class Model:
         self._session, self._max_batch = session, max_batch
         self._takes_slots = SLOTS in [given.name for given in session.get_overridable_initializers()]
         self._wanted: np.ndarray | None = None
+        self._parts: dict[tuple[int, ...], Model] = {}
         self._run_many = self._runner()
 
     @property
@@ -119,11 +121,16 @@ class Model:
         wanted = wanted_slots(self.spec, self.label, objects)
         if len(wanted) == len(self.slots):
             return self
+        known = self._parts.get(tuple(wanted))
+        if known is not None:
+            return known
         part = copy.copy(self)
         part.slots, part.spec = [self.slots[row] for row in wanted], part_of(self.spec, wanted)
         part._wanted = np.array(wanted) if self._wanted is None else self._wanted[wanted]
-        part._run_many = part._runner()
-        return part
+        part._parts, part._run_many = {}, part._runner()
+        if len(self._parts) >= _MOST_PARTS:
+            return part
+        return self._parts.setdefault(tuple(wanted), part)  # one for all calls, which are batched in it
 
     def _runner(self) -> "Batcher | Callable[[np.ndarray], Sequence[np.ndarray]]":
         return Batcher(self._run, self._max_batch) if self._max_batch > 1 else self._run

@@ -201,10 +201,10 @@ class Follower:
         kind = next(kind for kind in frame.detector.model.spec.objects if kind.name == measured.object)
         same = [track for track in self._tracks if track.kind.name == kind.name]
         if len(same) >= following.num_objects:
-            unseen = [track for track in same if not track.is_seen]
-            if not unseen:
+            replaced = min(same, key=lambda track: (track.is_seen, track.seen_s, track.measured.confidence))
+            if replaced.is_seen and measured.confidence <= replaced.measured.confidence + _SURER:
                 return
-            self._tracks.remove(min(unseen, key=lambda track: track.seen_s))
+            self._tracks.remove(replaced)
         self._last_number += 1
         self._tracks.append(Track.begin(self._last_number, kind, measured, frame.time_s))
 

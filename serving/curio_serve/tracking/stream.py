@@ -82,6 +82,8 @@ class FollowingStream:
             if detector.model.camera.matrix is None:
                 raise ArgumentError(f"model {detector.model.label} is of a 2D world; poses in space can be followed")
         size = pixels.shape[1] * reduction, pixels.shape[0] * reduction
+        for detector in detectors:
+            detector.camera_of(camera, *size)
         if not request.restart:
             self._check_same_camera(size, camera)
         if camera is not None:

@@ -1,9 +1,11 @@
 """Many images through one function: in parallel, answered in order, with a bounded number in flight."""
 
+import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import TypeVar
+from queue import SimpleQueue
+from typing import Generic, TypeVar
 
 from curio_serve.deferred import DeferredError
 
@@ -15,30 +17,75 @@ _IN_FLIGHT_A_JOB = 8
 
 
 def in_order(function: Callable[[Item], Answer], items: Iterable[Item], num_jobs: int) -> Generator[Answer, None, None]:
-    """The function's answers in the order of the items.
+    """The function's answers in the order of the items, each as soon as it and those before are there.
 
     Args:
         function: Called in other threads.
-        items: May be endless; never more than a few beyond the next answer are taken.
+        items: Taken in another thread, never more than a few beyond the next answer; may be endless, or slow to come.
         num_jobs: Threads.
 
     Raises:
         Exception: What the function or the iterable raised, where its turn comes.
     """
-    pool = ThreadPoolExecutor(num_jobs)
-    pending: deque[Future[Answer]] = deque()
     most = num_jobs * _IN_FLIGHT_A_JOB
-    failed = DeferredError()
+    feed = _Feed(function, items, num_jobs, most)
+    pending: deque[Future[Answer]] = deque()
     try:
-        for item in failed.each(items):
-            pending.append(pool.submit(function, item))
-            if len(pending) >= most:
-                # Half of them at a time: to wake for each answer costs the workers more than the answer's writing.
-                wait([pending[most // 2 - 1]])
-                for _ in range(most // 2):
-                    yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
-        failed.raise_it()
+        while feed.take_into(pending):
+            # Half of them at a time where there are many: to wake for each answer costs the workers more than the
+            # answer's writing.
+            count = most // 2 if len(pending) >= most // 2 else 1
+            wait([pending[count - 1]])
+            for _ in range(count):
+                yield pending.popleft().result()
+                feed.room.release()
+        feed.failed.raise_it()
     finally:
-        pool.shutdown(cancel_futures=True)
+        feed.end()
+
+
+class _Feed(Generic[Item, Answer]):
+    """A thread that takes items and begins their work, as long as there is room for more."""
+
+    def __init__(self, function: Callable[[Item], Answer], items: Iterable[Item], num_jobs: int, most: int) -> None:
+        """Begin at once.
+
+        Args:
+            function: The work.
+            items: What to do it on.
+            num_jobs: Threads that do it.
+            most: Largest number of items in work or waiting to be taken.
+        """
+        self.room, self.failed = threading.Semaphore(most), DeferredError()
+        self._begun: SimpleQueue[Future[Answer] | None] = SimpleQueue()
+        self._has_ended, self._is_done = False, False
+        self._pool = ThreadPoolExecutor(num_jobs)
+        # A daemon: who waits for a list on standard input that does not end must not keep the process from ending.
+        threading.Thread(target=self._run, args=(function, items), name="items", daemon=True).start()
+
+    def take_into(self, pending: "deque[Future[Answer]]") -> bool:
+        """Add what was begun meanwhile, in the items' order; wait where there is nothing. False: all items are done."""
+        while not self._is_done and (not pending or not self._begun.empty()):
+            begun = self._begun.get()
+            if begun is None:
+                self._is_done = True
+            else:
+                pending.append(begun)
+        return bool(pending)
+
+    def end(self) -> None:
+        """Take no further items, and wait for the work that runs."""
+        self._has_ended = True
+        self.room.release()
+        self._pool.shutdown(cancel_futures=True)
+
+    def _run(self, function: Callable[[Item], Answer], items: Iterable[Item]) -> None:
+        iterator = iter(self.failed.each(items))
+        while self.room.acquire() and not self._has_ended:
+            try:
+                self._begun.put(self._pool.submit(function, next(iterator)))
+            except StopIteration:
+                break
+            except RuntimeError:  # the pool was shut down meanwhile
+                return
+        self._begun.put(None)

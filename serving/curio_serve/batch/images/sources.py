@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
+from typing import BinaryIO
 
 import cv2
 
@@ -28,9 +29,11 @@ STANDARD_INPUT = "-"
 _NAMED = 20  # files passed over that are named; the others are counted
 _HEIC = (".heic", ".heif")
 _NAMES_A_PASS = 1 << 16
+_STDIN_BYTES = 1 << 16
 _BOP_SCENE_FILES = ("scene_camera.json", "scene_gt.json")
 _BOP_IMAGE_FOLDERS = ("rgb", "gray")
-_ANY_TOPICS = Topics()
+ANY_TOPICS = Topics()
+"""The only topic of images that a recording has."""
 
 
 def is_recording(path: str) -> bool:
@@ -95,7 +98,7 @@ def check_arguments(arguments: Sequence[str]) -> None:
 def images(
     arguments: Sequence[str],
     passed_over: PassedOver,
-    topics: Topics = _ANY_TOPICS,
+    topics: Topics = ANY_TOPICS,
 ) -> Iterator[SourceImage]:
     """Every image that the arguments name, in order; a folder that cannot be listed is one image with that error.
 
@@ -106,14 +109,33 @@ def images(
     """
     for argument in arguments:
         if argument == STANDARD_INPUT:
-            for line in sys.stdin.buffer:
-                if path := os.fsdecode(line.rstrip(b"\r\n")):
+            for line in _lines_as_they_come(sys.stdin.buffer):
+                if path := os.fsdecode(line.rstrip(b"\r")):
                     yield from _images_at(path, passed_over, topics)
-        elif is_url(argument) or os.path.exists(argument):
-            yield from _images_at(argument, passed_over, topics)
         else:
-            for path in sorted(glob.iglob(argument, recursive=True)):
+            for path in [argument] if is_url(argument) else matching_paths(argument):
                 yield from _images_at(path, passed_over, topics)
+
+
+def _lines_as_they_come(stream: BinaryIO) -> Iterator[bytes]:
+    """The lines of a stream without their ends.
+
+    They are read past its buffer: a thread that waits within one for more holds its lock, and Python cannot end.
+    """
+    unbuffered, rest = getattr(stream, "raw", stream), b""
+    while data := unbuffered.read(_STDIN_BYTES):
+        *lines, rest = (rest + data).split(b"\n")
+        yield from lines
+    yield rest
+
+
+def matching_paths(argument: str) -> list[str]:
+    """The files and folders that an argument names, itself or those that its wildcards match; none of a URL or a list.
+
+    Args:
+        argument: As on the command line.
+    """
+    return [argument] if os.path.exists(argument) else sorted(glob.iglob(argument, recursive=True))
 
 
 def common_folder(arguments: Sequence[str]) -> Path:

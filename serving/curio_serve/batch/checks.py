@@ -1,0 +1,98 @@
+"""Refuses calls of ``curio-detect`` that cannot be carried out, before any work."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from curio_serve.batch.arguments import DetectArguments
+from curio_serve.batch.estimators import Estimator
+from curio_serve.batch.images.recordings import Recording
+from curio_serve.batch.images.remote_files import is_url
+from curio_serve.batch.images.source_image import Topics
+from curio_serve.batch.images.sources import ANY_TOPICS, STANDARD_INPUT, common_folder, is_recording, matching_paths
+from curio_serve.errors import UsageError
+from curio_serve.models.repeated import MAX_READS
+
+
+def check_numbers(arguments: DetectArguments) -> None:
+    """Refuse flags that contradict each other, and numbers out of range.
+
+    Raises:
+        UsageError: Says which.
+    """
+    if arguments.video is not None and (arguments.images or arguments.out or arguments.overlays or arguments.ray):
+        raise UsageError("--video shows a video and writes nothing: leave out IMAGES, --out, --overlays and --ray")
+    if arguments.jobs < 1:
+        raise UsageError(f"--jobs {arguments.jobs}: expected at least 1")
+    if not 0 <= arguments.min_confidence <= 1:
+        raise UsageError(f"--min-confidence {arguments.min_confidence}: expected 0 to 1")
+    if arguments.max_detections is not None and arguments.max_detections < 1:
+        raise UsageError(f"--max-detections {arguments.max_detections}: expected at least 1")
+    if arguments.max_instances is not None and not 1 <= arguments.max_instances <= 16:
+        raise UsageError(f"--max-instances {arguments.max_instances}: expected 1 to 16")
+    if not 1 <= arguments.reads <= MAX_READS:
+        raise UsageError(f"--reads {arguments.reads}: expected 1 to {MAX_READS}")
+    if arguments.obj_id is not None and (arguments.format != "bop" or arguments.obj_id < 1):
+        raise UsageError(f"--obj-id {arguments.obj_id}: expected a number from 1, together with --format bop")
+
+
+def check_overlays(folder: Path, images: Sequence[str]) -> None:
+    """Refuse drawings that would land on the images, or be taken for images by this run or the next.
+
+    Raises:
+        UsageError: They would, or the folder cannot be made.
+    """
+    target = Path(os.path.abspath(folder))
+    if target == common_folder(images):  # below which drawings have the images' own names
+        raise UsageError(
+            f"--overlays {folder} is the folder of all images, which drawings would replace; choose another"
+        )
+    for argument in images:
+        if is_url(argument):
+            continue
+        source = common_folder([argument])
+        if target == source or (not os.path.isfile(argument) and argument != "-" and target.is_relative_to(source)):
+            raise UsageError(f"--overlays {folder} lies within the images' own folder {source}; choose one outside it")
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise UsageError(f"--overlays {folder}: cannot be made: {exc.strerror}") from exc
+
+
+def named_recordings(arguments: DetectArguments) -> list[Recording]:
+    """Open the recordings that a call names, so that a bad one is refused before any work.
+
+    Raises:
+        UsageError: One cannot be used, or the call chooses topics and names none.
+    """
+    topics = Topics(arguments.topic, arguments.info_topic)
+    found = [path for argument in arguments.images for path in matching_paths(argument) if is_recording(path)]
+    if not found and topics != ANY_TOPICS and STANDARD_INPUT not in arguments.images:
+        raise UsageError("--topic and --info-topic are for recordings; found no .mcap among the images")
+    return [Recording(path, topics) for path in found]
+
+
+def check_camera(arguments: DetectArguments, estimator: Estimator, recordings: Sequence[Recording]) -> None:
+    """Refuse images of an unknown camera where the model needs it; recordings have it in them.
+
+    Raises:
+        UsageError: The camera is missing, or the call has an option for poses in space and the model's world is flat.
+    """
+    canonical = estimator.canonical
+    if arguments.max_instances is not None and canonical.matrix is None:
+        raise UsageError(f"--max-instances is for poses in space; the world of {estimator.name} is flat")
+    if arguments.camera is not None or canonical.matrix is None or canonical.is_default:
+        return
+    for recording in recordings:
+        recording.refuse_without_info()
+    if arguments.video is not None or not all(map(_names_recordings, arguments.images)):
+        raise UsageError(
+            f"model {estimator.name} needs the intrinsics of the camera that took the images; give --camera FILE "
+            "(camera JSON, BOP's camera.json or scene_camera.json, or OpenCV YAML)"
+        )
+
+
+def _names_recordings(argument: str) -> bool:
+    """Whether an argument names recordings alone."""
+    paths = matching_paths(argument)
+    return bool(paths) and all(map(is_recording, paths))
