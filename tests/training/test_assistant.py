@@ -128,3 +128,14 @@ def test_the_page_shows_the_newest_frame() -> None:
 def test_a_taken_port_is_named() -> None:
     with Page(0) as page, pytest.raises(UsageError, match="--port"):
         Page(int(page.address.rstrip("/").rpartition(":")[2]))
+
+
+def test_other_files_in_the_folder_are_no_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("taken by the window")
+    source = video(tmp_path / "walk.avi", [clutter(1), clutter(2), clutter(3)])
+    status, out, err = call(capsys, "--video", source, "--out", folder, "--count", 2)
+    assert status == 0, err
+    assert "2 photographs, enough" in out
+    assert (folder / "notes.txt").read_text() == "taken by the window"

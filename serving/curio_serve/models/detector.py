@@ -20,6 +20,7 @@ from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
 from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Rows, Values
 from curio_serve.models.model import Model, Outputs, Slot
+from curio_serve.models.object_frames import transformed
 from curio_serve.models.reliability import add_interval, calibrated, region_status, status_of
 from curio_serve.models.repeated import RepeatedReader
 from curio_serve.models.stages.crop_stage import CropPose
@@ -337,20 +338,3 @@ def _judge(result: RegionResult, reliability: Reliability) -> None:
         detection.status = status_of(reliability, detection.object, detection.confidence)
         add_interval(detection, reliability)
     result.status = region_status(result.detections)
-
-
-def transformed(
-    points: Sequence[Sequence[float]], rotation: Sequence[float], translation: Sequence[float]
-) -> Sequence[Sequence[float]]:
-    """An object's points in the frame's camera, metres.
-
-    Args:
-        points: Object frame, metres.
-        rotation: Of cam_from_obj, 9 values row after row.
-        translation: Of cam_from_obj, metres.
-    """
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation
-    x, y, z = translation
-    return [
-        (xx * a + xy * b + xz * c + x, yx * a + yy * b + yz * c + y, zx * a + zy * b + zz * c + z) for a, b, c in points
-    ]

@@ -6,6 +6,7 @@ place, and it lies within the object.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectModel
@@ -49,3 +50,20 @@ def origin_from_middle(middle_m: Array, rotation: Array, center_m: Array) -> Arr
     """Where origins are, [..., 3]; the inverse of :func:`middle_from_origin`."""
     result: Array = middle_m - rotation @ center_m
     return result
+
+
+def transformed(
+    points: Sequence[Sequence[float]], rotation: Sequence[float], translation: Sequence[float]
+) -> Sequence[Sequence[float]]:
+    """An object's points in the frame's camera, metres.
+
+    Args:
+        points: Object frame, metres.
+        rotation: Of cam_from_obj, 9 values row after row.
+        translation: Of cam_from_obj, metres.
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation
+    x, y, z = translation
+    return [
+        (xx * a + xy * b + xz * c + x, yx * a + yy * b + yz * c + y, zx * a + zy * b + zz * c + z) for a, b, c in points
+    ]

@@ -16,12 +16,13 @@ from curio_serve.consensus.poses import Consensus, Predictions, consensus, posit
 from curio_serve.errors import ArgumentError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
-from curio_serve.models.detector import Detector, transformed
+from curio_serve.models.detector import Detector
 from curio_serve.models.object_frames import (
     center_of,
     middle_from_origin,
     origin_from_middle,
     symmetry_rotations,
+    transformed,
 )
 from curio_serve.models.reliability import region_status, status_of
 

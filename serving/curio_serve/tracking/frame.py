@@ -10,9 +10,9 @@ from curio_proto.v1.detector_pb2 import Track as TrackMessage
 
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
-from curio_serve.models.detector import Detector, transformed
+from curio_serve.models.detector import Detector
 from curio_serve.models.instances import cover, enlarged
-from curio_serve.models.object_frames import center_of, middle_from_origin, origin_from_middle
+from curio_serve.models.object_frames import center_of, middle_from_origin, origin_from_middle, transformed
 from curio_serve.models.reliability import status_of
 from curio_serve.models.stages.crop_stage import CropPose
 from curio_serve.tracking.tracks import Measurement, Track

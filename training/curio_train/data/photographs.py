@@ -156,6 +156,17 @@ def _read_shrunk(path: Path) -> np.ndarray:
     return cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
+def image_files(folder: Path) -> list[Path]:
+    """The images in a folder, by name; hidden files and sub-folders are passed over.
+
+    Raises:
+        OSError: It cannot be listed.
+    """
+    # macOS leaves a file ._IMG.jpg beside each IMG.jpg, which is no image.
+    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted(path for path in visible if path.suffix.lower() in SUFFIXES)
+
+
 class Photographs:
     """The images of a folder (not of its subfolders), in the order of their names; hidden files are passed over.
 
@@ -169,9 +180,7 @@ class Photographs:
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
             raise DataError(f"{folder}: there is no such folder; expected one with photographs")
-        # macOS leaves a file ._IMG.jpg beside each IMG.jpg, which is no image.
-        visible = (path for path in folder.iterdir() if not path.name.startswith("."))
-        self.paths = sorted(path for path in visible if path.suffix.lower() in SUFFIXES)
+        self.paths = image_files(folder)
         if not self.paths:
             raise DataError(f"{folder}: found no images, expected files ending in {' '.join(SUFFIXES)}")
         # Decoding costs more than rendering the object in front: a few hundred photographs stay in memory, shrunk.

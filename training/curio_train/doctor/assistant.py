@@ -9,7 +9,7 @@ import torch
 
 from curio_train.capture.calibration import Board
 from curio_train.data.background_difference import compare
-from curio_train.data.photographs import Photographs, read_photograph
+from curio_train.data.photographs import image_files, read_photograph
 from curio_train.doctor.picture_content import BLURRED, MOSTLY_LOST, sharpness_and_exposure, thumbnail
 from curio_train.errors import DataError
 
@@ -55,7 +55,7 @@ class Assistant:
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            there = Photographs(folder).paths if any(folder.iterdir()) else []
+            there = image_files(folder)
         except OSError as exc:
             raise DataError(f"--out {folder}: cannot be made or read: {exc.strerror}") from exc
         self._folder, self._board, self._background = folder, board, background

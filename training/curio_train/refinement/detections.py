@@ -12,8 +12,7 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import CanonicalCamera, PinholeCrop, PinholeFrame
-from curio_serve.models.detector import transformed
-from curio_serve.models.object_frames import center_of, middle_from_origin, origin_from_middle
+from curio_serve.models.object_frames import center_of, middle_from_origin, origin_from_middle, transformed
 
 from curio_train.geometry import rotation_6d_from_matrix
 from curio_train.meshes.inset import inset
