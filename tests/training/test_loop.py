@@ -10,8 +10,9 @@ import pytest
 import torch
 from curio_train.config import METHODS, PRESETS, ConvStack, MethodName, NetworkConfig, Recipe, RunConfig
 from curio_train.errors import DataError, TrainingError, UsageError
-from curio_train.learning.loop import Outcome, learning_rate_factor
+from curio_train.learning.loop import Outcome, learning_rate_factor, train
 from curio_train.learning.parallel import Ranks
+from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.session import learn
 from curio_train.learning.trainer import Trainer
@@ -184,6 +185,31 @@ def test_a_run_ends_when_the_image_loss_is_low_enough(tmp_path: Path, cache: Pat
     config = configuration(stop_below=1e9)
     outcome, course = learn(config, tmp_path / "run", interruption, resume=False, cache=cache)
     assert (outcome, course.step) == (Outcome.CONVERGED, 1)
+
+
+def test_a_network_is_finished_once_for_each_budget(tmp_path: Path, interruption: Interruption) -> None:
+    """Gone on with without a larger budget, it stays as it is: it has learned of its photographs already."""
+    first, finished = trainer(configuration(images=16)), list[int]()
+    run, others = RunFolder(tmp_path, first.config), (interruption, None, 60.0)
+
+    def go_on(learner: Trainer) -> None:
+        train(learner, run, *others, finish=lambda: finished.append(learner.state.progress.step))
+
+    go_on(first)
+    again = trainer(first.config)
+    again.state.progress = first.state.progress
+    go_on(again)
+    assert finished == [2]
+    longer = trainer(configuration(images=32))
+    longer.state.progress = first.state.progress
+    go_on(longer)
+    assert finished == [2, 4]
+    assert longer.state.progress.finished_step == 4
+    interruption.signum = 15
+    stopped = trainer(configuration(images=800))
+    go_on(stopped)
+    assert finished == [2, 4]
+    assert stopped.state.progress.finished_step is None
 
 
 def test_a_signal_ends_a_run_after_a_whole_step(tmp_path: Path, cache: Path, interruption: Interruption) -> None:

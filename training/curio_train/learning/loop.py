@@ -36,7 +36,7 @@ def train(
         interruption: How signals arrive.
         reporter: Only the process that has one writes: under torchrun all have the same state.
         checkpoint_minutes: Minutes of training between checkpoints.
-        finish: Called before the last checkpoint of a run that was not interrupted.
+        finish: Called before the last checkpoint of a run that was not interrupted, unless that was done already.
 
     Raises:
         TrainingError: The optimisation broke down; the last checkpoint is the one to go back to.
@@ -52,8 +52,9 @@ def train(
             outcome = _outcome(config, progress.image_loss, spent, bool(signalled))
             if outcome or seconds - saved_at >= 60 * checkpoint_minutes:
                 trainer.synthetic.wait_idle()
-                if outcome and outcome is not Outcome.INTERRUPTED:
+                if outcome and outcome is not Outcome.INTERRUPTED and progress.finished_step != progress.step:
                     finish()
+                    progress.finished_step = progress.step
                 if reporter:
                     run.save(trainer.state)
                     reporter.pictures(trainer.pairs())

@@ -40,6 +40,14 @@ def _draw(trainer: Trainer, cache: Path) -> None:
     trainer.state.progress.seconds += time.monotonic() - begin
 
 
+def _forget_photographs(trainer: Trainer, cache: Path) -> None:
+    """Draw the templates of a finished run that is gone on with: they look as photographs do, and would learn twice."""
+    progress = trainer.state.progress
+    spent = trainer.config.progress(progress.images, progress.seconds)
+    if progress.finished_step is not None and spent < 1 and isinstance(trainer.state.pose.network, ObjectsNetwork):
+        _draw(trainer, cache)
+
+
 def _training_images(config: RunConfig, world: World, cache: Path) -> Callable[[Path], Found]:
     """What gives the training images of a world's stages, once there is a run folder."""
     if config.terms.hypotheses:
@@ -96,6 +104,7 @@ def learn(
             choose_threads(trainer.warm_up, reserved=int(not config.terms.reads_images))
         if resume and run.checkpoints():
             run.restore(trainer.state)
+            _forget_photographs(trainer, cache)
         else:
             if config.init is not None:
                 begin_with(trainer.state, config.init)

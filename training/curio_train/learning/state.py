@@ -93,6 +93,9 @@ class TrainingProgress:
     seconds_before: float = 0.0
     """Time spent before this run's first step: on training the weights that it began with, and on searching for the
     scenes of its training images (``--method hypotheses``)."""
+    finished_step: int | None = None
+    """Step after which the network was finished: its templates learned of photographs, its confidence was calibrated.
+    None: it was not yet."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that no run can reach.
