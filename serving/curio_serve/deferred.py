@@ -1,24 +1,26 @@
 """Errors of an iterable that wait for their turn: what was taken of it before comes first."""
 
+from asyncio import CancelledError
 from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
 from types import TracebackType
 from typing import Self, TypeVar
 
 Item = TypeVar("Item")
+_ENDS_ALL = (GeneratorExit, KeyboardInterrupt, SystemExit, CancelledError)  # which are no errors of an iterable
 
 
 class DeferredError:
     """What an iterable raises ends it, and is raised once its items are done with."""
 
     def __init__(self) -> None:
-        self._error: Exception | None = None
+        self._error: BaseException | None = None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> bool:
         """Keep an error for :meth:`raise_it`."""
-        if not isinstance(error, Exception):
+        if isinstance(error, _ENDS_ALL):
             return False
         self._error = error
         return True
@@ -38,7 +40,7 @@ class DeferredError:
         """Raise what ended the items, if anything did.
 
         Raises:
-            Exception: What the iterable raised.
+            BaseException: What the iterable raised; not all that native code raises is an Exception.
         """
         if self._error is not None:
             raise self._error

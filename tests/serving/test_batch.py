@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from curio_serve.batch.images.parallel import in_order
@@ -92,3 +93,29 @@ def test_who_waits_for_items_is_left_alone() -> None:
     answers.close()
     assert not ever.is_set()
     ever.set()
+
+
+class NativeError(BaseException):
+    """As extensions raise it whose code panics."""
+
+
+def test_nothing_that_ends_the_items_is_lost() -> None:
+    def panicking() -> Iterator[int]:
+        yield 1
+        raise NativeError
+
+    answers = in_order(lambda number: number, panicking(), 2)
+    assert next(answers) == 1
+    with pytest.raises(NativeError):
+        next(answers)
+
+
+def test_work_that_cannot_begin_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a container allows no more threads."""
+
+    def refuse(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", refuse)
+    with pytest.raises(RuntimeError, match="new thread"):
+        next(in_order(lambda number: number, [1, 2], 2))

@@ -87,15 +87,22 @@ def _assert_alike(one: messages.Detection, moved: messages.Detection) -> None:
     assert np.linalg.norm(np.subtract(moved.translation_m, one.translation_m)) > 0.2
 
 
-@pytest.mark.parametrize("num_reads", [1, 3])
+@pytest.mark.parametrize("num_reads", [1, 9])
 def test_a_whole_frame_is_read_alike(
     models: tuple[Model, Model], photograph: tuple[PinholeCamera, np.ndarray], num_reads: int
 ) -> None:
     camera, pixels = photograph
-    (one,), (moved,) = (
-        Detector(model, num_reads).detect(pixels, camera, max_instances=2)[0].detections[:1] for model in models
-    )
-    _assert_alike(one, moved)
+    found = []
+    for model in models:
+        reliability = ModelSpec().reliability
+        reliability.level, bounds = 0.9, reliability.objects.add(object="ape", min_confidence=0.1).bounds
+        bounds.add(min_confidence=0.1, lateral_m=0.01, depth_fraction=0.05, rotation_deg=10)
+        model.spec.reliability.CopyFrom(reliability)
+        results = Detector(model, num_reads).detect(pixels, camera, max_instances=2)
+        model.spec.ClearField("reliability")
+        found.append(results[0].detections[0])
+    _assert_alike(*found)
+    assert found[1].interval.depth_m == pytest.approx(found[0].interval.depth_m, rel=1e-3) != 0
 
 
 def test_an_object_is_followed_alike(models: tuple[Model, Model], photograph: tuple[PinholeCamera, np.ndarray]) -> None:

@@ -9,7 +9,14 @@ from curio_serve.batch.estimators import Estimator
 from curio_serve.batch.images.recordings import Recording
 from curio_serve.batch.images.remote_files import is_url
 from curio_serve.batch.images.source_image import Topics
-from curio_serve.batch.images.sources import ANY_TOPICS, STANDARD_INPUT, common_folder, is_recording, matching_paths
+from curio_serve.batch.images.sources import (
+    ANY_TOPICS,
+    STANDARD_INPUT,
+    common_folder,
+    is_recording,
+    matching_paths,
+    names_recordings,
+)
 from curio_serve.errors import UsageError
 from curio_serve.models.repeated import MAX_READS
 
@@ -85,14 +92,8 @@ def check_camera(arguments: DetectArguments, estimator: Estimator, recordings: S
         return
     for recording in recordings:
         recording.refuse_without_info()
-    if arguments.video is not None or not all(map(_names_recordings, arguments.images)):
+    if arguments.video is not None or not all(map(names_recordings, arguments.images)):
         raise UsageError(
             f"model {estimator.name} needs the intrinsics of the camera that took the images; give --camera FILE "
             "(camera JSON, BOP's camera.json or scene_camera.json, or OpenCV YAML)"
         )
-
-
-def _names_recordings(argument: str) -> bool:
-    """Whether an argument names recordings alone."""
-    paths = matching_paths(argument)
-    return bool(paths) and all(map(is_recording, paths))

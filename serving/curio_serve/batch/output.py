@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from curio_serve.batch.arguments import DetectArguments
 from curio_serve.batch.estimators import Estimator
 from curio_serve.batch.images.remote_files import is_url
-from curio_serve.batch.images.sources import is_recording
+from curio_serve.batch.images.sources import is_recording, matching_paths, names_recordings
 from curio_serve.batch.results.formats import Bop, Csv, JsonLines, ResultFormat, bop_object_ids
 from curio_serve.batch.results.result_file import ResultFile
 from curio_serve.batch.results.result_parts import ResultParts
@@ -30,7 +30,7 @@ def result_format(arguments: DetectArguments, estimators: Sequence[Estimator]) -
                 f"--out {arguments.out}: recordings are written to files alone; name one, or a folder of parts"
             )
         are_flat = any(not estimator.spec.camera.camera_matrix for estimator in estimators)
-        if arguments.format != "jsonl" or not all(map(is_recording, arguments.images)) or are_flat:
+        if arguments.format != "jsonl" or not all(map(names_recordings, arguments.images)) or are_flat:
             raise UsageError(
                 f"--out {arguments.out} writes vision_msgs/Detection3DArray: for poses in space, images of recordings "
                 "(.mcap) alone, and no --format"
@@ -76,5 +76,6 @@ def _refuse_images(arguments: DetectArguments) -> None:
     out = arguments.out
     if out is None or is_url(out) or not os.path.exists(out):
         return
-    if any(not is_url(name) and os.path.exists(name) and os.path.samefile(name, out) for name in arguments.images):
+    paths = (path for name in arguments.images if not is_url(name) for path in matching_paths(name))
+    if any(os.path.samefile(path, out) for path in paths):
         raise UsageError(f"--out {out} is one of the images; choose another file")

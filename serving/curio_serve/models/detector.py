@@ -12,7 +12,7 @@ from curio_proto.v1.detector_pb2 import (
     DetectResponse,
     RegionResult,
 )
-from curio_proto.v1.model_spec_pb2 import ModelSpec, Reliability
+from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_serve.errors import ArgumentError, CameraError, CameraMissing, ImageError
 from curio_serve.imaging.camera import PinholeCamera
@@ -121,7 +121,7 @@ class Detector:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
                 _fill(result, crop, next(predictions), limits, self.depths_m)
-                _judge(result, self.model.spec.reliability)
+                self._judge(result)
         return results
 
     def _predictions(
@@ -174,6 +174,16 @@ class Detector:
             return self._repeated(images, before_run)
         before_run()
         return self.model.run(images)
+
+    def _judge(self, result: RegionResult) -> None:
+        """Write into a result which of its detections are sure, and within which intervals."""
+        reliability, center_of = self.model.spec.reliability, {slot.object: slot.center for slot in self.model.slots}
+        for detection in result.detections:
+            detection.status = status_of(reliability, detection.object, detection.confidence)
+            center = [center_of[detection.object]]
+            (middle,) = transformed(center, detection.rotation or _UPRIGHT, detection.translation_m)
+            add_interval(detection, reliability, math.hypot(*middle))
+        result.status = region_status(result.detections)
 
     def _calibrated(self, values: Values) -> Values:
         if "confidence" not in values:
@@ -330,11 +340,3 @@ def _depth_m(values: Values, row: int, slot: Slot) -> float:
     towards = values["rotation"][row][2] if "rotation" in values else _UPRIGHT[6:]
     depth_m: float = values["translation_m"][row][2] + sum(map(float.__mul__, towards, slot.center))
     return depth_m
-
-
-def _judge(result: RegionResult, reliability: Reliability) -> None:
-    """Write into a result which of its detections are sure, and within which intervals."""
-    for detection in result.detections:
-        detection.status = status_of(reliability, detection.object, detection.confidence)
-        add_interval(detection, reliability)
-    result.status = region_status(result.detections)

@@ -2,7 +2,7 @@
 
 A network reads where an object's middle is, and its graph answers where the origin of the mesh file is. Whatever
 compares or averages poses, or looks for an object in a frame, does so with the middle: every symmetry leaves it in its
-place, and it lies within the object.
+place, and it lies within the object's box.
 """
 
 import math

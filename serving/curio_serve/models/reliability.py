@@ -101,14 +101,20 @@ def status_of(reliability: Reliability, object_: str, confidence: float) -> Dete
     return DETECTION_STATUS_SURE if confidence >= one.min_confidence else DETECTION_STATUS_UNSURE
 
 
-def add_interval(detection: Detection, reliability: Reliability) -> None:
-    """Write the interval of a pose of one image into its detection, if the model has one for it."""
+def add_interval(detection: Detection, reliability: Reliability, distance_m: float) -> None:
+    """Write the interval of a pose of one image into its detection, if the model has one for it.
+
+    Args:
+        detection: With its confidence.
+        reliability: Of the model.
+        distance_m: Of the object's middle.
+    """
     one = _of(reliability, detection.object)
     bounds = None if one is None else bounds_of(one, detection.confidence)
     if bounds is not None:
         interval = detection.interval
         interval.level, interval.lateral_m = reliability.level, bounds.lateral_m
-        interval.depth_m = bounds.depth_fraction * math.hypot(*detection.translation_m)
+        interval.depth_m = bounds.depth_fraction * distance_m
         interval.rotation_deg = bounds.rotation_deg
 
 

@@ -74,7 +74,7 @@ class RepeatedReader:
             before_run()
             seen = np.stack([camera.image(pixels, self._matrix) for pixels in images])
             reads.append({name: np.array(values, float) for name, values in self._run(seen).items()})
-            _bring_back(reads[-1], camera)
+            self._bring_back(reads[-1], camera)
         rows = [[{name: values[row] for name, values in read.items()} for read in reads] for row in range(len(images))]
         agreed = [self._agreed(of_image) for of_image in rows]
         return {name: np.stack([one[name] for one in agreed]).astype(np.float32) for name in agreed[0]}
@@ -103,11 +103,15 @@ class RepeatedReader:
             found["rotation_6d"] = np.concatenate([found["rotation"][..., 0], found["rotation"][..., 1]], axis=-1)
         return found
 
+    def _bring_back(self, read: dict[str, Array], camera: VirtualCamera) -> None:
+        """Put the poses and the light that a virtual camera sees into the real one's frame.
 
-def _bring_back(read: dict[str, Array], camera: VirtualCamera) -> None:
-    """Put the poses and the light that a virtual camera sees into the real one's frame."""
-    for row, positions in enumerate(read["translation_m"]):
-        for slot, position in enumerate(positions):
-            read["rotation"][row, slot], positions[slot] = camera.back(read["rotation"][row, slot], position)
-    if "light" in read:
-        read["light"] = read["light"] @ camera.virtual_from_cam
+        A camera that zooms sees an object at another distance: the network reads where its middle is.
+        """
+        for rotations, positions in zip(read["rotation"], read["translation_m"], strict=True):
+            for slot, center_m in enumerate(self._centers_m):
+                seen_m = middle_from_origin(positions[slot], rotations[slot], center_m)
+                rotations[slot], middle_m = camera.back(rotations[slot], seen_m)
+                positions[slot] = origin_from_middle(middle_m, rotations[slot], center_m)
+        if "light" in read:
+            read["light"] = read["light"] @ camera.virtual_from_cam

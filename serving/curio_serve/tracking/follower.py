@@ -139,7 +139,7 @@ class Follower:
         return light
 
     def _is_taken(self, track: Track, position_m: Array) -> bool:
-        """Whether another object that is seen is at this position."""
+        """Whether an object other than that of the track is seen at this position."""
         apart_m = _TAKEN * track.kind.diameter_m
         return any(
             other.is_seen
@@ -202,7 +202,8 @@ class Follower:
         same = [track for track in self._tracks if track.kind.name == kind.name]
         if len(same) >= following.num_objects:
             replaced = min(same, key=lambda track: (track.is_seen, track.seen_s, track.measured.confidence))
-            if replaced.is_seen and measured.confidence <= replaced.measured.confidence + _SURER:
+            is_surer = measured.confidence > replaced.measured.confidence + _SURER
+            if replaced.is_seen and (not is_surer or self._is_taken(replaced, measured.translation_m)):
                 return
             self._tracks.remove(replaced)
         self._last_number += 1

@@ -70,6 +70,15 @@ class SceneContext:
             raise DataError(f"no mesh for object {kind!r}, only for {', '.join(self.meshes)}; add --mesh {kind}=FILE")
         return found
 
+    def middle(self, item: Placed) -> np.ndarray:
+        """Where the middle of an object's box is, camera frame, metres [3]; its origin may be anywhere.
+
+        Raises:
+            DataError: As of :meth:`mesh`.
+        """
+        found: np.ndarray = item.pose.apply(self.mesh(item.kind).box_corners_m).mean(axis=0)
+        return found
+
 
 @dataclass(frozen=True)
 class RenderOptions:
@@ -155,8 +164,8 @@ def _fitted(pixels: np.ndarray, scene: Scene) -> np.ndarray:
 
 def _carried(scene: Scene, around: SceneContext, turn_deg: float) -> tuple[Scene, SceneContext]:
     """Everything as the camera sees it that was carried round the middle, still looking at it."""
-    positions = [item.pose.translation_m for item in scene.objects]
-    center = np.mean(positions, axis=0) if around.center_m is None and positions else around.center_m
+    middles = [around.middle(item) for item in scene.objects]
+    center = np.mean(middles, axis=0) if around.center_m is None and middles else around.center_m
     if turn_deg == 0 or center is None:
         return scene, around
     rotation = Rotation.from_rotvec(-np.radians(turn_deg) * np.array(around.up)).as_matrix()

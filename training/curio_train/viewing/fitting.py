@@ -36,16 +36,17 @@ def walk(page: Page, number: int) -> Iterator[Step]:
     item, mesh = page.scene.objects[number], page.context.mesh(page.scene.objects[number].kind)
     height, width = page.image.shape[:2]
     matrix = scale_matrix(page.scene.camera_matrix, (page.scene.width, page.scene.height), (width, height))
+    middle = Pose(np.eye(3), mesh.box_corners_m.mean(axis=0))  # around which crops are cut
     code = {
-        TRANSLATION: _tensor(item.pose.translation_m)[None],
+        TRANSLATION: _tensor((item.pose @ middle).translation_m)[None],
         ROTATION_6D: rotation_6d_from_matrix(_tensor(item.pose.rotation))[None],
         LIGHT: _tensor(page.light),
         COLOR: _tensor(item.color_srgb)[None],
     }
     image = torch.from_numpy(np.ascontiguousarray(page.image)).permute(2, 0, 1)[None]
-    refiner = RenderAndCompare(mesh, Camera(width, height, matrix), mesh.diameter_m)
+    refiner = RenderAndCompare(mesh.moved(-middle.translation_m), Camera(width, height, matrix), mesh.diameter_m)
     for found, residual in refiner.steps(image, code):
-        yield Step(poses(found)[0], float(residual))
+        yield Step(poses(found)[0] @ middle.inverse(), float(residual))
 
 
 def _tensor(values: Sequence[float] | np.ndarray) -> torch.Tensor:

@@ -42,7 +42,7 @@ class Space:
         for gizmo in self._gizmos:
             gizmo.remove()
         self._fov = 2 * math.atan(scene.height / 2 / float(scene.camera_matrix[1, 1]))
-        self._reach_m = max((float(item.pose.translation_m[2]) for item in scene.objects), default=1.0)
+        self._reach_m = max((float(page.context.middle(item)[2]) for item in scene.objects), default=1.0)
         api.add_camera_frustum(
             "/camera", self._fov, scene.width / scene.height, scale=_IMAGE_PLANE * self._reach_m, image=page.image
         )

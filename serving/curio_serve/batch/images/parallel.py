@@ -4,6 +4,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from queue import SimpleQueue
 from typing import Generic, TypeVar
 
@@ -17,7 +18,7 @@ _IN_FLIGHT_A_JOB = 8
 
 
 def in_order(function: Callable[[Item], Answer], items: Iterable[Item], num_jobs: int) -> Generator[Answer, None, None]:
-    """The function's answers in the order of the items, each as soon as it and those before are there.
+    """The function's answers in the order of the items; none waits for an item that has not come yet.
 
     Args:
         function: Called in other threads.
@@ -80,12 +81,10 @@ class _Feed(Generic[Item, Answer]):
         self._pool.shutdown(cancel_futures=True)
 
     def _run(self, function: Callable[[Item], Answer], items: Iterable[Item]) -> None:
-        iterator = iter(self.failed.each(items))
-        while self.room.acquire() and not self._has_ended:
-            try:
-                self._begun.put(self._pool.submit(function, next(iterator)))
-            except StopIteration:
-                break
-            except RuntimeError:  # the pool was shut down meanwhile
-                return
-        self._begun.put(None)
+        iterator = iter(items)
+        try:
+            with self.failed, suppress(StopIteration):
+                while self.room.acquire() and not self._has_ended:
+                    self._begun.put(self._pool.submit(function, next(iterator)))
+        finally:
+            self._begun.put(None)

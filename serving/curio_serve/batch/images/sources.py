@@ -138,6 +138,12 @@ def matching_paths(argument: str) -> list[str]:
     return [argument] if os.path.exists(argument) else sorted(glob.iglob(argument, recursive=True))
 
 
+def names_recordings(argument: str) -> bool:
+    """Whether an argument of the command line names recordings alone."""
+    paths = matching_paths(argument)
+    return bool(paths) and all(map(is_recording, paths))
+
+
 def common_folder(arguments: Sequence[str]) -> Path:
     """The deepest folder that holds everything the arguments name: below it, relative paths are distinct.
 
