@@ -18,14 +18,17 @@ from curio_train.evaluation.evaluate import draw, evaluate, score
 from curio_train.evaluation.real_frames import evaluate_real_frames, refuse_unscorable
 from curio_train.evaluation.repeated import reading_repeatedly
 from curio_train.evaluation.reporting.tables import print_evaluation
-from curio_train.evaluation.scores import pose_scores, rotation_errors_deg
+from curio_train.evaluation.scores import pose_scores, rotation_errors_deg, scene_errors
+from curio_train.evaluation.several_objects import several_objects_scores
 from curio_train.evaluation.subject import Subject
-from curio_train.geometry import Pose
-from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION
+from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.linemod import build
 from curio_train.worlds.options import LinemodOptions
-from curio_train.worlds.single_object.world import SingleObjectWorld
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.world import Object, SingleObjectWorld
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
@@ -93,6 +96,26 @@ def test_turns_that_look_alike_are_no_errors() -> None:
     assert rotation_errors_deg(estimates, truth, ModelInfo(DIAMETER_M)) == pytest.approx([90, 100, 90], abs=1e-3)
     assert rotation_errors_deg(estimates, truth, discrete) == pytest.approx([0, 10, 90], abs=1e-3)
     assert rotation_errors_deg(estimates, truth, around) == pytest.approx([0, 0, 0], abs=0.6)  # half a step
+
+
+def test_a_pose_that_looks_alike_has_no_scene_error(brick_world: TwoStageWorld) -> None:
+    """Half a turn of the brick, which is not told from none, and a quarter, which is."""
+    true = brick_world.sample(3, (1,))
+    turns = torch.from_numpy(np.stack([turned("z", angle) for angle in (180.0, 90.0, 0.0)])).float()
+    rotation = matrix_from_rotation_6d(true[ROTATION_6D][:, 0]) @ turns
+    predicted = {**true, ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None]}
+    errors = scene_errors(brick_world, predicted, true)
+    assert errors["rotation_deg"].tolist() == pytest.approx([0, 90, 0], abs=0.1)
+    assert errors["scene_error"].tolist() == pytest.approx([0, errors["scene_error"][1].item(), 0], abs=1e-3)
+    assert errors["scene_error"][1] > 0.1
+
+
+def test_renderings_that_show_nothing_are_too_few(brick: Object) -> None:
+    world = SeveralObjectsWorld("linemod", [brick])
+    code = world.sample(2, (1,))
+    code[CONFIDENCE][:] = 0
+    with pytest.raises(UsageError, match="--num-images 2: none of them shows an object"):
+        several_objects_scores(world, code, code)
 
 
 K = [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1]

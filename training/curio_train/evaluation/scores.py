@@ -8,12 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.data.bop import ModelInfo
-from curio_train.geometry import Pose, rotation_angle_deg
+from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
 from curio_train.metrics.assignment import each_parameter_error, scene_error
 from curio_train.metrics.images import dssim
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, recall, symmetry_poses
-from curio_train.scene_code import TRANSLATION, SceneCode, index, poses
+from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode, index, poses
 from curio_train.worlds.base import World, novel_view
+from curio_train.worlds.several_objects.world import SeveralObjectsWorld
+from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _MM = 1000.0
@@ -43,8 +45,10 @@ def scene_errors(world: World, predicted: SceneCode, true: SceneCode) -> dict[st
     """Each single error of scene codes, under a name with its unit.
 
     ``scene_error`` is Eq. 1 of the paper, the table's Para, and ``novel_view_dssim`` is its Img, one value an image.
-    The others are errors of single parameters under the same assignment, within a shape where slots carry one.
+    The others are errors of single parameters under the same assignment, within a shape where slots carry one. Of
+    symmetric objects in free space the true pose is the one nearest to the prediction of those that look alike.
     """
+    true = _nearest_alike(world, predicted, true)
     groups = [kind.slots for kind in world.objects]
     errors = {
         "scene_error": scene_error(world.layout, predicted, true, groups),
@@ -57,6 +61,21 @@ def scene_errors(world: World, predicted: SceneCode, true: SceneCode) -> dict[st
     else:
         errors["position_mm"] = position * _MM
     return errors | parameters
+
+
+def _nearest_alike(world: World, predicted: SceneCode, true: SceneCode) -> SceneCode:
+    """The true codes with each object's rotation replaced by the nearest to the predicted one that looks alike."""
+    if not isinstance(world, SingleObjectWorld | SeveralObjectsWorld):
+        return true
+    rotation = true[ROTATION_6D].clone()
+    for kind in world.objects:
+        (slot,) = kind.slots
+        alike = torch.from_numpy(np.stack([pose.rotation for pose in symmetry_poses(kind.info, SYMMETRY_STEP)]))
+        found, wanted = (matrix_from_rotation_6d(code[ROTATION_6D][:, slot].double()) for code in (predicted, true))
+        candidates = wanted[:, None] @ alike.to(wanted)
+        nearest = rotation_angle_deg(found[:, None], candidates).argmin(dim=1)
+        rotation[:, slot] = rotation_6d_from_matrix(candidates[torch.arange(len(nearest)), nearest]).to(rotation)
+    return {**true, ROTATION_6D: rotation}
 
 
 @torch.no_grad()
@@ -77,6 +96,7 @@ def accuracy(world: World, predicted: SceneCode, true: SceneCode) -> float:
         kind = world.objects[0]
         errors = add_errors(poses(predicted), poses(true), world.object.mesh.vertices_m, kind.info)
         return recall(errors, ADD_THRESHOLD)
+    true = _nearest_alike(world, predicted, true)
     found = each_parameter_error(world.layout, predicted, true, [kind.slots for kind in world.objects])
     right = found["position"] < ADD_THRESHOLD * min(kind.diameter_m for kind in world.objects)
     if "rotation_deg" in found:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from curio_train.errors import UsageError
 from curio_train.evaluation.scores import add_errors, pose_scores
 from curio_train.metrics.calibration import auroc, calibration_error
 from curio_train.metrics.poses import ADD_THRESHOLD
@@ -16,6 +17,9 @@ def several_objects_scores(world: SeveralObjectsWorld, predicted: SceneCode, tru
 
     ``confidence_ece`` takes a confidence as the probability that ADD(-S) is below a tenth of the diameter, and
     ``present_auroc`` as a sign that an object is shown.
+
+    Raises:
+        UsageError: No rendering shows any object.
     """
     each, confidences, correct = [], [], []
     there = true[CONFIDENCE][..., 0] > 0
@@ -30,6 +34,8 @@ def several_objects_scores(world: SeveralObjectsWorld, predicted: SceneCode, tru
         errors = add_errors(found, wanted, points, member.kind.info)
         confidences += predicted[CONFIDENCE][shown, slot, 0].tolist()
         correct += [error < ADD_THRESHOLD for error in errors]
+    if not each:
+        raise UsageError(f"--num-images {len(there)}: none of them shows an object; expected more")
     scores = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
     scores["confidence_ece"] = calibration_error(confidences, correct)
     if not there.all():

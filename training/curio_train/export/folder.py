@@ -67,8 +67,9 @@ class ModelFolder:
         return versions(self.path) if self.path.is_dir() else []
 
     def next_version(self) -> int:
-        """The number after the largest."""
-        return max(self.versions(), default=0) + 1
+        """The number after the largest that a version, or anything else in the folder, has."""
+        taken = [int(path.name) for path in self.path.iterdir() if path.name.isdecimal()] if self.path.is_dir() else []
+        return max(taken, default=0) + 1
 
     def files(self) -> list[Path]:
         """All files of the model that are there."""
@@ -118,7 +119,7 @@ class ModelFolder:
         try:
             with _draft(self.path) as draft:
                 if self.path.exists():
-                    self._add_version(draft, target, files, card)
+                    self._add_version(draft, target, files, config, card)
                 else:
                     _fill(draft, self.path.name, version, files, card, config)
                     draft.rename(self.path)
@@ -146,12 +147,14 @@ class ModelFolder:
             raise ExportError(f"cannot write {path}: {exc.strerror}") from exc
         return path
 
-    def _add_version(self, draft: Path, target: Path, files: Mapping[str, bytes], card: str) -> None:
+    def _add_version(self, draft: Path, target: Path, files: Mapping[str, bytes], config: str, card: str) -> None:
         """Beside earlier versions: first what speaks of it, at last the version itself, by one rename."""
         _write(draft, files)
         others = [line for line in _text(self.path / SUMS_FILE).splitlines() if f"  {target.name}/" not in line]
         sums = "".join(f"{line}\n" for line in others) + _sums(target.name, files)
         title, _, earlier = _text(self.path / _CARD).partition("\n\n")
+        if not (self.path / CONFIG_FILE).exists():
+            _replace(self.path / CONFIG_FILE, config)
         _replace(self.path / SUMS_FILE, sums)
         draft.rename(target)
         _replace(self.path / _CARD, f"{title or _title(self.path.name)}\n\n{card}\n{earlier}")
