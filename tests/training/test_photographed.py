@@ -7,8 +7,8 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
-from curio_train.export.onnx import to_onnx
-from curio_train.export.stages import num_choosable
+from curio_train.export.onnx import Tracing, to_onnx
+from curio_train.export.stages import tracing_of
 from curio_train.geometry import Pose
 from curio_train.meshes.shapes import chair
 from curio_train.networks import outline_alignment
@@ -160,8 +160,8 @@ def test_the_exported_graph_equals_torch_whichever_objects_are_asked_for(
     network.reader = steps
     network.look_less()
     graph, names = _Graph(network).eval(), ["translation_m", "rotation_6d", "light", "confidence"]
-    assert num_choosable(network) == 2
-    session = onnxruntime.InferenceSession(to_onnx(graph, 640, 480, names, num_slots=2).SerializeToString())
+    assert tracing_of(network) == Tracing(one_image=True, num_slots=2)
+    session = onnxruntime.InferenceSession(to_onnx(graph, 640, 480, names, tracing_of(network)).SerializeToString())
     coarse = torch.rand(3, 3, 60, 80, generator=torch.Generator().manual_seed(2))
     smooth = torch.nn.functional.interpolate(coarse, (480, 640), mode="bicubic").clamp(0, 1)
     images = (255 * smooth).round().byte().permute(0, 2, 3, 1).contiguous()

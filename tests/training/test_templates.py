@@ -9,7 +9,7 @@ import onnxruntime
 import pytest
 import torch
 from curio_train.errors import CheckpointError, UsageError
-from curio_train.export.onnx import to_onnx
+from curio_train.export.onnx import Tracing, to_onnx
 from curio_train.geometry import random_rotations
 from curio_train.networks.crop_camera import about_axis, cut_crops
 from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
@@ -224,7 +224,7 @@ class _Graph(torch.nn.Module):
 def test_the_exported_graph_equals_torch_for_any_batch() -> None:
     graph, random = _Graph(_random_network((1, 0, 0))).eval(), np.random.default_rng(0)
     names = ["translation_m", "rotation_6d", "light", "confidence"]
-    session = onnxruntime.InferenceSession(to_onnx(graph, 640, 480, names).SerializeToString())
+    session = onnxruntime.InferenceSession(to_onnx(graph, 640, 480, names, Tracing(one_image=True)).SerializeToString())
     coarse = torch.from_numpy(random.integers(0, 255, (3, 3, 60, 80))).float()
     smooth = torch.nn.functional.interpolate(coarse, (480, 640), mode="bilinear")
     images = smooth.round().byte().permute(0, 2, 3, 1).contiguous()

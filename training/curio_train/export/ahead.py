@@ -11,7 +11,7 @@ import torch
 from curio_train.config import RunConfig
 from curio_train.export.graph import Graph, deployable
 from curio_train.export.onnx import simplified, traced_program
-from curio_train.export.stages import num_choosable
+from curio_train.export.stages import tracing_of
 from curio_train.learning.state import TrainState
 from curio_train.second_process import SecondProcess
 from curio_train.worlds import build
@@ -42,7 +42,7 @@ class TracingAhead(SecondProcess[bytes]):
         for name, initializer in model.graph.initializers.items():
             if name in values:
                 initializer.const_value = ir.tensor(values[name].detach().numpy(), name=name)
-        return simplified(model, num_choosable(graph.network))
+        return simplified(model, tracing_of(graph.network))
 
 
 def _trace(config: RunConfig) -> bytes:
@@ -52,6 +52,6 @@ def _trace(config: RunConfig) -> bytes:
     camera = world.camera
     with torch.no_grad():
         names = list(graph.outputs(torch.zeros(1, camera.height, camera.width, 3, dtype=torch.uint8)))
-    program = traced_program(graph, camera.width, camera.height, names, num_choosable(network))
+    program = traced_program(graph, camera.width, camera.height, names, tracing_of(network))
     content: bytes = program.model_proto.SerializeToString()
     return content

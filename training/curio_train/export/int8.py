@@ -20,6 +20,7 @@ from onnx import helper, numpy_helper
 from torch import Tensor
 
 from curio_train.errors import ExportError
+from curio_train.export.image_by_image import image_by_image, inner_graph, of_one_image
 
 _ACTIVATIONS = ("Relu", "Clip")
 _BETWEEN = (*_ACTIVATIONS, "Add")  # that stay in int8 after a convolution
@@ -40,8 +41,9 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
     load_onnxruntime()  # first, because it turns telemetry off
     from onnxruntime import quantization
 
-    kept = _kept(model.graph)
-    if not any(node.op_type == "Conv" and node.name not in kept for node in model.graph.node):
+    single = of_one_image(model)
+    kept = _kept(single.graph)
+    if not any(node.op_type == "Conv" and node.name not in kept for node in single.graph.node):
         raise ExportError("the network has no convolution before an activation to quantise; export without --int8")
 
     class Reader(quantization.CalibrationDataReader):
@@ -55,7 +57,7 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
 
     with tempfile.TemporaryDirectory() as folder, _quiet():
         source, target = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
-        onnx.save(model, source)  # of a model in memory the quantiser takes the weights away
+        onnx.save(single, source)  # of a model in memory the quantiser takes the weights away
         quantization.quantize_static(
             source,
             target,
@@ -69,6 +71,8 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
             weight_type=quantization.QuantType.QInt8,
         )
         quantised = onnx.load(target)
+    if single is not model:
+        quantised = image_by_image(quantised)
     onnx.checker.check_model(quantised)
     return quantised
 
@@ -82,7 +86,7 @@ def rounded_otherwise(model: onnx.ModelProto) -> Iterator[onnx.ModelProto]:
     for fraction in _ROUNDING:
         other = onnx.ModelProto()
         other.CopyFrom(model)
-        graph, nodes, rounded = other.graph, list[onnx.NodeProto](), set[str]()
+        graph, nodes, rounded = inner_graph(other), list[onnx.NodeProto](), set[str]()
         in_int8 = {name for node in graph.node if node.op_type == "DequantizeLinear" for name in node.output}
         made_by = {name: node for node in graph.node for name in node.output}
         graph.initializer.append(numpy_helper.from_array(np.array(1 + fraction, np.float32), _FACTOR))

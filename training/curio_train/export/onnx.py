@@ -4,7 +4,7 @@ import logging
 import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import onnx
@@ -20,13 +20,28 @@ from onnxscript import optimizer, rewriter
 from onnxscript.rewriter.rules.common import materialize_reshape_shape_rule
 from torch import nn
 
+from curio_train.export.image_by_image import image_by_image, inner_graph
+
 OPSET = 18
 _LARGEST_REPEATED = 1 << 20  # values; larger constants are weights, which are there once
 _SMALLEST_HALF = 256  # values; below, a Cast costs more than it saves
 
 
+class Tracing(NamedTuple):
+    """How a network is traced."""
+
+    one_image: bool = False
+    """Whether it is traced for one image, to be run on each of a batch, see :mod:`curio_train.export.image_by_image`.
+    """
+    num_slots: int | None = None
+    """Of a network that takes the numbers of the wanted slots, too, int64 [wanted]; None: it does not."""
+
+
+_PLAIN = Tracing()
+
+
 def to_onnx(
-    network: nn.Module, width: int, height: int, outputs: Sequence[str], num_slots: int | None = None
+    network: nn.Module, width: int, height: int, outputs: Sequence[str], tracing: Tracing = _PLAIN
 ) -> onnx.ModelProto:
     """Trace a network into an ONNX model with a free batch, and simplify it.
 
@@ -35,16 +50,16 @@ def to_onnx(
         width: Of the images, pixels.
         height: Of the images, pixels.
         outputs: Names of the returned tensors, in order.
-        num_slots: See :func:`traced_program`.
+        tracing: See :class:`Tracing`.
 
     Returns:
         A model that holds its weights and nothing of the machine it was traced on.
     """
-    return simplified(traced_program(network, width, height, outputs, num_slots).model, num_slots)
+    return simplified(traced_program(network, width, height, outputs, tracing).model, tracing)
 
 
 def traced_program(
-    network: nn.Module, width: int, height: int, outputs: Sequence[str], num_slots: int | None = None
+    network: nn.Module, width: int, height: int, outputs: Sequence[str], tracing: Tracing
 ) -> torch.onnx.ONNXProgram:
     """Trace a network; weights keep their names in its graph.
 
@@ -53,15 +68,16 @@ def traced_program(
         width: Of the images, pixels.
         height: Of the images, pixels.
         outputs: Names of the returned tensors, in order.
-        num_slots: Of a network that takes the numbers of the wanted slots, too, int64 [wanted]; None: it does not.
+        tracing: See :class:`Tracing`.
 
     Returns:
         What :func:`simplified` makes a model of.
     """
-    examples: tuple[torch.Tensor, ...] = (torch.zeros(2, height, width, 3, dtype=torch.uint8),)
-    free: tuple[dict[int, Any], ...] = ({0: torch.export.Dim("batch")},)
-    if num_slots is not None:
-        examples, free = (*examples, torch.arange(num_slots)), (*free, {0: torch.export.Dim("wanted")})
+    num_images = 1 if tracing.one_image else 2
+    examples: tuple[torch.Tensor, ...] = (torch.zeros(num_images, height, width, 3, dtype=torch.uint8),)
+    free: tuple[dict[int, Any], ...] = ({} if tracing.one_image else {0: torch.export.Dim("batch")},)
+    if tracing.num_slots is not None:
+        examples, free = (*examples, torch.arange(tracing.num_slots)), (*free, {0: torch.export.Dim("wanted")})
     with _quiet():
         program = torch.onnx.export(
             network,
@@ -79,18 +95,20 @@ def traced_program(
     return program
 
 
-def simplified(traced: ir.Model, num_slots: int | None = None) -> onnx.ModelProto:
+def simplified(traced: ir.Model, tracing: Tracing) -> onnx.ModelProto:
     """A traced graph as it is stored; changes the graph that is given.
 
     Args:
         traced: By :func:`traced_program`.
-        num_slots: As it was traced for. A caller may then leave the input out, which means all slots in their order.
+        tracing: As it was traced. A caller may leave out the wanted slots, which means all of them in their order.
     """
     _simplify(traced)
     model: onnx.ModelProto = ir.to_proto(traced)
     _strip(model)
-    if num_slots is not None:
-        model.graph.initializer.append(numpy_helper.from_array(np.arange(num_slots), SLOTS))
+    if tracing.num_slots is not None:
+        model.graph.initializer.append(numpy_helper.from_array(np.arange(tracing.num_slots), SLOTS))
+    if tracing.one_image:
+        model = image_by_image(model)
     onnx.checker.check_model(model)
     return model
 
@@ -144,8 +162,8 @@ def _strip(model: onnx.ModelProto) -> None:
 
 def store_half(model: onnx.ModelProto) -> None:
     """Store large float32 weights that float16 can hold exactly as such, with a Cast back in the graph."""
-    casts = []
-    for tensor in model.graph.initializer:
+    casts, graph = [], inner_graph(model)
+    for tensor in graph.initializer:
         if tensor.data_type != TensorProto.FLOAT or np.prod(tensor.dims) < _SMALLEST_HALF:
             continue
         values = numpy_helper.to_array(tensor)
@@ -154,9 +172,9 @@ def store_half(model: onnx.ModelProto) -> None:
             name = tensor.name
             tensor.CopyFrom(numpy_helper.from_array(half, f"{name}_half"))
             casts.append(helper.make_node("Cast", [tensor.name], [name], name=f"{name}_cast", to=TensorProto.FLOAT))
-    nodes = [*casts, *model.graph.node]
-    del model.graph.node[:]
-    model.graph.node.extend(nodes)
+    nodes = [*casts, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
     onnx.checker.check_model(model)
 
 

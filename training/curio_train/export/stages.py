@@ -7,8 +7,9 @@ from dataclasses import asdict
 import onnx
 from torch import nn
 
-from curio_train.export.onnx import hide_outputs, put_metadata, to_onnx
+from curio_train.export.onnx import Tracing, hide_outputs, put_metadata, to_onnx
 from curio_train.networks.several_objects.network import ObjectsNetwork
+from curio_train.networks.templates.network import TemplateNetwork
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.worlds.base import Camera
 
@@ -28,13 +29,18 @@ def traced(graph: nn.Module, network: nn.Module, camera: Camera, outputs: Sequen
         outputs: Their names.
     """
     if not isinstance(network, TwoStageNetwork):
-        return to_onnx(graph, camera.width, camera.height, outputs, num_choosable(network))
+        return to_onnx(graph, camera.width, camera.height, outputs, tracing_of(network))
     names = stage_tensors(network)
     model = to_onnx(graph, camera.width, camera.height, [*outputs, *names])
     hide_outputs(model, names)
     for key, note in network.stage_notes().items():
         put_metadata(model, key, json.dumps(asdict(note)))
     return model
+
+
+def tracing_of(network: nn.Module) -> Tracing:
+    """How a network is traced; of those with templates one image alone."""
+    return Tracing(isinstance(network, ObjectsNetwork | TemplateNetwork), num_choosable(network))
 
 
 def num_choosable(network: nn.Module) -> int | None:

@@ -202,9 +202,10 @@ class World(ABC):
     @property
     def outputs(self) -> CameraFrameOutputs:
         """Conversion between scene codes and the outputs of exported models."""
-        center_of = {slot: kind.center_m for kind in self.objects for slot in kind.slots}
-        centers_m = [center_of[slot] for slot in range(self.layout.num_slots)]
-        return CameraFrameOutputs(self.layout, torch.tensor(centers_m) if np.any(centers_m) else None)
+        centers_m = torch.zeros(self.layout.num_slots, 3)
+        for kind in self.objects:
+            centers_m[list(kind.slots)] = torch.tensor(kind.center_m)
+        return CameraFrameOutputs(self.layout, centers_m if centers_m.any() else None)
 
     def network(self, config: NetworkConfig) -> StageNetwork:
         """A new network that predicts scene codes of this world's images.
