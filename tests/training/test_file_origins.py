@@ -14,7 +14,7 @@ from curio_serve.models.object_frames import center_of
 from curio_train.config import RunConfig
 from curio_train.export.graph import Graph
 from curio_train.export.spec import model_spec
-from curio_train.geometry import Pose, matrix_from_rotation_6d
+from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.learning.runs.configuration import from_json, to_json
 from curio_train.meshes.meshes import load_mesh
 from curio_train.meshes.symmetries import find_symmetries
@@ -133,6 +133,19 @@ def test_a_shape_without_symmetries_has_its_middle_where_it_is_asked_for(folder:
     found = find_symmetries(load_mesh(folder / "lump.stl", "mm"))
     lopsided = replace(found, discrete=(), continuous=())
     np.testing.assert_allclose(lopsided.point_left(np.array([0.1, 0.2, 0.3])), [0.1, 0.2, 0.3])
+
+
+def test_how_far_an_origin_is_does_not_count_in_comparisons(worlds: tuple[TwoStageWorld, TwoStageWorld]) -> None:
+    """A rotation that differs by rounding moves the position of a distant origin, and of the middle not."""
+    _, moved = worlds
+    code = moved.sample(2, (1,))
+    turn = torch.from_numpy(Rotation.from_rotvec([0, 0, 2e-4]).as_matrix()).float()
+    rotation = matrix_from_rotation_6d(code[ROTATION_6D]) @ turn
+    other = {**code, ROTATION_6D: rotation_6d_from_matrix(rotation)}
+    graph = Graph(Reads(code), moved)
+    one, turned = graph.outputs(torch.zeros(2, 120, 160, 3, dtype=torch.uint8)), moved.outputs.from_code(other)
+    assert (one[TRANSLATION] - turned[TRANSLATION]).abs().max() > 3e-5
+    assert torch.allclose(graph.judged(one)[TRANSLATION], graph.judged(turned)[TRANSLATION], atol=1e-6)
 
 
 def test_of_several_parts_each_has_its_own_middle(folder: Path) -> None:

@@ -68,6 +68,10 @@ class Graph(nn.Module):
         """The same, few images at once."""
         return joined([self.read(part) for part in pixels.split(_IMAGES_AT_ONCE)])
 
+    def judged(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """What is compared of outputs: positions of the middles. Those of a distant origin move with every rounding."""
+        return self._world.outputs.at_middles(outputs)
+
     def where(self, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The stable answers, one a row: of objects, or of scenes whose every answer is stable."""
         whole = stable.all(dim=1)
@@ -77,6 +81,7 @@ class Graph(nn.Module):
         self, outputs: Mapping[str, Tensor], others: Mapping[str, Tensor], largest: float = LARGEST_PARITY_ERROR
     ) -> Bool[Tensor, "batch slots"]:
         """Which answers are the same in both, up to ``largest``; what a scene has once moves all of its answers."""
+        outputs, others = self.judged(outputs), self.judged(others)
         same = torch.ones(outputs[TRANSLATION].shape[:2], dtype=torch.bool)
         for name, values in outputs.items():
             kept = 1 if name in self.of_scene else 2

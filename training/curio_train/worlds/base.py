@@ -170,6 +170,12 @@ class CameraFrameOutputs:
             code[TRANSLATION] = code[TRANSLATION] + self._from_origin(outputs)
         return code
 
+    def at_middles(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The outputs with the positions of the objects' middles, which do not hang on how far away an origin is."""
+        if self._centers_m is None:
+            return dict(outputs)
+        return {**outputs, TRANSLATION: outputs[TRANSLATION] + self._from_origin(outputs)}
+
     def _from_origin(self, outputs: Mapping[str, Tensor]) -> Float[Tensor, "batch slots 3"]:
         """From the objects' origins to their middles, camera frame."""
         assert self._centers_m is not None
