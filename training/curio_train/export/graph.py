@@ -41,14 +41,14 @@ class Graph(nn.Module):
         super().__init__()
         self.network = network
         self.of_scene = frozenset(field.name for field in world.outputs.fields if not field.per_object)
-        self._world = world
+        self._outputs = world.outputs
         # Not while it is traced: the notes of stages hold numbers, which a trace would read out of its weights.
         self._stage_tensors = stage_tensors(network) if isinstance(network, TwoStageNetwork) else []
         self.eval()
 
     def forward(self, image: Tensor, slots: Tensor | None = None) -> tuple[Tensor, ...]:
         """The outputs, of the wanted slots alone if given, then the tensors of the last stages, if it has such."""
-        outputs = self._world.outputs
+        outputs = self._outputs
         if isinstance(self.network, TwoStageNetwork):
             code, stages = self.network.with_stages(pixels_of(image))
             return (*outputs.from_code(code).values(), *(stages[name] for name in self._stage_tensors))
@@ -62,7 +62,7 @@ class Graph(nn.Module):
 
     def read(self, pixels: Tensor) -> dict[str, Tensor]:
         """Outputs by name, for pixels [batch, 3, height, width] in [0, 1]."""
-        return self._world.outputs.from_code(self.network(pixels))
+        return self._outputs.from_code(self.network(pixels))
 
     def in_parts(self, pixels: Tensor) -> dict[str, Tensor]:
         """The same, few images at once."""
@@ -70,7 +70,7 @@ class Graph(nn.Module):
 
     def judged(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """What is compared of outputs: positions of the middles. Those of a distant origin move with every rounding."""
-        return self._world.outputs.at_middles(outputs)
+        return self._outputs.at_middles(outputs)
 
     def where(self, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The stable answers, one a row: of objects, or of scenes whose every answer is stable."""

@@ -208,10 +208,10 @@ class World(ABC):
     @property
     def outputs(self) -> CameraFrameOutputs:
         """Conversion between scene codes and the outputs of exported models."""
-        centers_m = torch.zeros(self.layout.num_slots, 3)
+        centers_m = np.zeros((self.layout.num_slots, 3), np.float32)
         for kind in self.objects:
-            centers_m[list(kind.slots)] = torch.tensor(kind.center_m)
-        return CameraFrameOutputs(self.layout, centers_m if centers_m.any() else None)
+            centers_m[list(kind.slots)] = kind.center_m
+        return CameraFrameOutputs(self.layout, torch.from_numpy(centers_m) if centers_m.any() else None)
 
     def network(self, config: NetworkConfig) -> StageNetwork:
         """A new network that predicts scene codes of this world's images.
