@@ -142,7 +142,7 @@ def test_codes_look_as_in_their_world(capsys, tmp_path: Path, name: str) -> None
         (detection_line(light=[0, 1]), [], 1, "light is .* expected finite numbers of shape"),
         (detection_line(camera_matrix=None), [], 1, "it is flat"),
         (detection_line(camera_matrix=[[1, 2], [3, 4]]), [], 1, "camera_matrix"),
-        (detection_line(), ["--over-photograph"], 1, "one.jpg: the image cannot be read"),
+        (detection_line(), ["--over-photograph"], 1, "one.jpg: the photograph cannot be read"),
         (detection_line(), ["--over-photograph", "--turn-deg", "5"], 2, "exclude each other"),
         (detection_line(), ["--world", "chairs"], 2, "exclude each other"),
         (detection_line(), ["--samples", "0"], 2, "at least 1"),

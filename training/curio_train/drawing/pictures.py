@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from curio_train.camera import scale_matrix
-from curio_train.data.photographs import read_photograph
+from curio_train.drawing.photograph import photograph_of
 from curio_train.drawing.scenes import Placed, Scene
 from curio_train.errors import DataError, UsageError
 from curio_train.geometry import Pose
@@ -147,14 +147,7 @@ def _photograph(scene: Scene) -> np.ndarray:
     """The scene's photograph, resized to the scene: [height, width, 3] in [0, 1]."""
     if scene.photograph is None:
         raise DataError(f"{scene.name} is a scene code, which has no photograph; leave out --over-photograph")
-    pixels = read_photograph(scene.photograph)
-    shape = pixels.shape[1] / pixels.shape[0]
-    if abs(shape * scene.height / scene.width - 1) > 0.02:
-        raise DataError(
-            f"{scene.photograph}: found {pixels.shape[1]}x{pixels.shape[0]} pixels, expected the shape of the frame "
-            f"that was detected in, {scene.width}x{scene.height}; is it another file by now?"
-        )
-    return _fitted(pixels, scene)
+    return _fitted(photograph_of(scene), scene)
 
 
 def _fitted(pixels: np.ndarray, scene: Scene) -> np.ndarray:
