@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+import viser
 from curio_train.commands import view as view_command
 from curio_train.data.clutter import dead_leaves_texture
 from curio_train.drawing.pictures import RenderOptions, SceneContext, picture
@@ -25,6 +26,7 @@ from curio_train.geometry import Pose
 from curio_train.meshes.meshes import load_mesh
 from curio_train.meshes.shapes import chair
 from curio_train.viewing.pages import Opening, newer_pages, open_pages
+from curio_train.viewing.panel import Panel
 from curio_train.viewing.saving import save
 from curio_train.worlds.options import SpheresOptions
 from scipy.spatial.transform import Rotation
@@ -63,12 +65,16 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return int(free.getsockname()[1])
+
+
 class Command:
     """A running ``curio-view``."""
 
     def __init__(self, *arguments: str | Path, **environment: str) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         script = "from curio_train.commands.view import view; view()"
         given = [sys.executable, "-c", script, *map(str, arguments), "--port", str(self.port)]
         full = {**os.environ, **environment}
@@ -221,6 +227,24 @@ def test_a_run_is_opened_again_with_a_newer_checkpoint(tmp_path: Path, write_run
     assert again is not None
     assert [page.scene.name for page in again] == [page.scene.name for page in pages]
     assert reload() is None
+
+
+def test_values_that_are_shown_and_not_changed_keep_all_their_digits() -> None:
+    server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
+    try:
+        panel = Panel(server.gui)
+        for confidence in (0.004, 0.823746, 0.5):
+            item = Placed("chair", TRUE, (0.64, 0.2, 0.19), confidence)
+            scene = Scene("photograph", WIDTH, HEIGHT, K, (item,), None)
+            panel.show_page(0, 1, scene)
+            panel.show_values(scene, np.zeros(3), 0)
+            kept = panel.edited(item)
+            assert (kept.confidence, kept.color_srgb) == (confidence, item.color_srgb)
+            assert kept.pose.rotation is item.pose.rotation
+            panel.confidence.value = 0.25
+            assert panel.edited(item).confidence == 0.25
+    finally:
+        server.stop()
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
