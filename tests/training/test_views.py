@@ -15,6 +15,7 @@ from curio_train.drawing.scenes import mesh_world
 
 WIDTH, HEIGHT = 64, 48
 MATRIX = [[70.0, 0.0, 30.0], [0.0, 66.0, 25.0], [0.0, 0.0, 1.0]]
+HUGE = [[9e4, 0.0, 45_000.0], [0.0, 9e4, 40_000.0], [0.0, 0.0, 1.0]]
 PLACE = [0.02, -0.01, 0.4]
 
 
@@ -146,6 +147,8 @@ def test_codes_look_as_in_their_world(capsys, tmp_path: Path, name: str) -> None
         (detection_line(), ["--over-photograph", "--turn-deg", "5"], 2, "exclude each other"),
         (detection_line(), ["--world", "chairs"], 2, "exclude each other"),
         (detection_line(), ["--samples", "0"], 2, "at least 1"),
+        (detection_line(), ["--height", "100000"], 2, "--height 100000 for a picture of .*x100000 pixels, expected at"),
+        (detection_line(width=90_000, height=80_000, camera_matrix=HUGE), [], 1, "picture of 90000x80000 pixels"),
         ({"world": "atlantis", "code": {}}, [], 1, "expected one of spheres"),
         ({"world": "circles", "code": {}}, [], 1, "expected one of spheres"),
         ({"world": "spheres", "code": {"light": [1, 2]}}, [], 1, "scene code has"),
