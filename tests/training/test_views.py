@@ -114,6 +114,24 @@ def test_objects_lie_over_their_photograph(capsys, egg: Path, tmp_path: Path) ->
         assert np.abs(image[20:30, 30:36] - content[20:30, 30:36, ::-1]).mean() > 20
 
 
+def test_the_camera_is_carried_round_the_middles_of_objects(capsys, egg: Path, tmp_path: Path) -> None:
+    """A mesh whose origin is far from its middle, placed at the same spot, is seen the same from the side."""
+    away = np.array([0.3, -0.1, 0.2])
+    loaded = trimesh.load_mesh(egg)
+    trimesh.Trimesh(loaded.vertices + away, loaded.faces).export(tmp_path / "away.ply")
+    seen = []
+    for mesh, place in ((egg, PLACE), (tmp_path / "away.ply", (PLACE - away).tolist())):
+        scenes = tmp_path / "scene.json"
+        line = detection_line()
+        line["detections"][0]["translation_m"] = place
+        scenes.write_text(json.dumps(line))
+        status, out, err = run(capsys, scenes, "--mesh", mesh, "--out", tmp_path / mesh.stem, "--turn-deg", 90)
+        assert status == 0, err
+        seen.append(pixels(Path(out.strip())))
+    assert (seen[0].sum(-1) > 0.1).sum() > 50
+    assert np.abs(seen[0] - seen[1]).mean() < 0.01
+
+
 @pytest.mark.parametrize("name", ["varied", "light"])
 def test_codes_look_as_in_their_world(capsys, tmp_path: Path, name: str) -> None:
     """From the world's own camera and from 90° round the scene."""
