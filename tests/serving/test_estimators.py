@@ -189,9 +189,31 @@ def test_exif_rotation_is_ignored_unless_asked_for_and_then_turns_k(
     assert (answers[True]["width"], answers[True]["height"]) == (240, 320)
     assert answers[False]["camera_matrix"] == K
     assert answers[True]["camera_matrix"] == [[301, 0, 239 - 119], [0, 300, 160], [0, 0, 1]]
+    assert "exif_rotation" not in answers[False]
+    assert answers[True]["exif_rotation"] is True
     x, y, z = answers[False]["detections"][0]["translation_m"]
     # a quarter turn clockwise takes (x, y) to (-y, x)
     np.testing.assert_allclose(answers[True]["detections"][0]["translation_m"], [-y, x, z], rtol=0.03, atol=0.01)
+
+
+def test_the_distortion_that_was_used_is_written_as_it_is_of_the_turned_frame(
+    detect: Callable[..., int], tmp_path: Path, spot_image: Callable[..., np.ndarray]
+) -> None:
+    stored = cv2.imencode(".jpg", spot_image(*SIZE, 200, 100, 12, 12, (255, 255, 255)))[1].tobytes()
+    (tmp_path / "turned.jpg").write_bytes(with_exif_orientation(stored, 6))
+    (tmp_path / "upright.jpg").write_bytes(stored)
+    images = [tmp_path / "turned.jpg", tmp_path / "upright.jpg"]
+    written = {}
+    for given in ([-0.2, 0.05, 0.001, 0.002, 0.0], [0.0] * 5):
+        camera, out = tmp_path / "camera.json", tmp_path / "out.jsonl"
+        camera.write_text(json.dumps({"camera_matrix": K, "width": 320, "height": 240, "distortion": given}))
+        assert detect("pinhole", *images, camera=camera, out=out, exif_rotation=True, overwrite=True) == 0
+        written[given[0]] = read(out)
+    turned, upright = written[-0.2]
+    assert turned["distortion"] == [-0.2, 0.05, 0.002, -0.001, 0.0]
+    assert upright["distortion"] == [-0.2, 0.05, 0.001, 0.002, 0.0]
+    assert ["exif_rotation" in line for line in (turned, upright)] == [True, False]
+    assert all("distortion" not in line for line in written[0.0])
 
 
 def test_videos_give_a_line_a_frame(

@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 import pytest
 from curio_proto.v1 import detector_pb2 as messages
-from curio_proto.v1.model_spec_pb2 import ModelSpec
+from curio_proto.v1.model_spec_pb2 import CanonicalCamera, Field, ModelSpec, ObjectModel
 from curio_serve.errors import CameraMissing
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
@@ -17,6 +17,7 @@ from curio_serve.models.model_folder import open_model
 from curio_serve.models.spec import SPEC_KEY
 from curio_serve.tracking.stream import FollowingStream
 from google.protobuf import json_format
+from onnx import TensorProto, helper, numpy_helper
 
 ROOT = Path(__file__).parents[2]
 
@@ -155,3 +156,58 @@ def test_a_clearly_surer_object_takes_the_place_of_one_that_is_seen() -> None:
     assert set(after) == {1, 3}
     assert after[3].translation_m[1] < -0.1
     assert after[3].confidence > before[2].confidence + 0.2
+
+
+def _three_spots(matrix: np.ndarray, width: int, height: int) -> onnx.ModelProto:
+    """Finds one ball in each colour channel: where that is brightest, 1 m away, as confident as it is bright there."""
+    rows, columns = np.mgrid[:height, :width]
+    rays = np.stack([columns.ravel(), rows.ravel(), np.ones(width * height)], axis=1) @ np.linalg.inv(matrix).T
+    constants = [
+        numpy_helper.from_array(np.array([-1, 3, width * height]), "as_rows"),
+        numpy_helper.from_array(np.array([2]), "pixels"),
+        numpy_helper.from_array(rays.astype(np.float32), "rays"),
+        numpy_helper.from_array(np.float32(255), "full"),
+    ]
+    nodes = [
+        helper.make_node("Cast", ["image"], ["float"], to=TensorProto.FLOAT),
+        helper.make_node("Transpose", ["float"], ["channels"], perm=[0, 3, 1, 2]),
+        helper.make_node("Reshape", ["channels", "as_rows"], ["rows"]),
+        helper.make_node("ArgMax", ["rows"], ["place"], axis=2, keepdims=0),
+        helper.make_node("Gather", ["rays", "place"], ["translation_m"]),
+        helper.make_node("ReduceMax", ["rows", "pixels"], ["brightest"], keepdims=0),
+        helper.make_node("Div", ["brightest", "full"], ["confidence"]),
+    ]
+    outputs = {"translation_m": ["b", 3, 3], "confidence": ["b", 3]}
+    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()]
+    image = helper.make_tensor_value_info("image", TensorProto.UINT8, ["b", height, width, 3])
+    graph = helper.make_graph(nodes, "balls", [image], values, constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    fields = [
+        Field(name="translation_m", size=3, per_object=True, unit="m", frame="camera"),
+        Field(name="confidence", size=1, per_object=True, unit="1"),
+    ]
+    box = 0.05 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    ball = ObjectModel(name="ball", diameter_m=0.1, box_corners_m=box.ravel(), slots=[0, 1, 2])
+    camera = CanonicalCamera(width=width, height=height, camera_matrix=matrix.ravel())
+    spec = ModelSpec(
+        schema_version=1, name="balls", world="balls", num_slots=3, fields=fields, objects=[ball], camera=camera
+    )
+    model.metadata_props.add(key=SPEC_KEY, value=json_format.MessageToJson(spec))
+    return model
+
+
+def test_an_object_that_is_read_twice_takes_no_other_ones_place() -> None:
+    """Two are followed, one of them dim; then the bright one is found a second time, surer than the dim one."""
+    matrix = np.array([[110.0, 0, 48.0], [0, 110.0, 32.0], [0, 0, 1]])
+    detector = Detector(from_bytes(_three_spots(matrix, 96, 64).SerializeToString(), "balls"))
+    once = np.zeros((64, 96, 3), np.uint8)
+    once[30, 20, 0], once[30, 70, 2] = 230, 80
+    twice = once.copy()
+    twice[30, 21, 1] = 240
+    stream, results = FollowingStream(), messages.DetectResponse().results
+    for frame in (once, once, twice, once):
+        track = messages.Tracking(num_objects=2)
+        stream.follow(track, [detector], frame, PinholeCamera(matrix), min_confidence=0.0, reduction=1, results=results)
+    for result in results:
+        found = {one.track.track_id: one.translation_m[0] for one in result.detections}
+        assert found == pytest.approx({1: -28 / 110, 2: 22 / 110}, abs=0.01)

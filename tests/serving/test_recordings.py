@@ -296,6 +296,10 @@ def test_a_glob_of_recordings_has_their_cameras(models_dir: Path, spots: list[np
     out = tmp_path / "poses.jsonl"
     assert detect(models_dir / "pinhole", tmp_path / "*.mcap", out=out, topic="/camera/image_raw") == 0
     assert [line["image"].partition("#")[0] for line in lines(out)] == [str(tmp_path / f"{n}.mcap") for n in "ab"]
+    poses = tmp_path / "out" / "poses.mcap"
+    assert detect(models_dir / "pinhole", tmp_path / "[ab].*", out=poses, topic="/camera/image_raw") == 0
+    with poses.open("rb") as file:
+        assert [channel.topic for _, channel, _ in make_reader(file).iter_messages()] == ["/camera/detections"] * 2
     cv2.imwrite(str(tmp_path / "c.png"), spots[0])
     with pytest.raises(UsageError, match="needs the intrinsics"):
         detect(models_dir / "pinhole", tmp_path / "*", out=tmp_path / "more.jsonl")

@@ -1,6 +1,7 @@
 """What a run of one's own part leaves beside itself where a second process makes the report."""
 
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,8 @@ import pytest
 from curio_train.commands.finish import end
 from curio_train.export.ahead import TracingAhead
 from curio_train.learning.runs.checkpoint import RunFolder
-from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds import build
+from curio_train.worlds.options import CaptureOptions, CirclesOptions, SpheresOptions
 
 
 @pytest.mark.parametrize("is_writable", [True, False])
@@ -24,3 +26,12 @@ def test_the_report_is_made_beside_the_model(circles_run: Path, tmp_path: Path, 
     assert (run / "models" / "circles" / "1" / "model.onnx").is_file()
     assert (run / "report.html").is_file() == is_writable
     assert [str(run / "report.html") in warning for warning in warnings] == [True] * (not is_writable)
+
+
+def test_what_curio_view_cannot_show_is_not_told_to_be_viewed(write_run: Callable[..., Path], tmp_path: Path) -> None:
+    for options, is_shown in ((CirclesOptions(), False), (SpheresOptions(), True)):
+        assert (build(options).camera.matrix is not None) == is_shown
+        run = write_run(tmp_path / type(options).__name__, options)
+        told = end(run, RunFolder.open(run).config, tmp_path / "cache", pytest.fail)
+        assert f"to see what it learned: {run / 'report.html'}" in told
+        assert (f"curio-view {run}" in told) == is_shown

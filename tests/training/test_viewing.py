@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,21 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+import viser
 from curio_train.commands import view as view_command
 from curio_train.data.clutter import dead_leaves_texture
+from curio_train.drawing.album import MeshFiles
 from curio_train.drawing.pictures import RenderOptions, SceneContext, picture
 from curio_train.drawing.scenes import Placed, Scene, read_scenes
 from curio_train.errors import DataError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import load_mesh
 from curio_train.meshes.shapes import chair
-from curio_train.viewing.pages import Opening, newer_pages, open_pages
+from curio_train.viewing.fitting import walk
+from curio_train.viewing.pages import Opening, Page, newer_pages, open_pages
+from curio_train.viewing.panel import Panel
 from curio_train.viewing.saving import save
+from curio_train.viewing.space import Space
 from curio_train.worlds.options import SpheresOptions
 from scipy.spatial.transform import Rotation
 
@@ -34,6 +40,7 @@ ROOT = Path(__file__).resolve().parents[2]
 WIDTH, HEIGHT = 320, 240
 K = np.array([[400.0, 0, 159.5], [0, 400.0, 119.5], [0, 0, 1]])
 TRUE = Pose(Rotation.from_euler("xyz", [160, 35, 10], degrees=True).as_matrix(), np.array([0.01, 0.02, 0.6]))
+OFF = Pose(np.eye(3), np.array([0.3, -0.1, 0.4]))
 WINDOW = (1600, 800)
 
 needs_browser = pytest.mark.skipif(
@@ -63,12 +70,16 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return int(free.getsockname()[1])
+
+
 class Command:
     """A running ``curio-view``."""
 
     def __init__(self, *arguments: str | Path, **environment: str) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         script = "from curio_train.commands.view import view; view()"
         given = [sys.executable, "-c", script, *map(str, arguments), "--port", str(self.port)]
         full = {**os.environ, **environment}
@@ -221,6 +232,50 @@ def test_a_run_is_opened_again_with_a_newer_checkpoint(tmp_path: Path, write_run
     assert again is not None
     assert [page.scene.name for page in again] == [page.scene.name for page in pages]
     assert reload() is None
+
+
+def with_far_origin(files: Path) -> Page:
+    """The result file's page with a mesh whose origin is half a metre from its middle, at the same place."""
+    (page,) = open_pages(Opening(str(files / "found.jsonl"), MeshFiles((str(files / "chair.ply"),), "m")))
+    (item,) = page.scene.objects
+    scene = replace(page.scene, objects=(replace(item, pose=item.pose @ OFF.inverse()),))
+    return replace(page, scene=scene, context=SceneContext({"": page.context.mesh("chair").moved(OFF.translation_m)}))
+
+
+def test_an_object_is_fitted_wherever_its_origin_is(files: Path) -> None:
+    *_, last = walk(with_far_origin(files), 0)
+    found = last.pose @ OFF
+    assert found.translation_m == pytest.approx(TRUE.translation_m, abs=0.002)
+    assert np.degrees(Rotation.from_matrix(found.rotation.T @ TRUE.rotation).magnitude()) < 2
+
+
+def test_the_camera_reaches_to_the_objects_wherever_their_origins_are(files: Path) -> None:
+    page = with_far_origin(files)
+    assert abs(page.scene.objects[0].pose.translation_m[2] - TRUE.translation_m[2]) > 0.3
+    server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
+    try:
+        Space(server, lambda number, pose: None).show(page)
+        assert server.scene.get_handle_by_name("/camera").scale == pytest.approx(1.5 * 0.6, rel=0.1)
+    finally:
+        server.stop()
+
+
+def test_values_that_are_shown_and_not_changed_keep_all_their_digits() -> None:
+    server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
+    try:
+        panel = Panel(server.gui)
+        for confidence in (0.004, 0.823746, 0.5):
+            item = Placed("chair", TRUE, (0.64, 0.2, 0.19), confidence)
+            scene = Scene("photograph", WIDTH, HEIGHT, K, (item,), None)
+            panel.show_page(0, 1, scene)
+            panel.show_values(scene, np.zeros(3), 0)
+            kept = panel.edited(item)
+            assert (kept.confidence, kept.color_srgb) == (confidence, item.color_srgb)
+            assert kept.pose.rotation is item.pose.rotation
+            panel.confidence.value = 0.25
+            assert panel.edited(item).confidence == 0.25
+    finally:
+        server.stop()
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:

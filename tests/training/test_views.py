@@ -15,6 +15,7 @@ from curio_train.drawing.scenes import mesh_world
 
 WIDTH, HEIGHT = 64, 48
 MATRIX = [[70.0, 0.0, 30.0], [0.0, 66.0, 25.0], [0.0, 0.0, 1.0]]
+HUGE = [[9e4, 0.0, 45_000.0], [0.0, 9e4, 40_000.0], [0.0, 0.0, 1.0]]
 PLACE = [0.02, -0.01, 0.4]
 
 
@@ -113,6 +114,24 @@ def test_objects_lie_over_their_photograph(capsys, egg: Path, tmp_path: Path) ->
         assert np.abs(image[20:30, 30:36] - content[20:30, 30:36, ::-1]).mean() > 20
 
 
+def test_the_camera_is_carried_round_the_middles_of_objects(capsys, egg: Path, tmp_path: Path) -> None:
+    """A mesh whose origin is far from its middle, placed at the same spot, is seen the same from the side."""
+    away = np.array([0.3, -0.1, 0.2])
+    loaded = trimesh.load_mesh(egg)
+    trimesh.Trimesh(loaded.vertices + away, loaded.faces).export(tmp_path / "away.ply")
+    seen = []
+    for mesh, place in ((egg, PLACE), (tmp_path / "away.ply", (PLACE - away).tolist())):
+        scenes = tmp_path / "scene.json"
+        line = detection_line()
+        line["detections"][0]["translation_m"] = place
+        scenes.write_text(json.dumps(line))
+        status, out, err = run(capsys, scenes, "--mesh", mesh, "--out", tmp_path / mesh.stem, "--turn-deg", 90)
+        assert status == 0, err
+        seen.append(pixels(Path(out.strip())))
+    assert (seen[0].sum(-1) > 0.1).sum() > 50
+    assert np.abs(seen[0] - seen[1]).mean() < 0.01
+
+
 @pytest.mark.parametrize("name", ["varied", "light"])
 def test_codes_look_as_in_their_world(capsys, tmp_path: Path, name: str) -> None:
     """From the world's own camera and from 90° round the scene."""
@@ -142,10 +161,12 @@ def test_codes_look_as_in_their_world(capsys, tmp_path: Path, name: str) -> None
         (detection_line(light=[0, 1]), [], 1, "light is .* expected finite numbers of shape"),
         (detection_line(camera_matrix=None), [], 1, "it is flat"),
         (detection_line(camera_matrix=[[1, 2], [3, 4]]), [], 1, "camera_matrix"),
-        (detection_line(), ["--over-photograph"], 1, "one.jpg: the image cannot be read"),
+        (detection_line(), ["--over-photograph"], 1, "one.jpg: the photograph cannot be read"),
         (detection_line(), ["--over-photograph", "--turn-deg", "5"], 2, "exclude each other"),
         (detection_line(), ["--world", "chairs"], 2, "exclude each other"),
         (detection_line(), ["--samples", "0"], 2, "at least 1"),
+        (detection_line(), ["--height", "100000"], 2, "--height 100000 for a picture of .*x100000 pixels, expected at"),
+        (detection_line(width=90_000, height=80_000, camera_matrix=HUGE), [], 1, "picture of 90000x80000 pixels"),
         ({"world": "atlantis", "code": {}}, [], 1, "expected one of spheres"),
         ({"world": "circles", "code": {}}, [], 1, "expected one of spheres"),
         ({"world": "spheres", "code": {"light": [1, 2]}}, [], 1, "scene code has"),

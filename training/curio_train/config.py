@@ -121,6 +121,8 @@ class WorldOptions:
     """The method unless --method is given."""
     default_recipe: ClassVar[Mapping[str, Any]] = {}
     """Hyperparameters that were measured to be better for this world than those of the preset laptop."""
+    is_flat: ClassVar[bool] = False
+    """Whether its scenes have two dimensions and no camera matrix, so that ``curio-view`` cannot show them."""
 
     @classmethod
     def upgraded(cls, stored: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -116,7 +116,7 @@ class Estimator(ABC):
 
     def result(self, image: SourceImage, data: bytes, seen: Seen) -> ImageResult:
         """The result of an image for the result file."""
-        is_turned = image.pixels is None and images.open_header(data).orientation > 1
+        has_rotation = image.pixels is None and images.open_header(data).orientation > 1
         return ImageResult(
             image.name,
             self.name,
@@ -127,8 +127,10 @@ class Estimator(ABC):
             seen.results,
             seen.decode_ms,
             seen.inference_ms,
-            is_turned=is_turned and not self.settings.apply_exif_rotation,
+            is_turned=has_rotation and not self.settings.apply_exif_rotation,
             recorded=image.recorded,
+            distortion=() if seen.camera is None else seen.camera.distortion,
+            exif_rotation=has_rotation and self.settings.apply_exif_rotation,
         )
 
     def failed(self, image: SourceImage, exc: Exception) -> ImageResult:

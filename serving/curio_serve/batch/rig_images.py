@@ -77,6 +77,7 @@ class RigEstimator:
             1e3 * (decoded - begun),
             1e3 * (time.perf_counter() - decoded),
             views=names,
+            distortion=views[0].camera.distortion,
         )
 
     def _view(self, image: SourceImage, of: RigCamera) -> RigView:

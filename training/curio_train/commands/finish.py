@@ -50,8 +50,9 @@ def end(
         verdict = _told(exc, warn)
     if isinstance(config.world, CaptureOptions):
         return _exported(run, config.world.camera, lambda: verdict)
+    viewed = "" if config.world.is_flat else f", or curio-view {run}"
     return (
-        f"to see what it learned: {run / REPORT_FILE}, or curio-view {run}\n"
+        f"to see what it learned: {run / REPORT_FILE}{viewed}\n"
         f"to serve it: curio-export {run} --out models/, then curio-serve models/"
     )
 

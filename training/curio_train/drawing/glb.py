@@ -18,7 +18,7 @@ from PIL import Image
 
 from curio_train.drawing.axes import GL_FROM_CV, embed, light_of, linear, pose_matrix, root_from_camera, towards_light
 from curio_train.drawing.pictures import SceneContext
-from curio_train.drawing.scenes import Placed, Scene
+from curio_train.drawing.scenes import Placed, Scene, located
 from curio_train.errors import DataError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import MAX_BYTES, Mesh
@@ -85,8 +85,10 @@ def _scene(tree: dict[str, Any], path: Path) -> Scene:
         np.array(about["camera_matrix"]),
         tuple(_placed(node, cam_from_root) for node in nodes.values()),
         strength * (cam_from_root @ _node_matrix(sun))[:3, 2],
-        None if about["photograph"] is None else Path(about["photograph"]),
+        None if about["photograph"] is None else located(Path(about["photograph"]), path.parent),
         about["world"],
+        tuple(map(float, about.get("distortion", ()))),
+        about.get("exif_rotation") is True,
     )
 
 
@@ -128,6 +130,8 @@ def _add_camera(tree: dict[str, Any], scene: Scene, root: np.ndarray, ambient: f
         "ambient": ambient,
         "photograph": None if scene.photograph is None else str(scene.photograph),
         "world": scene.world,
+        "distortion": list(scene.distortion),
+        "exif_rotation": scene.exif_rotation,
     }
     # A glTF camera looks along −z with y up, the scene's along +z with y down.
     _add_node(tree, _CAMERA, root @ embed(GL_FROM_CV), {"camera": 0, "extras": {_EXTRAS: about}})

@@ -8,11 +8,12 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from curio_serve.imaging.image import MAX_PIXELS
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from curio_train.camera import scale_matrix
-from curio_train.data.photographs import read_photograph
+from curio_train.drawing.photograph import photograph_of
 from curio_train.drawing.scenes import Placed, Scene
 from curio_train.errors import DataError, UsageError
 from curio_train.geometry import Pose
@@ -115,7 +116,8 @@ def picture(
         photograph: [height, width, 3] uint8 sRGB to draw over, in place of the scene's file.
 
     Raises:
-        DataError: An object without a mesh, or a photograph that is missing or of another size.
+        UsageError: The options' height makes the picture too large.
+        DataError: An object without a mesh, a photograph that is missing or of another size, or a scene too large.
         RendererError: No usable libLLVM, or a mesh that cannot be rendered.
     """
     scene, around = _resized(scene, options.height), _with_light(scene, around)
@@ -132,10 +134,18 @@ def picture(
 
 def _resized(scene: Scene, height: int | None) -> Scene:
     if height is None:
+        if scene.width * scene.height > MAX_PIXELS:
+            raise DataError(f"{scene.name}: found {_too_large(scene.width, scene.height)}; give a --height")
         return scene
     width = max(1, round(scene.width * height / scene.height))
+    if width * height > MAX_PIXELS:
+        raise UsageError(f"found --height {height} for {_too_large(width, height)}; give a smaller one")
     matrix = scale_matrix(scene.camera_matrix, (scene.width, scene.height), (width, height))
     return replace(scene, width=width, height=height, camera_matrix=matrix)
+
+
+def _too_large(width: int, height: int) -> str:
+    return f"a picture of {width}x{height} pixels, expected at most {MAX_PIXELS:,} pixels"
 
 
 def _with_light(scene: Scene, around: SceneContext) -> SceneContext:
@@ -147,14 +157,7 @@ def _photograph(scene: Scene) -> np.ndarray:
     """The scene's photograph, resized to the scene: [height, width, 3] in [0, 1]."""
     if scene.photograph is None:
         raise DataError(f"{scene.name} is a scene code, which has no photograph; leave out --over-photograph")
-    pixels = read_photograph(scene.photograph)
-    shape = pixels.shape[1] / pixels.shape[0]
-    if abs(shape * scene.height / scene.width - 1) > 0.02:
-        raise DataError(
-            f"{scene.photograph}: found {pixels.shape[1]}x{pixels.shape[0]} pixels, expected the shape of the frame "
-            f"that was detected in, {scene.width}x{scene.height}; is it another file by now?"
-        )
-    return _fitted(pixels, scene)
+    return _fitted(photograph_of(scene), scene)
 
 
 def _fitted(pixels: np.ndarray, scene: Scene) -> np.ndarray:

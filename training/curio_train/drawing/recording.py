@@ -3,11 +3,13 @@
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun
 from scipy.spatial.transform import Rotation
 
+from curio_train.drawing.photograph import is_stored_as_drawn, photograph_of
 from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Scene
 from curio_train.errors import DataError
@@ -41,15 +43,19 @@ def write_recording(path: Path, scenes: Iterable[tuple[Scene, SceneContext]]) ->
 def _log_camera(recording: rerun.RecordingStream, scene: Scene) -> None:
     size = [scene.width, scene.height]
     recording.log("camera", rerun.Pinhole(image_from_camera=scene.camera_matrix, resolution=size))
-    if scene.photograph is None:
-        return
+    if scene.photograph is not None:
+        recording.log("camera/image", _image(scene, scene.photograph))
+
+
+def _image(scene: Scene, photograph: Path) -> Any:
+    """The photograph's own file where that shows what a pinhole camera sees; else what it sees, as JPEG."""
+    if not is_stored_as_drawn(scene):
+        return rerun.Image(photograph_of(scene)).compress()
     try:
-        content = scene.photograph.read_bytes()
+        content = photograph.read_bytes()
     except OSError as exc:
-        raise DataError(
-            f"{scene.photograph}: the photograph cannot be read ({exc.strerror}); run where curio-detect ran"
-        ) from exc
-    recording.log("camera/image", rerun.EncodedImage(contents=content, media_type=_media_type(scene.photograph)))
+        raise DataError(f"{photograph}: the photograph cannot be read ({exc.strerror})") from exc
+    return rerun.EncodedImage(contents=content, media_type=_media_type(photograph))
 
 
 def _media_type(path: Path) -> str:

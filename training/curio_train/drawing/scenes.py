@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import json
+import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +23,7 @@ from curio_train.worlds.base import World
 from curio_train.worlds.generated.mesh_world import MeshWorld
 
 _MAX_BYTES = 1 << 28
+_VIDEO_FRAME = re.compile(r"(.+)#(\d+)", re.DOTALL)
 EXPECTED = 'a line of curio-detect with "detections", or {"world": NAME, "code": {FIELD: numbers}}'
 
 
@@ -55,9 +58,13 @@ class Scene:
     light: np.ndarray | None
     """Camera frame, towards the light [3], or None: not known."""
     photograph: Path | None = None
-    """That the objects were found in, or None."""
+    """That the objects were found in, or None; a frame of a video is ``clip.mp4#12``."""
     world: str | None = None
     """Name of the generated world that the scene is a code of, or None."""
+    distortion: tuple[float, ...] = ()
+    """OpenCV's coefficients of the camera that took the photograph: none, 4, 5 or 8; the scene itself has none."""
+    exif_rotation: bool = False
+    """Whether the photograph was rotated as EXIF says before objects were found in it."""
 
 
 @functools.cache
@@ -88,7 +95,7 @@ def read_scenes(path: Path) -> Iterator[Scene]:
         if "error" in record:
             continue
         try:
-            yield _from_code(record, number) if "code" in record else _from_detections(record, number, where)
+            yield _from_code(record, number) if "code" in record else _from_detections(record, number, path)
         except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as exc:
             raise DataError(f"{where}: not a scene ({type(exc).__name__}: {exc}); expected {EXPECTED}") from exc
 
@@ -113,7 +120,25 @@ def _records(path: Path) -> Iterator[tuple[int, Any]]:
                 raise DataError(f"{path}, line {number}: not JSON ({exc}); expected {EXPECTED}") from exc
 
 
-def _from_detections(record: Mapping[str, Any], number: int, where: str) -> Scene:
+def file_of(image: Path) -> tuple[Path, int | None]:
+    """The file that holds an image of a result file, and the image's number in it if that is a video."""
+    match = None if os.path.exists(image) else _VIDEO_FRAME.fullmatch(str(image))
+    return (image, None) if match is None else (Path(match[1]), int(match[2]))
+
+
+def located(image: Path, folder: Path) -> Path:
+    """An image by the path in a result file, which counts from where ``curio-detect`` was called.
+
+    Args:
+        image: As in the file.
+        folder: Of the result file; the image is looked for there if it is not found.
+    """
+    is_beside = not os.path.exists(file_of(image)[0]) and os.path.exists(file_of(folder / image)[0])
+    return folder / image if is_beside else image
+
+
+def _from_detections(record: Mapping[str, Any], number: int, path: Path) -> Scene:
+    where = f"{path}, line {number}"
     if record["camera_matrix"] is None:
         raise DataError(f"{where}: it has no camera_matrix, so it is flat; expected poses in three dimensions")
     width, height = int(record["width"]), int(record["height"])
@@ -125,7 +150,9 @@ def _from_detections(record: Mapping[str, Any], number: int, where: str) -> Scen
         check_matrix(record["camera_matrix"], width, height, f"{where}, camera_matrix"),
         tuple(_placed(detection) for detection in record["detections"]),
         None if light is None else _numbers(light, (3,), "light"),
-        Path(record["image"]),
+        located(Path(record["image"]), path.parent),
+        distortion=tuple(map(float, record.get("distortion") or ())),
+        exif_rotation=record.get("exif_rotation") is True,
     )
 
 

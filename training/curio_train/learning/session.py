@@ -111,7 +111,8 @@ def learn(
             trainer.state.progress.seconds_before += found.seconds
             _draw(trainer, cache)
 
-        with reporting(path, trainer.state.progress) if here.leads else nullcontext() as reporter:
+        told = reporting(path, trainer.state.progress, is_flat=config.world.is_flat) if here.leads else nullcontext()
+        with told as reporter:
             outcome = train(
                 trainer,
                 run,

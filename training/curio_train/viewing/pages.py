@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from curio_train.data.photographs import read_photograph
 from curio_train.drawing.album import MeshFiles, scene_context, scenes_of
+from curio_train.drawing.photograph import photograph_of
 from curio_train.drawing.pictures import LIGHT, SceneContext
 from curio_train.drawing.scenes import Scene, mesh_world, scene_of_code
 from curio_train.errors import CurioError, DataError, UsageError
@@ -160,19 +160,12 @@ def _of_results(path: Path, opening: Opening) -> list[Page]:
             raise UsageError(f"{path}: detections do not hold the shape of the objects; add --mesh FILE or NAME=FILE")
         for item in scene.objects:
             context.mesh(item.kind)
-        photograph = None if scene.photograph is None else _photograph(scene.photograph, path.parent)
-        if photograph is None:
-            photograph = np.zeros((scene.height, scene.width, 3), np.uint8)
-        pages.append(Page(scene, context, photograph, over_image=scene.photograph is not None))
+        has_photograph = scene.photograph is not None
+        image = photograph_of(scene) if has_photograph else np.zeros((scene.height, scene.width, 3), np.uint8)
+        pages.append(Page(scene, context, image, over_image=has_photograph))
     if not pages:
         raise DataError(f"{path}: every line reports an error; there is nothing to show")
     return pages
-
-
-def _photograph(path: Path, beside: Path) -> np.ndarray:
-    """A photograph by the path in a result file, which counts from where ``curio-detect`` was called."""
-    found = path if path.exists() else beside / path
-    return read_photograph(found if found.exists() else path)
 
 
 def _of_photographs(path: Path, opening: Opening) -> list[Page]:

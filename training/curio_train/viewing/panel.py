@@ -63,19 +63,20 @@ class Panel:
         self.position.value = _triple(1000 * item.pose.translation_m)
         self.rotation.value = _triple(Rotation.from_matrix(item.pose.rotation).as_rotvec(degrees=True))
         self.color.value = tuple(round(255 * value) for value in item.color_srgb)
-        self.confidence.value = round(item.confidence, 2)
+        self.confidence.value = _shown(item.confidence)
 
     def edited(self, item: Placed) -> Placed:
         """An object with the fields that the controls show; a field that is as it was keeps all its digits."""
         rotation = Rotation.from_rotvec(self.rotation.value, degrees=True).as_matrix()
         if np.allclose(rotation, item.pose.rotation, atol=_UNCHANGED):
             rotation = item.pose.rotation
+        confidence = float(self.confidence.value)
+        if confidence == _shown(item.confidence):
+            confidence = item.confidence
         color = tuple(value / 255 for value in self.color.value)
         if np.allclose(color, item.color_srgb, atol=0.5 / 255):
             color = item.color_srgb
-        return Placed(
-            item.kind, Pose(rotation, np.array(self.position.value) / 1000), color, float(self.confidence.value)
-        )
+        return Placed(item.kind, Pose(rotation, np.array(self.position.value) / 1000), color, confidence)
 
     def show_pictures(self, drawn: Comparison) -> None:
         """Show photograph, re-rendering, difference and loss."""
@@ -91,6 +92,11 @@ class Panel:
     def message(self, text: str) -> None:
         """Say what was done, or what failed."""
         self._message.content = text
+
+
+def _shown(confidence: float) -> float:
+    """A confidence as its control shows it."""
+    return round(confidence, 2)
 
 
 def _triple(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:

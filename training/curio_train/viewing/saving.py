@@ -28,6 +28,8 @@ def _record(scene: Scene) -> dict[str, object]:
         "width": scene.width,
         "height": scene.height,
         "camera_matrix": scene.camera_matrix.tolist(),
+        **({"distortion": list(scene.distortion)} if any(scene.distortion) else {}),
+        **({"exif_rotation": True} if scene.exif_rotation else {}),
         "detections": [
             {
                 "object": item.kind,

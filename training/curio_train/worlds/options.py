@@ -37,6 +37,8 @@ def _make_absolute(options: WorldOptions, *names: str) -> None:
 class CirclesOptions(WorldOptions):
     """A red circle of constant size on black: 2D position alone. Needs no data."""
 
+    is_flat: ClassVar[bool] = True
+
 
 @dataclass(frozen=True)
 class SpheresOptions(WorldOptions):

@@ -50,6 +50,10 @@ class ImageResult:
     """For an image of a robot's recording."""
     views: Sequence[str] = ()
     """Images of all cameras of a rig; poses are then in the rig's frame."""
+    distortion: Sequence[float] = ()
+    """OpenCV's coefficients that were used with K; empty if none were."""
+    exif_rotation: bool = False
+    """The pixels were rotated as EXIF asks; size, K and distortion are of the frame after that."""
 
     @property
     def detections(self) -> list[Detection]:
@@ -127,7 +131,8 @@ class ResultFormat(ABC):
 class JsonLines(ResultFormat):
     """One JSON object an image, always with the same keys; ``error`` stands in place of ``detections``.
 
-    What does not apply (the rotation of a flat object, the size of what is no image) is null.
+    What does not apply (the rotation of a flat object, the size of what is no image) is null. ``views``, ``distortion``
+    and ``exif_rotation`` are there only where they apply.
     """
 
     opening = b'{"image": '
@@ -141,6 +146,8 @@ class JsonLines(ResultFormat):
             "width": result.width,
             "height": result.height,
             "camera_matrix": rows(result.camera_matrix, 3) or None,
+            **({"distortion": list(result.distortion)} if any(result.distortion) else {}),
+            **({"exif_rotation": True} if result.exif_rotation else {}),
             **({"error": result.error} if result.error else answer),
             "light": result.light or None,
             "model": {"name": result.model, "version": result.version},

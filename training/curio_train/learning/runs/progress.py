@@ -42,7 +42,7 @@ _BAR_WIDTH = 12
 class Reporter:
     """Reports the progress of one run; see :func:`reporting`."""
 
-    def __init__(self, run: Path, progress: TrainingProgress, console: Console) -> None:
+    def __init__(self, run: Path, progress: TrainingProgress, console: Console, *, is_flat: bool) -> None:
         self._run = run
         self._progress = progress
         self._console = console
@@ -52,8 +52,8 @@ class Reporter:
         self._counts: Counter[str] = Counter()
         self._since = (progress.step, progress.images, progress.seconds)
         self._logged_at = progress.seconds
-        watched = f"{run}: to watch it learn: curio-view {run}, or tensorboard --logdir {run}"
-        console.print(watched, soft_wrap=True, markup=False)
+        viewed = "" if is_flat else f"curio-view {run}, or "
+        console.print(f"{run}: to watch it learn: {viewed}tensorboard --logdir {run}", soft_wrap=True, markup=False)
         self._bar: Progress | None = None
         self._task = TaskID(0)
         if console.is_terminal:
@@ -134,11 +134,20 @@ class Reporter:
 
 
 @contextmanager
-def reporting(run: Path, progress: TrainingProgress) -> Iterator[Reporter]:
-    """Report a run from ``progress`` on; drops lines of a killed session that are later than that."""
+def reporting(run: Path, progress: TrainingProgress, *, is_flat: bool) -> Iterator[Reporter]:
+    """Report a run from ``progress`` on; drops lines of a killed session that are later than that.
+
+    Args:
+        run: The run folder.
+        progress: Counted on by whoever trains.
+        is_flat: Whether the run's world is one that ``curio-view`` cannot show.
+
+    Raises:
+        CheckpointError: The run folder cannot be written into.
+    """
     with _writing_into(run):
         _drop_after(run, progress.step)
-        reporter = Reporter(run, progress, Console(stderr=True, highlight=False))
+        reporter = Reporter(run, progress, Console(stderr=True, highlight=False), is_flat=is_flat)
     try:
         yield reporter
     finally:
