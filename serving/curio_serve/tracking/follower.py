@@ -203,7 +203,7 @@ class Follower:
         if len(same) >= following.num_objects:
             replaced = min(same, key=lambda track: (track.is_seen, track.seen_s, track.measured.confidence))
             is_surer = measured.confidence > replaced.measured.confidence + _SURER
-            if replaced.is_seen and (not is_surer or self._is_taken(replaced, measured.translation_m)):
+            if (replaced.is_seen and not is_surer) or self._is_taken(replaced, measured.translation_m):
                 return
             self._tracks.remove(replaced)
         self._last_number += 1
