@@ -18,6 +18,7 @@ import trimesh
 from curio_serve.files import read_file
 
 from curio_train.errors import MeshError, UsageError
+from curio_train.meshes.appearance import appearance, joined
 from curio_train.meshes.cad import CAD_SUFFIXES, read_cad
 from curio_train.meshes.extent import box_corners, diameter
 
@@ -32,7 +33,6 @@ _READER_ERRORS = (
     *(ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError, OSError),
     *(MemoryError, ArithmeticError),
 )
-_TRIMESH_DEFAULT_COLOR = (102, 102, 102)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ def load_mesh(path: Path, unit: Unit | None = None, body: str | None = None) -> 
         loaded.merge_vertices()  # STL repeats the corners of every triangle
     _check(path, loaded)
     loaded.remove_unreferenced_vertices()  # stray points would count towards the diameter
-    colors, uv, texture = _appearance(path, loaded)
+    colors, uv, texture = appearance(loaded)
     read_unit = unit or _unit_of(path, loaded)
     mesh = Mesh(
         vertices_m=np.asarray(loaded.vertices, dtype=np.float64) * METRES[read_unit],
@@ -148,7 +148,7 @@ def _from_cad(path: Path, content: bytes, unit: Unit | None, body: str | None) -
     except _READER_ERRORS as exc:
         raise MeshError(f"{path}: what OpenCASCADE made of it is no mesh ({exc}); export it again") from exc
     _check(path, merged)
-    colors, _, _ = _appearance(path, merged)
+    colors, _, _ = appearance(merged)
     mesh = Mesh(
         np.asarray(merged.vertices, np.float64), np.asarray(merged.faces, np.int64), colors, sha256="-", bodies=bodies
     )
@@ -187,7 +187,8 @@ def _parse(path: Path, content: bytes) -> Any:
     kind = path.suffix.lower().lstrip(".")
     resolver = _Beside(str(path))
     try:
-        return trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
+        scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
+        return joined(path, scene)
     except _READER_ERRORS as exc:
         # Without its optional packages for odd encodings trimesh names those; they would not make a mesh of garbage.
         reason = "garbled text" if isinstance(exc, ImportError) else exc
@@ -236,24 +237,3 @@ def _check_size(path: Path, mesh: Mesh, unit: str, *, given: bool) -> None:
     raise MeshError(
         f"{path}: found a diameter of {found} ({source}), expected {SMALLEST_M:g} to {LARGEST_M:g} m; {remedy}"
     )
-
-
-def _appearance(path: Path, loaded: Any) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
-    """Vertex colours, texture coordinates and texture; colours of faces are averaged at their corners."""
-    visual = loaded.visual
-    if visual.kind in ("vertex", "face"):
-        return np.asarray(visual.vertex_colors)[:, :3] / 255.0, None, None
-    if visual.kind != "texture":
-        return None, None, None
-    material = visual.material
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if image is not None and visual.uv is not None:
-        try:
-            texture = np.asarray(image.convert("RGB"))  # decodes only now
-        except (OSError, ValueError) as exc:
-            raise MeshError(f"{path}: its texture cannot be decoded ({exc})") from exc
-        return None, np.asarray(visual.uv, dtype=np.float64), texture
-    color = np.asarray(material.main_color)[:3]
-    if tuple(color) == _TRIMESH_DEFAULT_COLOR:
-        return None, None, None
-    return np.tile(color / 255.0, (len(loaded.vertices), 1)), None, None
