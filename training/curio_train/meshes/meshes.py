@@ -21,12 +21,13 @@ from curio_train.errors import MeshError, UsageError
 from curio_train.meshes.appearance import appearance, joined
 from curio_train.meshes.cad import CAD_SUFFIXES, read_cad
 from curio_train.meshes.extent import box_corners, diameter
+from curio_train.meshes.gltf import GLTF_SUFFIXES, read_gltf
 
 Unit = Literal["m", "cm", "mm", "inch"]
 METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 SMALLEST_M, LARGEST_M = 0.001, 20.0
 MAX_BYTES = 1 << 28  # of a mesh, a material or a texture; in memory a mesh takes eight times that
-SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off", *CAD_SUFFIXES)
+SUFFIXES = (".ply", ".obj", ".stl", *GLTF_SUFFIXES, ".off", *CAD_SUFFIXES)
 
 # What trimesh's readers let through on damaged files, found by feeding them such.
 _READER_ERRORS = (
@@ -80,7 +81,7 @@ def load_mesh(path: Path, unit: Unit | None = None, body: str | None = None) -> 
     """Read a PLY, OBJ, STL, glTF, OFF, STEP or IGES file; parts of a scene and bodies of an assembly become one mesh.
 
     Faces without area are kept: they are part of the file and the renderer passes over them. A colour or factor that
-    a material has beside its texture is not applied.
+    a material has beside its texture is not applied. Colours of glTF are linear light, and are encoded to sRGB.
 
     Args:
         path: The file.
@@ -187,7 +188,10 @@ def _parse(path: Path, content: bytes) -> Any:
     kind = path.suffix.lower().lstrip(".")
     resolver = _Beside(str(path))
     try:
-        scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
+        if kind in ("glb", "gltf"):
+            scene = read_gltf(content, kind, resolver)
+        else:
+            scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
         return joined(path, scene)
     except _READER_ERRORS as exc:
         # Without its optional packages for odd encodings trimesh names those; they would not make a mesh of garbage.
@@ -216,7 +220,7 @@ def _check(path: Path, loaded: Any) -> None:
 
 def _unit_of(path: Path, loaded: Any) -> str:
     """The unit the file names; metres where it names none or one we don't know."""
-    if path.suffix.lower() in (".glb", ".gltf"):
+    if path.suffix.lower() in GLTF_SUFFIXES:
         return "m"
     named = {"meters": "m", "millimeters": "mm", "centimeters": "cm", "inches": "inch", "in": "inch"}
     unit = str(loaded.units)
