@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import io
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +18,7 @@ from curio_serve.files import read_file
 
 from curio_train.errors import MeshError, UsageError
 from curio_train.meshes.appearance import appearance, joined
+from curio_train.meshes.beside import Beside
 from curio_train.meshes.cad import CAD_SUFFIXES, read_cad
 from curio_train.meshes.extent import box_corners, diameter
 from curio_train.meshes.gltf import GLTF_SUFFIXES, read_gltf
@@ -169,29 +169,16 @@ def _read(path: Path) -> bytes:
     return content
 
 
-class _Beside(trimesh.resolvers.FilePathResolver):
-    """Materials and textures, which lie beside the mesh."""
-
-    def get(self, name: str) -> bytes:
-        """The content of one; only of regular files.
-
-        Raises:
-            OSError: There is none, or it is too large.
-        """
-        for candidate in (name, name.strip().lstrip("/"), Path(name).name):
-            with suppress(FileNotFoundError, ValueError):  # ValueError: it would lie elsewhere
-                return read_file(self.absolute(candidate), MAX_BYTES)
-        raise FileNotFoundError(name)
-
-
 def _parse(path: Path, content: bytes) -> Any:
     kind = path.suffix.lower().lstrip(".")
-    resolver = _Beside(str(path))
+    resolver = Beside(path, MAX_BYTES)
     try:
         if kind in ("glb", "gltf"):
             scene = read_gltf(content, kind, resolver)
         else:
             scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
+        if kind != "ply":  # those have colours of vertices, as a rule
+            resolver.refuse_missing()
         return joined(path, scene)
     except _READER_ERRORS as exc:
         # Without its optional packages for odd encodings trimesh names those; they would not make a mesh of garbage.
