@@ -93,3 +93,15 @@ def test_a_missing_texture_of_gltf_is_refused(tmp_path: Path) -> None:
     (tmp_path / "red.png").unlink()
     with pytest.raises(MeshError, match=r"red\.png cannot be read \(there is no such file\)"):
         load_mesh(path)
+
+
+def test_names_in_gltf_are_quoted(tmp_path: Path) -> None:
+    path = write_gltf(tmp_path)
+    tree = json.loads(path.read_text())
+    for named in (*tree["buffers"], *tree["images"]):
+        (tmp_path / named["uri"]).rename(tmp_path / f"my ä {named['uri']}")
+        named["uri"] = f"my%20%C3%A4%20{named['uri']}"
+    path.write_text(json.dumps(tree))
+    mesh = load_mesh(path)
+    assert mesh.faces.shape == (12, 3)
+    assert mesh.texture is not None

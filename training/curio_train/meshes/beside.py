@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
 
 import trimesh
 from curio_serve.files import read_file
@@ -82,7 +83,7 @@ class Beside(trimesh.resolvers.FilePathResolver):
 
 
 def _spellings(name: str) -> Iterator[str]:
-    """What may be meant, likeliest first: Windows has backslashes, and absolute paths are of another machine."""
+    """What may be meant, likeliest first: from Windows, another machine, or quoted as glTF has it."""
     written = name.strip()
-    for path in (written, _MTL_OPTIONS.sub("", written).strip('"').replace("\\", "/")):
+    for path in (written, _MTL_OPTIONS.sub("", written).strip('"').replace("\\", "/"), unquote(written)):
         yield from filter(None, (path, path.lstrip("/"), PurePosixPath(path).name))
