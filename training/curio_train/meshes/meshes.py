@@ -179,6 +179,9 @@ def _parse(path: Path, content: bytes) -> Any:
             scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
         if kind != "ply":  # those have colours of vertices, as a rule
             resolver.refuse_missing()
+        points = [part for part in scene.geometry.values() if isinstance(part, trimesh.PointCloud)]
+        if len(points) == len(scene.geometry) > 0:
+            raise _no_surface(path, sum(len(cloud.vertices) for cloud in points))
         return joined(path, scene)
     except _READER_ERRORS as exc:
         # Without its optional packages for odd encodings trimesh names those; they would not make a mesh of garbage.
@@ -191,11 +194,7 @@ def _check(path: Path, loaded: Any) -> None:
     if path.suffix.lower() == ".stl" and len(faces) == 0:  # trimesh takes a binary file that is cut off for text
         raise MeshError(f"{path}: not a readable STL mesh (it holds no triangle); is the file complete?")
     if len(faces) == 0:
-        kind = path.suffix.lstrip(".").upper()
-        raise MeshError(
-            f"{path}: found {len(vertices)} vertices and no faces in this {kind} file; a surface is needed, not a "
-            "point cloud; is the file complete?"
-        )
+        raise _no_surface(path, len(vertices))
     num_broken = int((~np.isfinite(vertices).all(axis=1)).sum())
     if num_broken:
         raise MeshError(f"{path}: {num_broken} of {len(vertices)} vertices are NaN or infinite; repair the mesh")
@@ -203,6 +202,14 @@ def _check(path: Path, loaded: Any) -> None:
     if low < 0 or high >= len(vertices):
         wrong = low if low < 0 else high
         raise MeshError(f"{path}: a face names vertex {wrong}, but there are {len(vertices)}; is the file complete?")
+
+
+def _no_surface(path: Path, num_vertices: int) -> MeshError:
+    kind = path.suffix.lstrip(".").upper()
+    return MeshError(
+        f"{path}: found {num_vertices} vertices and no faces in this {kind} file; a surface is needed, not a "
+        "point cloud; is the file complete?"
+    )
 
 
 def _unit_of(path: Path, loaded: Any) -> str:
