@@ -72,6 +72,12 @@ def test_materials_are_found(tmp_path: Path, library: str) -> None:
     assert mesh.texture[0, 0].tolist() == [*RED]
 
 
+def test_texture_coordinates_without_materials_are_no_color(tmp_path: Path) -> None:
+    mesh = load_mesh(textured(tmp_path, "map_Kd red.png", library="gone.mtl"))
+    assert mesh.texture is None
+    assert mesh.vertex_colors_srgb is None
+
+
 def write_gltf(folder: Path) -> Path:
     """A glTF file with a texture and buffers beside it."""
     part = trimesh.creation.box((0.1, 0.1, 0.1))

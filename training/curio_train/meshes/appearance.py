@@ -58,7 +58,8 @@ def _tell_apart(path: Path, parts: Sequence[Any]) -> None:
         if visual.kind != "texture":
             continue
         image = getattr(visual.material, "baseColorTexture", None) or getattr(visual.material, "image", None)
-        if image is not None and visual.uv is not None:
+        # Where there is no material trimesh makes a grey picture up; one read from a file has a format.
+        if image is not None and image.format is not None and visual.uv is not None:
             if id(image) not in materials:
                 materials[id(image)] = SimpleMaterial(image=_decoded(path, image))
             part.visual = TextureVisuals(visual.uv, materials[id(image)])
