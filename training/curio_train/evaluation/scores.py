@@ -11,7 +11,7 @@ from curio_train.data.bop import ModelInfo
 from curio_train.geometry import Pose, rotation_angle_deg
 from curio_train.metrics.assignment import each_parameter_error, scene_error
 from curio_train.metrics.images import dssim
-from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, recall, symmetry_poses
+from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, recall, symmetry_poses, turned_alike
 from curio_train.scene_code import TRANSLATION, SceneCode, index, poses
 from curio_train.worlds.base import World, novel_view
 from curio_train.worlds.single_object.world import SingleObjectWorld
@@ -91,7 +91,8 @@ def add_errors(estimates: Sequence[Pose], truths: Sequence[Pose], points: np.nda
 
 
 def rotation_errors_deg(estimates: Sequence[Pose], truths: Sequence[Pose], info: ModelInfo) -> np.ndarray:
-    """Angle [num_poses] between each estimate and the closest of the true poses that look alike."""
+    """Angle [num_poses] between each estimate and the closest of the true poses that look alike; 0 for a ball."""
+    truths = [turned_alike(truth, estimate, info) for estimate, truth in zip(estimates, truths, strict=True)]
     alike = torch.from_numpy(np.stack([pose.rotation for pose in symmetry_poses(info)]))
     found, true = (torch.from_numpy(np.stack([pose.rotation for pose in side])) for side in (estimates, truths))
     return rotation_angle_deg(found[:, None], true[:, None] @ alike).amin(dim=1).numpy()
