@@ -96,6 +96,8 @@ def test_turns_that_look_alike_are_no_errors() -> None:
     assert rotation_errors_deg(estimates, truth, ModelInfo(DIAMETER_M)) == pytest.approx([90, 100, 90], abs=1e-3)
     assert rotation_errors_deg(estimates, truth, discrete) == pytest.approx([0, 10, 90], abs=1e-3)
     assert rotation_errors_deg(estimates, truth, around) == pytest.approx([0, 0, 0], abs=0.6)  # half a step
+    ball = ModelInfo(DIAMETER_M, symmetry_axes=tuple((axis, np.zeros(3)) for axis in np.eye(3)[:2]))
+    assert rotation_errors_deg(estimates, truth, ball) == pytest.approx([0, 0, 0], abs=1e-6)
 
 
 def test_a_pose_that_looks_alike_has_no_scene_error(brick_world: TwoStageWorld) -> None:
@@ -201,6 +203,22 @@ def test_real_frames_are_scored_where_bop_asks(data: Path, tmp_path: Path) -> No
         assert np.array(row[4].split(), float) == pytest.approx(np.eye(3).ravel(), abs=1e-3)
         assert np.array(row[5].split(), float) == pytest.approx([0, 0, 800], abs=0.5)
         assert float(row[6]) > 0
+
+
+def test_a_ball_is_found_however_it_is_turned(data: Path) -> None:
+    trimesh.creation.icosphere(radius=40).export(data / "models" / "obj_000001.ply")
+    axes = [{"axis": axis, "offset": [0, 0, 0]} for axis in ([0, 0, 1], [1, 0, 0])]
+    info = {"1": {"diameter": 80, "symmetries_continuous": axes}}
+    (data / "models" / "models_info.json").write_text(json.dumps(info))
+    labels = data / "test/000002/scene_gt.json"
+    rows = json.loads(labels.read_text())
+    rows["3"][0]["cam_R_m2c"] = Rotation.from_euler("xyz", [70, 80, 100], degrees=True).as_matrix().ravel().tolist()
+    labels.write_text(json.dumps(rows))
+    world = build(LinemodOptions("ape", data, gaze=False))
+    found = evaluate_real_frames(always_at(world, [0.0, 0.0, 0.8]), data, None)
+    assert found["targets"][0]["rotation_deg"] == 0
+    assert found["metrics"]["mssd_recall"] == 0.5  # image 4 is 117 mm off
+    assert found["metrics"]["mspd_recall"] >= 0.5
 
 
 def test_what_agrees_in_several_reads_is_scored(data: Path) -> None:

@@ -16,6 +16,11 @@ from scipy.spatial.distance import pdist
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
+POINTS = (
+    "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    "0 0 0\n1 1 1\n"
+)
+
 
 def write(path: Path, content: str | bytes) -> Path:
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -81,7 +86,8 @@ def test_impossible_sizes(tmp_path: Path, size: float, unit: str | None, expecte
         ("words.obj", "hello world", "no faces"),
         ("words.stl", b"\x00\xff\xfe" * 40, "STL"),
         ("short.glb", b"glTF", "not a readable GLB"),
-        ("points.obj", TRIANGLE, "no faces"),
+        ("points.obj", TRIANGLE, "found 3 vertices and no faces"),
+        ("points.ply", POINTS, "found 2 vertices and no faces"),
         ("nan.obj", TRIANGLE.replace("1 0 0", "nan 0 0") + "f 1 2 3\n", "NaN or infinite"),
         ("inf.obj", TRIANGLE.replace("1 0 0", "inf 0 0") + "f 1 2 3\n", "NaN or infinite"),
         ("high.ply", ply("0 0 0\n1 0 0\n0 1 0\n", "3 0 1 9\n"), "vertex 9"),
@@ -123,9 +129,10 @@ def test_pipes_are_not_waited_for(tmp_path: Path) -> None:
     for name in ("b.mtl", "c.png"):
         os.mkfifo(tmp_path / name)
     write(tmp_path / "c.mtl", "newmtl m\nmap_Kd c.png\n")
-    for name in ("b", "c"):
-        mesh = load_mesh(write(tmp_path / f"{name}.obj", f"mtllib {name}.mtl\nusemtl m\n{TRIANGLE}f 1 2 3\n"))
-        assert mesh.texture is None
+    text = f"usemtl m\n{TRIANGLE}f 1 2 3\n"
+    assert load_mesh(write(tmp_path / "b.obj", f"mtllib b.mtl\n{text}")).texture is None
+    with pytest.raises(MeshError, match="not a regular file"):
+        load_mesh(write(tmp_path / "c.obj", f"mtllib c.mtl\n{text}"))
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".glb"])

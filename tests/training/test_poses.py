@@ -109,6 +109,32 @@ def test_continuous_symmetry() -> None:
     assert len(poses.symmetry_poses(both)) == 630
 
 
+BALL_AXES = ((np.array([0.0, 0, 2]), np.array([0.1, 0.02, 5])), (np.array([1.0, 1, 0]), np.array([0.2, 0.12, -0.03])))
+BALL_CENTRE = np.array([0.1, 0.02, -0.03])  # where they meet
+
+
+def test_a_ball_turns_any_way() -> None:
+    info = ModelInfo(diameter_m=0.2, symmetry_axes=BALL_AXES)
+    points = CLOUD / np.linalg.norm(CLOUD, axis=1, keepdims=True) * 0.1 + BALL_CENTRE
+    turn, true_turn = Rotation.random(2, random_state=3).as_matrix()
+    moved_m = np.array([0.003, 0, 0.004])
+    truth = Pose(true_turn, np.array([0.1, 0.2, 0.8]))
+    estimate = Pose(turn, truth.apply(BALL_CENTRE) + moved_m - turn @ BALL_CENTRE)
+    alike = poses.turned_alike(truth, estimate, info)
+    assert alike.apply(BALL_CENTRE) == pytest.approx(truth.apply(BALL_CENTRE))
+    assert poses.rotation_error_deg(estimate, alike) == pytest.approx(0, abs=1e-9)
+    assert poses.mssd_m(estimate, alike, points, poses.symmetry_poses(info)) == pytest.approx(0.005)
+    still = Pose(turn, estimate.translation_m - moved_m)
+    assert poses.mspd_px(still, alike, points, poses.symmetry_poses(info), K) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("axes", [BALL_AXES[:1], (BALL_AXES[0], (np.array([0.0, 0, -1]), np.zeros(3))), ()])
+def test_what_has_one_axis_is_no_ball(axes: tuple[tuple[np.ndarray, np.ndarray], ...]) -> None:
+    info = ModelInfo(diameter_m=0.2, symmetry_axes=axes)
+    assert not info.turns_any_way
+    assert poses.turned_alike(ORIGIN, turned("x", 20), info) is ORIGIN
+
+
 def test_projection() -> None:
     # 1 cm sideways at 1 m through a focal length of 500 px is 5 px for points of depth 1 m.
     estimate = moved(0.01, 0, 0)

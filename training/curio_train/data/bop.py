@@ -33,6 +33,7 @@ _LINEMOD = "LineMOD (Hinterstoisser et al. 2012)"
 _BOP = "as published by the BOP benchmark, https://bop.felk.cvut.cz"
 
 _MM = METRES["mm"]
+_PARALLEL = 0.01  # axes of unit length that differ by less are one
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _HOW_TO_GET = (
     "download it with: hf download bop-benchmark/{name} --repo-type dataset --local-dir DIR, and unpack the zips"
@@ -98,6 +99,12 @@ class ModelInfo:
     def is_symmetric(self) -> bool:
         """Whether more than one pose looks the same; such objects are scored by ADD-S."""
         return bool(self.symmetries or self.symmetry_axes)
+
+    @property
+    def turns_any_way(self) -> bool:
+        """Whether it looks the same after every turn about its centre, as a ball does: it has two axes or more."""
+        axes = np.array([axis for axis, _ in self.symmetry_axes])
+        return len(axes) > 1 and bool(np.linalg.matrix_rank(axes, tol=_PARALLEL) > 1)
 
 
 class BopDataset:

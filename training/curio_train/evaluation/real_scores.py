@@ -18,6 +18,7 @@ from curio_train.metrics.poses import (
     recall,
     symmetry_poses,
     translation_error_m,
+    turned_alike,
 )
 from curio_train.worlds.base import ObjectKind
 
@@ -99,9 +100,13 @@ def _metrics(pairs: Pairs, points: np.ndarray, info: ModelInfo) -> dict[str, flo
     estimates, truths = [e.pose for e, _ in pairs], [target.pose for _, target in pairs]
     scores = pose_scores(estimates, truths, points, info)
     scores.pop("add_recall")
-    alike = symmetry_poses(info)
-    surface = [mssd_m(e, t, points, alike) / info.diameter_m for e, t in zip(estimates, truths, strict=True)]
-    pixels = [mspd_px(e.pose, target.pose, points, alike, e.frame.matrix) * 640 / e.frame.width for e, target in pairs]
+    same = symmetry_poses(info)
+    nearest = [turned_alike(truth, estimate, info) for estimate, truth in zip(estimates, truths, strict=True)]
+    surface = [mssd_m(e, t, points, same) / info.diameter_m for e, t in zip(estimates, nearest, strict=True)]
+    pixels = [
+        mspd_px(e.pose, t, points, same, e.frame.matrix) * 640 / e.frame.width
+        for (e, _), t in zip(pairs, nearest, strict=True)
+    ]
     return {
         **_recall("add_recall", pairs, points, info),
         **scores,

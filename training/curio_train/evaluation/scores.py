@@ -11,7 +11,7 @@ from curio_train.data.bop import ModelInfo
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
 from curio_train.metrics.assignment import each_parameter_error, scene_error
 from curio_train.metrics.images import dssim
-from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, recall, symmetry_poses
+from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, recall, symmetry_poses, turned_alike
 from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode, index, poses
 from curio_train.worlds.base import World, novel_view
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
@@ -70,6 +70,9 @@ def _nearest_alike(world: World, predicted: SceneCode, true: SceneCode) -> Scene
     rotation = true[ROTATION_6D].clone()
     for kind in world.objects:
         (slot,) = kind.slots
+        if kind.info.turns_any_way:
+            rotation[:, slot] = predicted[ROTATION_6D][:, slot]
+            continue
         alike = torch.from_numpy(np.stack([pose.rotation for pose in symmetry_poses(kind.info, SYMMETRY_STEP)]))
         found, wanted = (matrix_from_rotation_6d(code[ROTATION_6D][:, slot].double()) for code in (predicted, true))
         candidates = wanted[:, None] @ alike.to(wanted)
@@ -111,7 +114,8 @@ def add_errors(estimates: Sequence[Pose], truths: Sequence[Pose], points: np.nda
 
 
 def rotation_errors_deg(estimates: Sequence[Pose], truths: Sequence[Pose], info: ModelInfo) -> np.ndarray:
-    """Angle [num_poses] between each estimate and the closest of the true poses that look alike."""
+    """Angle [num_poses] between each estimate and the closest of the true poses that look alike; 0 for a ball."""
+    truths = [turned_alike(truth, estimate, info) for estimate, truth in zip(estimates, truths, strict=True)]
     alike = torch.from_numpy(np.stack([pose.rotation for pose in symmetry_poses(info)]))
     found, true = (torch.from_numpy(np.stack([pose.rotation for pose in side])) for side in (estimates, truths))
     return rotation_angle_deg(found[:, None], true[:, None] @ alike).amin(dim=1).numpy()

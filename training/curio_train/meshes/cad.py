@@ -26,6 +26,7 @@ import trimesh
 
 from curio_train.errors import MeshError, UsageError
 from curio_train.meshes.extent import diameter
+from curio_train.meshes.gltf import srgb_from_linear
 
 Kind = Literal["step", "iges"]
 CAD_SUFFIXES = (".step", ".stp", ".iges", ".igs")
@@ -167,8 +168,7 @@ def _color_srgb(part: trimesh.Trimesh) -> np.ndarray | None:
     factor = getattr(getattr(part.visual, "material", None), "baseColorFactor", None)
     if factor is None:
         return None
-    linear = np.asarray(factor)[:3] / 255
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return srgb_from_linear(np.asarray(factor)[:3] / 255)
 
 
 def _chosen(path: Path, bodies: list[_Body], name: str | None) -> list[_Body]:

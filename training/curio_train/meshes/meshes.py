@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import io
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,21 +17,23 @@ import trimesh
 from curio_serve.files import read_file
 
 from curio_train.errors import MeshError, UsageError
+from curio_train.meshes.appearance import appearance, joined
+from curio_train.meshes.beside import Beside
 from curio_train.meshes.cad import CAD_SUFFIXES, read_cad
 from curio_train.meshes.extent import box_corners, diameter
+from curio_train.meshes.gltf import GLTF_SUFFIXES, read_gltf
 
 Unit = Literal["m", "cm", "mm", "inch"]
 METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 SMALLEST_M, LARGEST_M = 0.001, 20.0
 MAX_BYTES = 1 << 28  # of a mesh, a material or a texture; in memory a mesh takes eight times that
-SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off", *CAD_SUFFIXES)
+SUFFIXES = (".ply", ".obj", ".stl", *GLTF_SUFFIXES, ".off", *CAD_SUFFIXES)
 
 # What trimesh's readers let through on damaged files, found by feeding them such.
 _READER_ERRORS = (
     *(ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError, OSError),
     *(MemoryError, ArithmeticError),
 )
-_TRIMESH_DEFAULT_COLOR = (102, 102, 102)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +81,7 @@ def load_mesh(path: Path, unit: Unit | None = None, body: str | None = None) -> 
     """Read a PLY, OBJ, STL, glTF, OFF, STEP or IGES file; parts of a scene and bodies of an assembly become one mesh.
 
     Faces without area are kept: they are part of the file and the renderer passes over them. A colour or factor that
-    a material has beside its texture is not applied.
+    a material has beside its texture is not applied. Colours of glTF are linear light, and are encoded to sRGB.
 
     Args:
         path: The file.
@@ -102,7 +103,7 @@ def load_mesh(path: Path, unit: Unit | None = None, body: str | None = None) -> 
         loaded.merge_vertices()  # STL repeats the corners of every triangle
     _check(path, loaded)
     loaded.remove_unreferenced_vertices()  # stray points would count towards the diameter
-    colors, uv, texture = _appearance(path, loaded)
+    colors, uv, texture = appearance(loaded)
     read_unit = unit or _unit_of(path, loaded)
     mesh = Mesh(
         vertices_m=np.asarray(loaded.vertices, dtype=np.float64) * METRES[read_unit],
@@ -148,7 +149,7 @@ def _from_cad(path: Path, content: bytes, unit: Unit | None, body: str | None) -
     except _READER_ERRORS as exc:
         raise MeshError(f"{path}: what OpenCASCADE made of it is no mesh ({exc}); export it again") from exc
     _check(path, merged)
-    colors, _, _ = _appearance(path, merged)
+    colors, _, _ = appearance(merged)
     mesh = Mesh(
         np.asarray(merged.vertices, np.float64), np.asarray(merged.faces, np.int64), colors, sha256="-", bodies=bodies
     )
@@ -168,26 +169,20 @@ def _read(path: Path) -> bytes:
     return content
 
 
-class _Beside(trimesh.resolvers.FilePathResolver):
-    """Materials and textures, which lie beside the mesh."""
-
-    def get(self, name: str) -> bytes:
-        """The content of one; only of regular files.
-
-        Raises:
-            OSError: There is none, or it is too large.
-        """
-        for candidate in (name, name.strip().lstrip("/"), Path(name).name):
-            with suppress(FileNotFoundError, ValueError):  # ValueError: it would lie elsewhere
-                return read_file(self.absolute(candidate), MAX_BYTES)
-        raise FileNotFoundError(name)
-
-
 def _parse(path: Path, content: bytes) -> Any:
     kind = path.suffix.lower().lstrip(".")
-    resolver = _Beside(str(path))
+    resolver = Beside(path, MAX_BYTES)
     try:
-        return trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
+        if kind in ("glb", "gltf"):
+            scene = read_gltf(content, kind, resolver)
+        else:
+            scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
+        if kind != "ply":  # those have colours of vertices, as a rule
+            resolver.refuse_missing()
+        points = [part for part in scene.geometry.values() if isinstance(part, trimesh.PointCloud)]
+        if len(points) == len(scene.geometry) > 0:
+            raise _no_surface(path, sum(len(cloud.vertices) for cloud in points))
+        return joined(path, scene)
     except _READER_ERRORS as exc:
         # Without its optional packages for odd encodings trimesh names those; they would not make a mesh of garbage.
         reason = "garbled text" if isinstance(exc, ImportError) else exc
@@ -199,11 +194,7 @@ def _check(path: Path, loaded: Any) -> None:
     if path.suffix.lower() == ".stl" and len(faces) == 0:  # trimesh takes a binary file that is cut off for text
         raise MeshError(f"{path}: not a readable STL mesh (it holds no triangle); is the file complete?")
     if len(faces) == 0:
-        kind = path.suffix.lstrip(".").upper()
-        raise MeshError(
-            f"{path}: found {len(vertices)} vertices and no faces in this {kind} file; a surface is needed, not a "
-            "point cloud; is the file complete?"
-        )
+        raise _no_surface(path, len(vertices))
     num_broken = int((~np.isfinite(vertices).all(axis=1)).sum())
     if num_broken:
         raise MeshError(f"{path}: {num_broken} of {len(vertices)} vertices are NaN or infinite; repair the mesh")
@@ -213,9 +204,17 @@ def _check(path: Path, loaded: Any) -> None:
         raise MeshError(f"{path}: a face names vertex {wrong}, but there are {len(vertices)}; is the file complete?")
 
 
+def _no_surface(path: Path, num_vertices: int) -> MeshError:
+    kind = path.suffix.lstrip(".").upper()
+    return MeshError(
+        f"{path}: found {num_vertices} vertices and no faces in this {kind} file; a surface is needed, not a "
+        "point cloud; is the file complete?"
+    )
+
+
 def _unit_of(path: Path, loaded: Any) -> str:
     """The unit the file names; metres where it names none or one we don't know."""
-    if path.suffix.lower() in (".glb", ".gltf"):
+    if path.suffix.lower() in GLTF_SUFFIXES:
         return "m"
     named = {"meters": "m", "millimeters": "mm", "centimeters": "cm", "inches": "inch", "in": "inch"}
     unit = str(loaded.units)
@@ -236,24 +235,3 @@ def _check_size(path: Path, mesh: Mesh, unit: str, *, given: bool) -> None:
     raise MeshError(
         f"{path}: found a diameter of {found} ({source}), expected {SMALLEST_M:g} to {LARGEST_M:g} m; {remedy}"
     )
-
-
-def _appearance(path: Path, loaded: Any) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
-    """Vertex colours, texture coordinates and texture; colours of faces are averaged at their corners."""
-    visual = loaded.visual
-    if visual.kind in ("vertex", "face"):
-        return np.asarray(visual.vertex_colors)[:, :3] / 255.0, None, None
-    if visual.kind != "texture":
-        return None, None, None
-    material = visual.material
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if image is not None and visual.uv is not None:
-        try:
-            texture = np.asarray(image.convert("RGB"))  # decodes only now
-        except (OSError, ValueError) as exc:
-            raise MeshError(f"{path}: its texture cannot be decoded ({exc})") from exc
-        return None, np.asarray(visual.uv, dtype=np.float64), texture
-    color = np.asarray(material.main_color)[:3]
-    if tuple(color) == _TRIMESH_DEFAULT_COLOR:
-        return None, None, None
-    return np.tile(color / 255.0, (len(loaded.vertices), 1)), None, None

@@ -51,6 +51,9 @@ def add_or_add_s_m(estimate: Pose, truth: Pose, points: np.ndarray, info: ModelI
 def symmetry_poses(info: ModelInfo, max_step: float = 0.01) -> list[Pose]:
     """All motions of the object that leave its appearance unchanged, the identity first; continuous ones in steps.
 
+    Of an object that turns any way these are but the turns about its axes; errors are then those to
+    :func:`turned_alike`.
+
     Args:
         info: Discrete and continuous symmetries of the object.
         max_step: Largest displacement of the point farthest from a continuous axis per step, as a fraction of the
@@ -63,6 +66,27 @@ def symmetry_poses(info: ModelInfo, max_step: float = 0.01) -> list[Pose]:
         for rotation in _rotations_about(axis, point, int(np.ceil(np.pi / max_step)))
     ]
     return [rotation @ pose for pose in discrete for rotation in continuous or [Pose.identity()]]
+
+
+def turned_alike(truth: Pose, estimate: Pose, info: ModelInfo) -> Pose:
+    """The true pose, of an object that turns any way the one that is turned as the estimate is.
+
+    Args:
+        truth: The true pose.
+        estimate: The pose to judge.
+        info: Symmetries of the object.
+    """
+    if not info.turns_any_way:
+        return truth
+    centre_m = _meeting_point(info.symmetry_axes)
+    return Pose(estimate.rotation, truth.apply(centre_m) - estimate.rotation @ centre_m)
+
+
+def _meeting_point(axes: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """The point [3] closest to all axes, each (axis, point on it)."""
+    across = [np.eye(3) - np.outer(axis, axis) / (axis @ axis) for axis, _ in axes]
+    offsets = [matrix @ point for matrix, (_, point) in zip(across, axes, strict=True)]
+    return np.linalg.lstsq(np.concatenate(across), np.concatenate(offsets))[0]
 
 
 def _rotations_about(axis: np.ndarray, point: np.ndarray, num_steps: int) -> list[Pose]:

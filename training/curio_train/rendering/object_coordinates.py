@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from curio_train.meshes.gltf import srgb_from_linear
 from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.renderer import Renderer, linear_from_srgb
 
@@ -30,7 +31,7 @@ class ObjectCoordinateMap:
         self.center_m, self.half_extent_m = (lower + upper) / 2, float((upper - lower).max() / 2)
         linear = _MIDDLE + _REACH * (mesh.vertices_m - self.center_m) / self.half_extent_m
         painted = dataclasses.replace(
-            mesh, vertex_colors_srgb=_srgb_from_linear(linear), uv=None, texture=None, sha256=""
+            mesh, vertex_colors_srgb=srgb_from_linear(linear), uv=None, texture=None, sha256=""
         )
         self._renderer = Renderer([painted], [0], side, side, ambient=1.0)
         self._side = side
@@ -65,7 +66,3 @@ class ObjectCoordinateMap:
             light=translation_m.new_tensor([[0.0, 0.0, -1e-6]]).expand(count, 3),
             seed=0,  # both pictures have their samples in the same places
         )
-
-
-def _srgb_from_linear(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)

@@ -6,6 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from curio_train.meshes.gltf import srgb_from_linear
 from curio_train.rendering.ground import Ground
 from curio_train.rendering.parts import linear_from_srgb
 from curio_train.rendering.stock import PosedMesh, emitters, load_scene, sensor
@@ -70,8 +71,7 @@ def path_traced(
     )
     alpha = image[..., 3:].clip(0, 1)
     linear = np.where(alpha > 0, image[..., :3] / np.maximum(alpha, 1e-6), 0).clip(0, 1)
-    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-6) ** (1 / 2.4) - 0.055)
-    return np.concatenate([srgb, alpha], axis=2).astype(np.float32)
+    return np.concatenate([srgb_from_linear(linear), alpha], axis=2).astype(np.float32)
 
 
 def ground_disk(mitsuba: Any, ground: Ground) -> dict[str, Any]:
