@@ -130,13 +130,56 @@ def test_the_command(
     with pytest.raises(SystemExit) as exit_:
         train_command.train(["capture", "--calibrate", *flags])
     assert not exit_.value.code
-    assert "placed 14 photographs" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "placed 14 of 14 photographs, points off by" in out
+    assert f"in metres, {baseline:g} from 000.png to 039.png" in out
     assert load_intrinsics(tmp_path / "camera.json").matrix[0, 0] == pytest.approx(FOCAL, rel=0.02)
     view = json.loads((tmp_path / "views.json").read_text())["000.png"]
     assert view["unit"] == "m"
     first = np.array(view["cam_from_world"])
     height = -(first[:3, :3].T @ first[:3, 3])[1]
     assert height == pytest.approx(np.linalg.inv(truth[0])[1, 3], abs=0.03), "metres above the ground"
+
+
+def calibrate_with_a_stranger(
+    frames: list[Path], stranger: int, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> tuple[int, str, str]:
+    """The command on every fifth of 40 frames, one of which shows another scene; each camera is at its distance."""
+    (folder / "images").mkdir()
+    for number, path in enumerate(frames):
+        if number == stranger:
+            cv2.imwrite(str(folder / "images" / path.name), texture(100)[:HEIGHT, :WIDTH])
+        else:
+            (folder / "images" / path.name).symlink_to(path)
+    flags = ["--images", folder / "images", "--every", 5, "--distance-m", 1.0, "--camera-out", folder / "camera.json"]
+    with pytest.raises(SystemExit) as exit_:
+        train_command.train(["capture", "--calibrate", *map(str, flags), "--views-out", str(folder / "views.json")])
+    captured = capsys.readouterr()
+    return int(exit_.value.code or 0), captured.out, captured.err
+
+
+@pytest.mark.parametrize(("stranger", "end"), [(0, "first"), (35, "last")], ids=["first", "last"])
+def test_a_distance_to_a_camera_without_a_place_is_refused(
+    stranger: int,
+    end: str,
+    sequence: tuple[list[Path], np.ndarray],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    status, _, err = calibrate_with_a_stranger(sequence[0], stranger, tmp_path, capsys)
+    assert status == 1
+    assert f"from 000.png to 035.png, but {stranger:03}.png was not placed" in err
+    assert f"new {end} photograph" in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["images"], "nothing of a wrong scale is written"
+
+
+def test_photographs_without_a_place_are_named(
+    sequence: tuple[list[Path], np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = calibrate_with_a_stranger(sequence[0], 20, tmp_path, capsys)
+    assert status == 0, err
+    assert "placed 7 of 8 photographs (not placed: 020.png), points off by" in out
+    assert "020.png" not in json.loads((tmp_path / "views.json").read_text())
 
 
 def test_no_texture(tmp_path: Path) -> None:

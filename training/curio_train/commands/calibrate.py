@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,9 @@ from curio_train.capture.options import CalibrateCommand
 from curio_train.capture.rig import calibrate_rig, save_rig
 from curio_train.capture.structure import Structure, every_nth, recover
 from curio_train.data.photographs import Photographs
-from curio_train.errors import DataError, UsageError
+from curio_train.errors import CameraError, DataError, UsageError
+
+_NAMED = 3
 
 ByObjects = Callable[[Structure, Path, Path | None], tuple[Structure, str]]
 """Brings a structure to metres by models of objects (their folder, their data), and says how; networks are none of this
@@ -95,8 +97,16 @@ def _reading(given: Board, found: Board) -> str:
 
 def _from_scene(command: CalibrateCommand, by_objects: ByObjects) -> str:
     known = None if command.camera is None else load_intrinsics(command.camera)
-    found = recover(every_nth(Photographs(command.images).paths, command.every), known)
-    lines = [f"placed {len(found.photographs)} photographs, points off by {found.error_px:.2f} pixels"]
+    given = every_nth(Photographs(command.images).paths, command.every)
+    found = recover(given, known)
+    missing = [path.name for path in given if path not in found.photographs]
+    if command.distance_m is not None:
+        _check_ends_placed(given, missing, command.distance_m)
+    unplaced = f" (not placed: {_shortly(missing)})" if missing else ""
+    lines = [
+        f"placed {len(found.photographs)} of {len(given)} photographs{unplaced}, points off by {found.error_px:.2f} "
+        "pixels"
+    ]
     if known is None:
         save_intrinsics(command.camera_out, found.camera)
         lines.append(f"{command.camera_out}: focal length {found.camera.matrix[0, 0]:.1f} pixels")
@@ -110,8 +120,27 @@ def _from_scene(command: CalibrateCommand, by_objects: ByObjects) -> str:
         in_metres = command.distance_m is not None or command.objects is not None
         _save_views(command.views_out, world, "m" if in_metres else None)
         unit = "metres" if in_metres else "no known unit: give --distance-m or --objects for metres"
+        if command.distance_m is not None:
+            unit += f", {command.distance_m:g} from {given[0].name} to {given[-1].name}"
         lines.append(f"{command.views_out}: cam_from_world of each, in {unit}")
     return "\n".join(lines)
+
+
+def _check_ends_placed(given: Sequence[Path], missing: Sequence[str], distance_m: float) -> None:
+    """Refuse a distance of two cameras one of which has no place: those beside it stand elsewhere."""
+    ends = {"first": given[0].name, "last": given[-1].name}
+    for end, name in ends.items():
+        if name in missing:
+            raise CameraError(
+                f"--distance-m {distance_m:g} is from {ends['first']} to {ends['last']}, but {name} was not placed. "
+                f"Take a new {end} photograph that shows more of what the others show, or remove it and measure the "
+                f"distance to the photograph that is {end} then"
+            )
+
+
+def _shortly(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"{', '.join(names[:_NAMED])}{more}"
 
 
 def _check_scale(command: CalibrateCommand) -> None:
