@@ -120,6 +120,22 @@ def test_a_known_camera_is_kept(sequence: tuple[list[Path], np.ndarray]) -> None
     assert np.degrees(Rotation.from_matrix(found.relative(0, 9)[:3, :3] @ turn.T).magnitude()) < 0.5
 
 
+def test_all_coefficients_of_a_known_lens_count(tmp_path: Path) -> None:
+    """Of a rational model they are large, and nearly cancel each other: these are a Kinect's."""
+    lens = (0.52, -2.67, 0.0006, -0.0002, 1.52, 0.40, -2.49, 1.45)
+    pixels = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1).reshape(-1, 1, 2).astype(np.float64)
+    ideal = cv2.undistortPoints(pixels, MATRIX, np.array(lens), P=MATRIX).reshape(HEIGHT, WIDTH, 2).astype(np.float32)
+    random, textures = np.random.default_rng(0), [texture(seed) for seed in range(len(PLANES))]
+    truth, paths = [pose(number / 20) for number in range(8)], [tmp_path / f"{number}.png" for number in range(8)]
+    for path, matrix in zip(paths, truth, strict=True):
+        seen = cv2.remap(photograph(matrix, textures), ideal, None, cv2.INTER_CUBIC, borderValue=128)
+        cv2.imwrite(str(path), (seen + random.normal(0, 2, seen.shape)).clip(0, 255).astype(np.uint8))
+    found = recover(paths, Intrinsics(MATRIX, WIDTH, HEIGHT, lens))
+    assert len(found.photographs) == 8
+    turns = [found.relative(0, n)[:3, :3] @ (truth[n] @ np.linalg.inv(truth[0]))[:3, :3].T for n in range(1, 8)]
+    assert np.degrees(Rotation.from_matrix(np.stack(turns)).magnitude()).max() < 0.3
+
+
 def test_the_command(
     sequence: tuple[list[Path], np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
