@@ -157,6 +157,30 @@ def test_the_command(
     assert height == pytest.approx(np.linalg.inv(truth[0])[1, 3], abs=0.03), "metres above the ground"
 
 
+def test_a_camera_file_that_was_not_named_is_left(
+    sequence: tuple[list[Path], np.ndarray],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    call = ["capture", "--calibrate", "--images", str(sequence[0][0].parent), "--every", "5"]
+
+    def said(*flags: str) -> str:
+        with pytest.raises(SystemExit) as exit_:
+            train_command.train([*call, *flags])
+        assert not exit_.value.code
+        return capsys.readouterr().out
+
+    assert "\ncamera.json: focal length" in said()
+    assert load_intrinsics(tmp_path / "camera.json").width == WIDTH
+    (tmp_path / "camera.json").write_text("from a board")
+    assert "camera.json is there already and was left as it is: to write this camera, add --camera-out" in said()
+    assert (tmp_path / "camera.json").read_text() == "from a board"
+    assert "\ncamera.json: focal length" in said("--camera-out", "camera.json")
+    assert load_intrinsics(tmp_path / "camera.json").width == WIDTH
+
+
 def calibrate_with_a_stranger(
     frames: list[Path], stranger: int, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> tuple[int, str, str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curio_train.camera import load_intrinsics, save_intrinsics
+from curio_train.camera import Intrinsics, load_intrinsics, save_intrinsics
 from curio_train.capture.calibration import Board, calibrate
 from curio_train.capture.ground import scale_by_distance, to_world
 from curio_train.capture.options import CalibrateCommand
@@ -16,6 +16,7 @@ from curio_train.capture.structure import Structure, every_nth, recover
 from curio_train.data.photographs import Photographs
 from curio_train.errors import CameraError, DataError, UsageError
 
+_CAMERA_FILE = Path("camera.json")
 _NAMED = 3
 
 ByObjects = Callable[[Structure, Path, Path | None], tuple[Structure, str]]
@@ -50,10 +51,11 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
         )
     board = _board(command, command.board)
     found = calibrate(command.images, board)
-    save_intrinsics(command.camera_out, found.camera)
+    camera_out = command.camera_out or _CAMERA_FILE
+    save_intrinsics(camera_out, found.camera)
     unused = f", not found in {', '.join(path.name for path in found.unused[:5])}" if found.unused else ""
     return (
-        f"{command.camera_out}: focal length {found.camera.matrix[0, 0]:.1f} pixels ± {found.focal_uncertainty:.2%}, "
+        f"{camera_out}: focal length {found.camera.matrix[0, 0]:.1f} pixels ± {found.focal_uncertainty:.2%}, "
         f"corners off by {found.error_px:.2f} pixels in {found.num_views} photographs{unused}"
         + _reading(board, found.board)
     )
@@ -108,8 +110,7 @@ def _from_scene(command: CalibrateCommand, by_objects: ByObjects) -> str:
         "pixels"
     ]
     if known is None:
-        save_intrinsics(command.camera_out, found.camera)
-        lines.append(f"{command.camera_out}: focal length {found.camera.matrix[0, 0]:.1f} pixels")
+        lines.append(_save_found_camera(command.camera_out, found.camera))
     if command.views_out is not None:
         world = to_world(found)
         if command.distance_m is not None:
@@ -124,6 +125,16 @@ def _from_scene(command: CalibrateCommand, by_objects: ByObjects) -> str:
             unit += f", {command.distance_m:g} from {given[0].name} to {given[-1].name}"
         lines.append(f"{command.views_out}: cam_from_world of each, in {unit}")
     return "\n".join(lines)
+
+
+def _save_found_camera(named: Path | None, camera: Intrinsics) -> str:
+    """Write a scene's camera, but not over one that may come from a board and was not named; says what was done."""
+    found = f"focal length {camera.matrix[0, 0]:.1f} pixels"
+    if named is None and _CAMERA_FILE.exists():
+        return f"{found}; {_CAMERA_FILE} is there already and was left as it is: to write this camera, add --camera-out"
+    path = named or _CAMERA_FILE
+    save_intrinsics(path, camera)
+    return f"{path}: {found}"
 
 
 def _check_ends_placed(given: Sequence[Path], missing: Sequence[str], distance_m: float) -> None:
