@@ -99,6 +99,22 @@ def test_symmetries_need_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "--mesh" in capsys.readouterr().err
 
 
+def test_symmetries_replace_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trimesh.creation.box((30, 40, 120)).export(tmp_path / "box.ply")
+    out = tmp_path / "models_info.json"
+    out.write_text("of other objects")
+    flags = ["--mesh", str(tmp_path / "box.ply"), "--mesh-unit", "mm", "--cache", str(tmp_path), "--symmetries"]
+    with pytest.raises(SystemExit) as exit_:
+        doctor_command.doctor([*flags, str(out)])
+    assert exit_.value.code == 2
+    assert "name a new one" in capsys.readouterr().err
+    assert out.read_text() == "of other objects"
+    with pytest.raises(SystemExit) as exit_:
+        doctor_command.doctor([*flags, str(tmp_path / "none" / "models_info.json")])
+    assert exit_.value.code == 1
+    assert "cannot be written (No such file or directory); name another file: --symmetries" in capsys.readouterr().err
+
+
 def test_a_machine_without_a_usable_llvm(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

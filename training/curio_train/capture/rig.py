@@ -5,7 +5,6 @@ camera and each other one are related by the instants in which both see the boar
 """
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from curio_serve.consensus.poses import angles_deg
+from curio_serve.files import write_whole
 
 from curio_train.camera import Intrinsics
 from curio_train.capture.calibration import Board, Calibration, calibrate
@@ -92,10 +92,8 @@ def save_rig(path: Path, rig: RigCalibration) -> None:
         }
         for name, found, pose in zip(rig.names, rig.cameras, rig.cam_from_rig, strict=True)
     ]
-    draft = path.with_name(f"{path.name}.part")
     try:
-        draft.write_text(json.dumps({"cameras": entries}, indent=2) + "\n", encoding="utf-8")
-        os.replace(draft, path)
+        write_whole(path, json.dumps({"cameras": entries}, indent=2) + "\n")
     except OSError as exc:
         raise CameraError(f"{path}: cannot be written ({exc.strerror}); name another file: --rig-out") from exc
 

@@ -1,11 +1,11 @@
 """``curio-train capture --calibrate``: a camera file, and where on request the camera stood, from photographs."""
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from curio_serve.files import write_whole
 
 from curio_train.camera import Intrinsics, load_intrinsics, save_intrinsics
 from curio_train.capture.calibration import Board, calibrate
@@ -170,9 +170,7 @@ def _save_views(path: Path, structure: Structure, unit: str | None) -> None:
         photo.name: {"cam_from_world": matrix.tolist(), "unit": unit}
         for photo, matrix in zip(structure.photographs, structure.cam_from_world, strict=True)
     }
-    draft = path.with_name(f"{path.name}.part")
     try:
-        draft.write_text(json.dumps(views) + "\n", encoding="utf-8")
-        os.replace(draft, path)
+        write_whole(path, json.dumps(views) + "\n")
     except OSError as exc:
         raise DataError(f"{path}: cannot be written ({exc.strerror}); name another file: --views-out") from exc
