@@ -160,6 +160,16 @@ def test_exif_rotation_and_focal_length(files: Files) -> None:
     assert "85 mm" in found["focal length"].text
 
 
+def test_broken_exif_entries_say_nothing(files: Files) -> None:
+    for number, broken in enumerate((b"garbage", b"II", b"II*\0\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\0")):
+        for suffix, options in ((".png", {}), (".webp", {"lossless": True})):
+            path = files.photos[2 * number + (suffix == ".webp")]
+            image = Image.fromarray(photo(int(path.stem)))
+            path.unlink()
+            image.save(path.with_suffix(suffix), exif=b"Exif\0\0" + broken, **options)
+    assert alarms(files.subjects()) == []
+
+
 def test_duplicates(files: Files) -> None:
     cv2.imwrite(str(files.photos[0].with_name("copy.png")), cv2.imread(str(files.photos[0])))
     (finding,) = alarms(files.subjects())

@@ -1,5 +1,6 @@
 """Examines what photographs show: blur, repetition, exposure, swapped colours, and the image of the empty scene."""
 
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from curio_train.errors import CurioError
 THUMBNAIL_PX = 64
 _MEASURED_PX = 640
 _BLACK, _WHITE = 3, 252
+# What Pillow raises on them; only of a JPEG's it makes an empty entry itself.
+_BROKEN_EXIF = (SyntaxError, struct.error, ArithmeticError, LookupError, OSError, TypeError, ValueError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +81,17 @@ def thumbnail(pixels: np.ndarray) -> np.ndarray:
 
 
 def _exif(path: Path) -> tuple[int, float]:
-    with Image.open(path) as image:
-        entries = image.getexif()
-        details = entries.get_ifd(ExifTags.IFD.Exif)
-    orientation, focal = entries.get(ExifTags.Base.Orientation, 1), details.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)
-    # Broken writers store anything there; what is no number says nothing.
-    numbers = [value if isinstance(value, int | float) else 0 for value in (orientation, focal)]
-    return int(numbers[0]) or 1, float(numbers[1])
+    """Orientation and focal length; of an entry that is missing or broken, what says nothing."""
+    try:
+        with Image.open(path) as image:
+            entries = image.getexif()
+            details = entries.get_ifd(ExifTags.IFD.Exif)
+        given = entries.get(ExifTags.Base.Orientation, 1), details.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)
+        # Broken writers store anything there; what is no number says nothing.
+        orientation, focal = (value if isinstance(value, int | float) else 0 for value in given)
+        return int(orientation) or 1, float(focal)
+    except _BROKEN_EXIF:
+        return 1, 0.0
 
 
 BLURRED = 0.6  # sharp photographs of clutter: up to 0.45; blurred with a sigma of 2.5 pixels: 0.65 and more
