@@ -110,6 +110,16 @@ def test_wrong_calls(tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: 
     assert told in err
 
 
+@pytest.mark.parametrize("flag", ["--out", "--background", "--video"])
+def test_paths_that_cannot_be_reached(tmp_path: Path, capsys: pytest.CaptureFixture[str], flag: str) -> None:
+    given = {"--out": tmp_path / "photos", "--video": video(tmp_path / "walk.avi", [clutter(1)])}
+    flags = [word for pair in (given | {flag: tmp_path / ("a" * 300)}).items() for word in pair]
+    status, _, err = call(capsys, *flags)
+    assert status == (2 if flag == "--video" else 1)
+    assert err.startswith(f"error: {flag} {tmp_path}")
+    assert ("cannot be opened" if flag == "--video" else "File name too long") in err
+
+
 def test_the_page_shows_the_newest_frame() -> None:
     with Page(0) as page:
         page.show(clutter(1), "1 of 80 kept", "blur 0.2", 7)

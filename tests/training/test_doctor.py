@@ -128,6 +128,14 @@ def test_a_machine_without_a_usable_llvm(
     assert "rendering" not in findings, "a process would have been aborted"
 
 
+def test_a_cache_that_cannot_be_reached(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The folder above it stands for it, as for one that is still to be made."""
+    cache = tmp_path / ("a" * 300)
+    status, findings = run(["--camera", str(tmp_path / "camera.json"), "--cache", str(cache)], capsys)
+    assert status == 1
+    assert set(findings) == {"camera"}
+
+
 def test_a_library_that_is_none_is_found_by_rendering(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """By its name it is new enough; only trying shows what it is."""
     fake = tmp_path / "libLLVM.so.19.1"

@@ -100,3 +100,6 @@ def test_photographs_of_no_rig_are_refused(tmp_path: Path) -> None:
         calibrate_rig(folder, CHARUCO)
     with pytest.raises(DataError, match="has 0 folders"):
         calibrate_rig(folder / "left", CHARUCO)
+    for name, reason in (("none", "No such file or directory"), ("a" * 300, "File name too long")):
+        with pytest.raises(DataError, match=rf"{name}: cannot be listed \({reason}\)"):
+            calibrate_rig(tmp_path / name, CHARUCO)

@@ -52,10 +52,13 @@ def calibrate_rig(folder: Path, board: Board) -> RigCalibration:
         board: That they show.
 
     Raises:
-        DataError: A wrong number of folders, or photographs that cannot be used.
+        DataError: The folder cannot be listed, a wrong number of folders, or photographs that cannot be used.
         CameraError: They do not determine a camera, or too few instants show the board to a pair.
     """
-    folders = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    try:
+        folders = sorted(path for path in folder.iterdir() if path.is_dir())
+    except OSError as exc:
+        raise DataError(f"{folder}: cannot be listed ({exc.strerror}); expected a folder of each camera in it") from exc
     if not LEAST_CAMERAS <= len(folders) <= MOST_CAMERAS:
         raise DataError(
             f"{folder} has {len(folders)} folders; expected one a camera, {LEAST_CAMERAS} to {MOST_CAMERAS}, with "

@@ -1,6 +1,7 @@
 """``curio-train capture --assistant``: photographs from a camera, and a page on loopback that says what is missing."""
 
 import json
+import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -135,7 +136,7 @@ def _frames(source: str) -> Iterator[np.ndarray]:
         UsageError: It cannot be opened.
         DataError: A photograph cannot be read.
     """
-    if Path(source).is_dir():
+    if os.path.isdir(source):
         return (read_photograph(path) for path in Photographs(Path(source)).paths)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
     if not capture.isOpened():

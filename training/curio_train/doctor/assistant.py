@@ -51,7 +51,7 @@ class Assistant:
             background: Photograph of the empty scene; one that does not exist is taken first.
 
         Raises:
-            DataError: The folder or a photograph cannot be used.
+            DataError: The folder, a photograph or the background's path cannot be used.
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,7 @@ class Assistant:
         self._kept = [thumbnail(read_photograph(path)) for path in there]
         self.num_kept = len(self._kept)
         self._empty: torch.Tensor | None = None
-        if background is not None and background.exists():
+        if background is not None and _exists(background):
             self._empty = _small(read_photograph(background))
 
     @property
@@ -118,6 +118,16 @@ class Assistant:
         assert self._board is not None
         grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
         return any(reading.find(grey) is not None for reading in self._board.readings)
+
+
+def _exists(background: Path) -> bool:
+    try:
+        background.stat()
+    except FileNotFoundError:
+        return False
+    except OSError as exc:
+        raise DataError(f"--background {background}: cannot be reached ({exc.strerror}); name another file") from exc
+    return True
 
 
 def _small(pixels: np.ndarray) -> torch.Tensor:
