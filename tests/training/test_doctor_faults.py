@@ -265,6 +265,15 @@ def test_faults_of_the_plate(files: Files, spoilt: Callable[[], np.ndarray], fau
     assert finding.fault == fault
 
 
+def test_a_plate_of_another_size_than_the_camera(files: Files) -> None:
+    subjects = Subjects(camera=files.camera, background=files.plate)
+    assert alarms(subjects) == []
+    save(files.plate, plate()[:, :100])
+    (finding,) = alarms(subjects)
+    assert (finding.fault, finding.state) == ("background size", "bad")
+    assert f"has 100x{HEIGHT} pixels, the camera file is for {WIDTH}x{HEIGHT}" in finding.text
+
+
 # Faults of a model beside mesh and camera.
 
 

@@ -70,7 +70,7 @@ def examine_files(subjects: Subjects) -> Iterator[Finding]:
     else:
         photographs = []
     if subjects.background is not None:
-        yield from examine_background(subjects.background, photographs)
+        yield from examine_background(subjects.background, photographs, camera)
     if subjects.model is not None:
         from curio_train.doctor.model_file import examine_model
 

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import ExifTags, Image
 from skimage.measure import blur_effect
 
+from curio_train.camera import Intrinsics
 from curio_train.data.photographs import read_photograph
 from curio_train.doctor.finding import Finding
 from curio_train.errors import CurioError
@@ -175,12 +176,13 @@ _UNLIKE_WHEN_SHIFTED_BACK = 0.6
 _MOST_COMPARED = 100
 
 
-def examine_background(path: Path, photographs: Sequence[Photograph]) -> Iterator[Finding]:
-    """Whether the background image can be read, and fits to photographs.
+def examine_background(path: Path, photographs: Sequence[Photograph], camera: Intrinsics | None) -> Iterator[Finding]:
+    """Whether the background image can be read, and fits to photographs, or without them to the camera.
 
     Args:
         path: The background image's file.
-        photographs: What was taken before it; nothing is compared where there are none.
+        photographs: What was taken before it.
+        camera: What it was taken with, where known; photographs are compared with it elsewhere.
     """
     try:
         pixels = read_photograph(path)
@@ -188,9 +190,11 @@ def examine_background(path: Path, photographs: Sequence[Photograph]) -> Iterato
         yield Finding("background", "bad", str(exc), fault="background unreadable")
         return
     height, width = pixels.shape[:2]
-    sizes = {(photo.width, photo.height) for photo in photographs}
+    others, sizes = "photographs have", {(photo.width, photo.height) for photo in photographs}
+    if not sizes and camera is not None:
+        others, sizes = "the camera file is for", {(camera.width, camera.height)}
     if sizes and (width, height) not in sizes:
-        text = f"{path} has {width}x{height} pixels, photographs have {' '.join(f'{w}x{h}' for w, h in sorted(sizes))}"
+        text = f"{path} has {width}x{height} pixels, {others} {' '.join(f'{w}x{h}' for w, h in sorted(sizes))}"
         yield Finding("background", "bad", text, "Take it with the same camera and settings", fault="background size")
         return
     yield Finding("background", "good", f"{path}: {width}x{height}")
