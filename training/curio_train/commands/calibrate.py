@@ -1,6 +1,8 @@
 """``curio-train capture --calibrate``: a camera file, and where on request the camera stood, from photographs."""
 
 import json
+import math
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -18,6 +20,8 @@ from curio_train.errors import CameraError, DataError, UsageError
 
 _CAMERA_FILE = Path("camera.json")
 _NAMED = 3
+_NEEDED = {"--square-mm": "--board", "--marker-mm": "--board", "--data": "--objects", "--camera": "--views-out"}
+"""Flags that have no effect without another one."""
 
 ByObjects = Callable[[Structure, Path, Path | None], tuple[Structure, str]]
 """Brings a structure to metres by models of objects (their folder, their data), and says how; networks are none of this
@@ -32,23 +36,15 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
         by_objects: For ``--objects``.
 
     Raises:
-        UsageError: Flags that contradict each other.
+        UsageError: Flags that contradict each other or have no effect, or an output that is no file.
         DataError: Photographs that cannot be used, or a file that cannot be written.
         CameraError: They do not determine a camera.
     """
-    if command.every < 1:
-        raise UsageError(f"--every {command.every}, expected 1 or more")
-    if command.every > 1 and command.board is not None:
-        raise UsageError(f"--every {command.every} is for photographs of a scene; leave it out, or leave out --board")
-    _check_scale(command)
+    _check(command)
     if command.rig_out is not None:
         return _rig(command, command.rig_out)
     if command.board is None:
         return _from_scene(command, by_objects)
-    if command.views_out is not None or command.camera is not None:
-        raise UsageError(
-            "--views-out and --camera are for photographs of a scene; leave them out, or leave out --board"
-        )
     board = _board(command, command.board)
     found = calibrate(command.images, board)
     camera_out = command.camera_out or _CAMERA_FILE
@@ -69,10 +65,6 @@ def _board(command: CalibrateCommand, size: tuple[int, int]) -> Board:
 def _rig(command: CalibrateCommand, path: Path) -> str:
     if command.board is None:
         raise UsageError("--rig-out needs photographs of a board: say which by --board")
-    if command.views_out is not None or command.camera is not None:
-        raise UsageError(
-            "--views-out and --camera are for photographs of a scene; leave them out, or leave out --rig-out"
-        )
     found = calibrate_rig(command.images, _board(command, command.board))
     save_rig(path, found)
     lines = [f"{path}: {len(found.names)} cameras, corners off by at most {found.error_px:.2f} pixels"]
@@ -154,9 +146,46 @@ def _shortly(names: Sequence[str]) -> str:
     return f"{', '.join(names[:_NAMED])}{more}"
 
 
+def _check(command: CalibrateCommand) -> None:
+    """Refuse before any work what cannot be done, and flags that would change nothing."""
+    if command.every < 1:
+        raise UsageError(f"--every {command.every}, expected 1 or more")
+    if command.every > 1 and command.board is not None:
+        raise UsageError(f"--every {command.every} is for photographs of a scene; leave it out, or leave out --board")
+    _check_scale(command)
+    for flag in ("--board", "--rig-out"):
+        is_given = getattr(command, _field(flag)) is not None
+        if is_given and (command.views_out is not None or command.camera is not None):
+            raise UsageError(
+                f"--views-out and --camera are for photographs of a scene; leave them out, or leave out {flag}"
+            )
+    for flag, needed in _NEEDED.items():
+        given = getattr(command, _field(flag))
+        if given != getattr(CalibrateCommand, _field(flag)) and getattr(command, _field(needed)) is None:
+            raise UsageError(f"{flag} {given} has no effect without {needed}; add that, or leave out {flag}")
+    for flag in ("--rig-out", "--camera"):
+        if command.camera_out is not None and getattr(command, _field(flag)) is not None:
+            raise UsageError(f"--camera-out {command.camera_out} is not written with {flag}; leave out one of them")
+    for flag in ("--camera-out", "--views-out", "--rig-out"):
+        _check_output(flag, getattr(command, _field(flag)))
+
+
+def _field(flag: str) -> str:
+    return flag.removeprefix("--").replace("-", "_")
+
+
+def _check_output(flag: str, path: Path | None) -> None:
+    if path is not None and os.path.isdir(path):
+        raise UsageError(f"{flag} {path}: this is a folder, expected a file; name one in it")
+    if path is not None and not os.path.isdir(path.parent):
+        raise UsageError(f"{flag} {path}: there is no folder {path.parent}; make it first, or name another file")
+
+
 def _check_scale(command: CalibrateCommand) -> None:
     ways = {"--distance-m": command.distance_m, "--objects": command.objects}
     given = [f"{flag} {value}" for flag, value in ways.items() if value is not None]
+    if command.distance_m is not None and not 0 < command.distance_m < math.inf:
+        raise UsageError(f"--distance-m {command.distance_m:g}: expected a distance in metres, more than 0")
     if given and command.views_out is None:
         raise UsageError(f"{given[0]} is for poses; name a file for them: --views-out")
     if len(given) > 1:
