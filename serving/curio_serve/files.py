@@ -1,5 +1,6 @@
-"""Reads files that users name. They may be anything: pipes, devices, sparse files larger than the memory."""
+"""Reads files that users name, and writes text. What is read may be anything: pipes, devices, huge sparse files."""
 
+import contextlib
 import errno
 import json
 import os
@@ -52,6 +53,22 @@ def read_json(path: str | Path, max_bytes: int) -> Any:
         return json.loads(read_file(path, max_bytes).decode("utf-8"))
     except RecursionError as exc:
         raise ValueError("nested too deeply") from exc
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file in UTF-8, whole or not at all.
+
+    Raises:
+        OSError: It cannot be written; no draft of it is left.
+    """
+    draft = Path(f"{path}.part")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        os.replace(draft, path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            draft.unlink()
+        raise
 
 
 def direct(path: Path) -> Path:

@@ -1,6 +1,8 @@
 """``curio-train capture --assistant`` on drawn videos: what it keeps, what it says, and who may look."""
 
 import json
+import socket
+import struct
 import threading
 import urllib.error
 import urllib.request
@@ -93,6 +95,36 @@ def test_the_empty_scene_comes_first(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert [bool(picture[115, 65, 0] > 200) for picture in kept(tmp_path / "photos")] == [True, False]
 
 
+def test_enough_photographs_do_not_stand_for_the_empty_scene(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The background lies among them, is no photograph of the part, and is a PNG as its name says."""
+    photos = tmp_path / "photos"
+    source, empty = video(tmp_path / "part.avi", [with_part(1, 40)]), photos / "empty.png"
+    assert call(capsys, "--video", source, "--out", photos, "--count", 1)[0] == 0
+    black = video(tmp_path / "black.avi", [np.zeros((HEIGHT, WIDTH, 3), np.uint8)])
+    flags = ["--out", photos, "--background", empty]
+    status, out, _ = call(capsys, "--video", black, *flags, "--count", 1)
+    assert (status, f"1 of 1 photographs, {empty} was not taken; 1 frames were mostly black" in out) == (1, True)
+    status, out, err = call(capsys, "--video", video(tmp_path / "empty.avi", [clutter(1)]), *flags, "--count", 1)
+    assert (status, f"{photos}: 1 photographs, enough" in out) == (0, True), err
+    assert empty.read_bytes().startswith(b"\x89PNG")
+    status, out, _ = call(capsys, "--video", source, *flags, "--count", 2)
+    assert (status, "1 of 2 photographs; 1 frames were like a photograph" in out) == (1, True), out
+
+
+@pytest.mark.parametrize("there", ["photos/0.png", "empty.png"])
+def test_frames_of_another_size_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], there: str) -> None:
+    (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / there), clutter(1)[:200, :300])
+    flags = ["--video", video(tmp_path / "part.avi", [clutter(2)]), "--out", tmp_path / "photos"]
+    if there == "empty.png":
+        flags += ["--background", tmp_path / there]
+    status, _, err = call(capsys, *flags)
+    assert status == 1
+    assert f"this frame has {WIDTH}x{HEIGHT} pixels, but {tmp_path / there} has 300x200" in err
+
+
 def test_only_frames_with_the_board_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     frames = [clutter(1), board(0), board(30), clutter(2)]
     source = video(tmp_path / "board.avi", frames)
@@ -102,12 +134,35 @@ def test_only_frames_with_the_board_are_kept(tmp_path: Path, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize(
-    ("flags", "told"), [(["--count", 0], "--count 0"), (["--video", "nowhere.avi"], "--video nowhere.avi")]
+    ("flags", "told"),
+    [
+        (["--count", 0], "--count 0"),
+        (["--video", "nowhere.avi"], "--video nowhere.avi"),
+        (["--video", ".", "--background", "empty.heic"], "--background empty.heic: expected a file name that ends in"),
+    ],
 )
-def test_wrong_calls(tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[object], told: str) -> None:
+def test_wrong_calls(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    flags: list[object],
+    told: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("frame.png", clutter(1))
     status, _, err = call(capsys, "--out", tmp_path / "photos", *flags)
     assert status == 2
     assert told in err
+
+
+@pytest.mark.parametrize("flag", ["--out", "--background", "--video"])
+def test_paths_that_cannot_be_reached(tmp_path: Path, capsys: pytest.CaptureFixture[str], flag: str) -> None:
+    given = {"--out": tmp_path / "photos", "--video": video(tmp_path / "walk.avi", [clutter(1)])}
+    flags = [word for pair in (given | {flag: tmp_path / ("a" * 300)}).items() for word in pair]
+    status, _, err = call(capsys, *flags)
+    assert status == (2 if flag == "--video" else 1)
+    assert err.startswith(f"error: {flag} {tmp_path}")
+    assert ("cannot be opened" if flag == "--video" else "File name too long") in err
 
 
 def test_the_page_shows_the_newest_frame() -> None:
@@ -123,6 +178,19 @@ def test_the_page_shows_the_newest_frame() -> None:
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(page.address + "etc/passwd", timeout=30)
     assert not any(thread.name == "page" and thread.is_alive() for thread in threading.enumerate())
+
+
+def test_a_browser_that_goes_away_is_no_news(capsys: pytest.CaptureFixture[str]) -> None:
+    with Page(0) as page:
+        with socket.create_connection(("127.0.0.1", int(page.address.rstrip("/").rpartition(":")[2]))) as browser:
+            browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closing resets
+            browser.sendall(b"GET /frame")
+        with urllib.request.urlopen(page.address, timeout=30) as answer:
+            assert b"frame.jpg" in answer.read()
+        for thread in threading.enumerate():
+            if "process_request_thread" in thread.name:
+                thread.join(30)
+    assert capsys.readouterr().err == ""
 
 
 def test_a_taken_port_is_named() -> None:

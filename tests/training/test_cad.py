@@ -249,6 +249,13 @@ def test_the_doctor_names_bodies(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert bolt["symmetries_continuous"][0]["axis"] == pytest.approx([0, 0, 1], abs=0.01)
 
 
+def test_the_doctor_does_not_advise_a_unit_that_is_refused(tmp_path: Path) -> None:
+    write_step(tmp_path / "ball.step", ball(2000))
+    (finding,) = (found for found in examine_files(Subjects(mesh=tmp_path / "ball.step")) if found.fault == "mesh unit")
+    assert "diameter of 4" in finding.text
+    assert finding.remedy == "If it is not the object's true size, export it again in its true unit"
+
+
 WIDTH, HEIGHT = 160, 120
 
 

@@ -125,6 +125,11 @@ def test_the_camera_file_is_read_as_written(tmp_path: Path) -> None:
     assert (again.width, again.height, again.distortion) == (WIDTH, HEIGHT, tuple(DISTORTION))
     with pytest.raises(CameraError, match="cannot be written"):
         save_intrinsics(tmp_path / "none" / "camera.json", camera)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(CameraError, match=r"folder: cannot be written \(.*\); name another file: --camera-out"):
+        save_intrinsics(tmp_path / "folder", camera)
+    there = sorted(path.name for path in tmp_path.iterdir())
+    assert there == ["again.json", "camera.json", "folder"], "no draft is left"
 
 
 def _written(folder: Path, other: dict[str, object]) -> Path:

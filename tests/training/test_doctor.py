@@ -99,6 +99,22 @@ def test_symmetries_need_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "--mesh" in capsys.readouterr().err
 
 
+def test_symmetries_replace_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trimesh.creation.box((30, 40, 120)).export(tmp_path / "box.ply")
+    out = tmp_path / "models_info.json"
+    out.write_text("of other objects")
+    flags = ["--mesh", str(tmp_path / "box.ply"), "--mesh-unit", "mm", "--cache", str(tmp_path), "--symmetries"]
+    with pytest.raises(SystemExit) as exit_:
+        doctor_command.doctor([*flags, str(out)])
+    assert exit_.value.code == 2
+    assert "name a new one" in capsys.readouterr().err
+    assert out.read_text() == "of other objects"
+    with pytest.raises(SystemExit) as exit_:
+        doctor_command.doctor([*flags, str(tmp_path / "none" / "models_info.json")])
+    assert exit_.value.code == 1
+    assert "cannot be written (No such file or directory); name another file: --symmetries" in capsys.readouterr().err
+
+
 def test_a_machine_without_a_usable_llvm(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -110,6 +126,14 @@ def test_a_machine_without_a_usable_llvm(
     assert findings["libLLVM"].startswith("bad")
     assert "apt-get install libllvm19" in findings["libLLVM"]
     assert "rendering" not in findings, "a process would have been aborted"
+
+
+def test_a_cache_that_cannot_be_reached(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The folder above it stands for it, as for one that is still to be made."""
+    cache = tmp_path / ("a" * 300)
+    status, findings = run(["--camera", str(tmp_path / "camera.json"), "--cache", str(cache)], capsys)
+    assert status == 1
+    assert set(findings) == {"camera"}
 
 
 def test_a_library_that_is_none_is_found_by_rendering(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

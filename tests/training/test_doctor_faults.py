@@ -160,6 +160,16 @@ def test_exif_rotation_and_focal_length(files: Files) -> None:
     assert "85 mm" in found["focal length"].text
 
 
+def test_broken_exif_entries_say_nothing(files: Files) -> None:
+    for number, broken in enumerate((b"garbage", b"II", b"II*\0\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\0")):
+        for suffix, options in ((".png", {}), (".webp", {"lossless": True})):
+            path = files.photos[2 * number + (suffix == ".webp")]
+            image = Image.fromarray(photo(int(path.stem)))
+            path.unlink()
+            image.save(path.with_suffix(suffix), exif=b"Exif\0\0" + broken, **options)
+    assert alarms(files.subjects()) == []
+
+
 def test_duplicates(files: Files) -> None:
     cv2.imwrite(str(files.photos[0].with_name("copy.png")), cv2.imread(str(files.photos[0])))
     (finding,) = alarms(files.subjects())
@@ -253,6 +263,15 @@ def test_faults_of_the_plate(files: Files, spoilt: Callable[[], np.ndarray], fau
     save(files.plate, spoilt())
     (finding,) = alarms(files.subjects())
     assert finding.fault == fault
+
+
+def test_a_plate_of_another_size_than_the_camera(files: Files) -> None:
+    subjects = Subjects(camera=files.camera, background=files.plate)
+    assert alarms(subjects) == []
+    save(files.plate, plate()[:, :100])
+    (finding,) = alarms(subjects)
+    assert (finding.fault, finding.state) == ("background size", "bad")
+    assert f"has 100x{HEIGHT} pixels, the camera file is for {WIDTH}x{HEIGHT}" in finding.text
 
 
 # Faults of a model beside mesh and camera.

@@ -93,6 +93,10 @@ def test_folders(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such folder"):
         Photographs(tmp_path / "none")
     (tmp_path / "note.txt").touch()
+    with pytest.raises(DataError, match="no such folder"):
+        Photographs(tmp_path / "note.txt")
+    with pytest.raises(DataError, match=r"a: cannot be listed \(File name too long\)"):
+        Photographs(tmp_path / ("a" * 300))
     with pytest.raises(DataError, match="found no images"):
         Photographs(tmp_path)
     save(tmp_path / "b.png", PIXELS)

@@ -62,6 +62,8 @@ def test_where_things_ever_were_is_told_from_noise_and_exposure() -> None:
         (json.dumps({"plate.png": {"cam_from_world": "here"}}), "no matrix"),
         (json.dumps({"plate.png": {"cam_from_world": np.diag([2, 2, 2, 1]).tolist()}}), "not rigid"),
         (json.dumps({"plate.png": {"cam_from_world": camera(-20).tolist()}}), "looks up"),
+        (json.dumps({"plate.png": {"cam_from_world": camera(20).tolist(), "unit": None}}), "--distance-m or --objects"),
+        (json.dumps({"plate.png": {"cam_from_world": camera(20).tolist(), "unit": "mm"}}), "the unit is 'mm'"),
         ("[" * 100_000, "not JSON .*nested too deeply"),
     ],
 )
@@ -71,6 +73,13 @@ def test_camera_places_that_do_not_do(tmp_path: Path, content: str | None, expec
         file.write_text(content)
     with pytest.raises(CameraError, match=expected):
         CameraPoseFile.read(file).pose_above_plane(tmp_path / "plate.png")
+
+
+def test_a_pose_is_in_metres_unless_its_file_says_otherwise(tmp_path: Path) -> None:
+    for name, more in (("said.json", {"unit": "m"}), ("silent.json", {})):
+        (tmp_path / name).write_text(json.dumps({"plate.png": {"cam_from_world": camera(20).tolist()} | more}))
+        found = CameraPoseFile.read(tmp_path / name).pose_above_plane(tmp_path / "plate.png")
+        assert np.array_equal(found, camera(20))
 
 
 def test_a_file_of_camera_places_is_a_regular_file(tmp_path: Path) -> None:

@@ -18,13 +18,13 @@ MATRICES = [
     np.array([[610.0, 0, 326.0], [0, 606.0, 233.0], [0, 0, 1]]),
     np.array([[560.0, 0, 315], [0, 560, 241], [0, 0, 1]]),
 ]
-CHARUCO, PLAIN = Board(9, 6, SQUARE_M, 0.022), Board(9, 6, SQUARE_M)
+CHARUCO, PLAIN, SQUARE = Board(9, 6, SQUARE_M, 0.022), Board(9, 6, SQUARE_M), Board(8, 8, SQUARE_M)
 
 
-def _second() -> np.ndarray:
+def _second(roll_deg: float = -2) -> np.ndarray:
     """Right from left: 0.25 m beside it, turned towards the same place."""
     pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("xyz", [3, 28, -2], degrees=True).as_matrix()
+    pose[:3, :3] = Rotation.from_euler("xyz", [3, 28, roll_deg], degrees=True).as_matrix()
     pose[:3, 3] = np.array([0, 0, 0.48]) - pose[:3, :3] @ np.array([0, 0, 0.47]) + np.array([0.0, 0.01, 0.0])
     return pose
 
@@ -40,7 +40,7 @@ def _print(board: Board) -> np.ndarray:
     return cv2.GaussianBlur(cv2.copyMakeBorder(image, *(PX // 2,) * 4, cv2.BORDER_CONSTANT, value=255), (0, 0), 0.8)
 
 
-def _write(folder: Path, board: Board, count: int = 14) -> Path:
+def _write(folder: Path, board: Board, count: int = 14, roll_deg: float = -2) -> Path:
     random, image = np.random.default_rng(3), _print(board)
     step, middle = SQUARE_M / PX, (np.array(image.shape[::-1]) - 1) / 2
     for number in range(count):
@@ -48,7 +48,7 @@ def _write(folder: Path, board: Board, count: int = 14) -> Path:
         angles = [*random.uniform(-30, 30, 2), random.uniform(-15, 15)]
         held[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
         held[:3, 3] = [*random.uniform(-0.03, 0.03, 2), random.uniform(0.42, 0.52)]
-        for name, matrix, pose in (("left", MATRICES[0], np.eye(4)), ("right", MATRICES[1], _second())):
+        for name, matrix, pose in (("left", MATRICES[0], np.eye(4)), ("right", MATRICES[1], _second(roll_deg))):
             seen = pose @ held
             on_board = np.array([[step, 0, -step * middle[0]], [0, step, -step * middle[1]], [0, 0, 1]])
             homography = matrix @ np.stack([seen[:3, 0], seen[:3, 1], seen[:3, 3]], axis=1) @ on_board
@@ -59,18 +59,23 @@ def _write(folder: Path, board: Board, count: int = 14) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("board", [PLAIN, CHARUCO], ids=["chessboard", "ChArUco"])
-def test_cameras_are_found_where_they_stand(tmp_path: Path, board: Board) -> None:
-    rig = calibrate_rig(_write(tmp_path, board), board)
+@pytest.mark.parametrize(
+    ("board", "roll_deg"),
+    [(PLAIN, -2), (CHARUCO, -2), (SQUARE, -2), (SQUARE, 45), (SQUARE, 90), (PLAIN, 90)],
+    ids=["chessboard", "ChArUco", "square chessboard", "rolled, square", "turned, square", "turned"],
+)
+def test_cameras_are_found_where_they_stand(tmp_path: Path, board: Board, roll_deg: float) -> None:
+    rig = calibrate_rig(_write(tmp_path, board, roll_deg=roll_deg), board)
     assert rig.names == ("left", "right")
     assert rig.num_instants[1] >= 8
-    error = np.linalg.inv(_second()) @ rig.cam_from_rig[1]
+    error = np.linalg.inv(_second(roll_deg)) @ rig.cam_from_rig[1]
     assert np.linalg.norm(error[:3, 3]) < 0.006
     assert np.degrees(np.arccos((np.trace(error[:3, :3]) - 1) / 2)) < 0.6
 
 
 def test_the_command_writes_what_serving_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, out = _write(tmp_path / "boards", CHARUCO), tmp_path / "rig.json"
+    (folder / ".thumbnails").mkdir()
     flags = ["--board", "9", "6", "--square-mm", "30", "--marker-mm", "22", "--rig-out", str(out)]
     with pytest.raises(SystemExit) as ended:
         train(["capture", "--calibrate", "--images", str(folder), *flags])
@@ -100,3 +105,6 @@ def test_photographs_of_no_rig_are_refused(tmp_path: Path) -> None:
         calibrate_rig(folder, CHARUCO)
     with pytest.raises(DataError, match="has 0 folders"):
         calibrate_rig(folder / "left", CHARUCO)
+    for name, reason in (("none", "No such file or directory"), ("a" * 300, "File name too long")):
+        with pytest.raises(DataError, match=rf"{name}: cannot be listed \({reason}\)"):
+            calibrate_rig(tmp_path / name, CHARUCO)

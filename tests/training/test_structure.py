@@ -120,6 +120,22 @@ def test_a_known_camera_is_kept(sequence: tuple[list[Path], np.ndarray]) -> None
     assert np.degrees(Rotation.from_matrix(found.relative(0, 9)[:3, :3] @ turn.T).magnitude()) < 0.5
 
 
+def test_all_coefficients_of_a_known_lens_count(tmp_path: Path) -> None:
+    """Of a rational model they are large, and nearly cancel each other: these are a Kinect's."""
+    lens = (0.52, -2.67, 0.0006, -0.0002, 1.52, 0.40, -2.49, 1.45)
+    pixels = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1).reshape(-1, 1, 2).astype(np.float64)
+    ideal = cv2.undistortPoints(pixels, MATRIX, np.array(lens), P=MATRIX).reshape(HEIGHT, WIDTH, 2).astype(np.float32)
+    random, textures = np.random.default_rng(0), [texture(seed) for seed in range(len(PLANES))]
+    truth, paths = [pose(number / 20) for number in range(8)], [tmp_path / f"{number}.png" for number in range(8)]
+    for path, matrix in zip(paths, truth, strict=True):
+        seen = cv2.remap(photograph(matrix, textures), ideal, None, cv2.INTER_CUBIC, borderValue=128)
+        cv2.imwrite(str(path), (seen + random.normal(0, 2, seen.shape)).clip(0, 255).astype(np.uint8))
+    found = recover(paths, Intrinsics(MATRIX, WIDTH, HEIGHT, lens))
+    assert len(found.photographs) == 8
+    turns = [found.relative(0, n)[:3, :3] @ (truth[n] @ np.linalg.inv(truth[0]))[:3, :3].T for n in range(1, 8)]
+    assert np.degrees(Rotation.from_matrix(np.stack(turns)).magnitude()).max() < 0.3
+
+
 def test_the_command(
     sequence: tuple[list[Path], np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -130,13 +146,80 @@ def test_the_command(
     with pytest.raises(SystemExit) as exit_:
         train_command.train(["capture", "--calibrate", *flags])
     assert not exit_.value.code
-    assert "placed 14 photographs" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "placed 14 of 14 photographs, points off by" in out
+    assert f"in metres, {baseline:g} from 000.png to 039.png" in out
     assert load_intrinsics(tmp_path / "camera.json").matrix[0, 0] == pytest.approx(FOCAL, rel=0.02)
     view = json.loads((tmp_path / "views.json").read_text())["000.png"]
     assert view["unit"] == "m"
     first = np.array(view["cam_from_world"])
     height = -(first[:3, :3].T @ first[:3, 3])[1]
     assert height == pytest.approx(np.linalg.inv(truth[0])[1, 3], abs=0.03), "metres above the ground"
+
+
+def test_a_camera_file_that_was_not_named_is_left(
+    sequence: tuple[list[Path], np.ndarray],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    call = ["capture", "--calibrate", "--images", str(sequence[0][0].parent), "--every", "5"]
+
+    def said(*flags: str) -> str:
+        with pytest.raises(SystemExit) as exit_:
+            train_command.train([*call, *flags])
+        assert not exit_.value.code
+        return capsys.readouterr().out
+
+    assert "\ncamera.json: focal length" in said()
+    assert load_intrinsics(tmp_path / "camera.json").width == WIDTH
+    (tmp_path / "camera.json").write_text("from a board")
+    assert "camera.json is there already and was left as it is: to write this camera, add --camera-out" in said()
+    assert (tmp_path / "camera.json").read_text() == "from a board"
+    assert "\ncamera.json: focal length" in said("--camera-out", "camera.json")
+    assert load_intrinsics(tmp_path / "camera.json").width == WIDTH
+
+
+def calibrate_with_a_stranger(
+    frames: list[Path], stranger: int, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> tuple[int, str, str]:
+    """The command on every fifth of 40 frames, one of which shows another scene; each camera is at its distance."""
+    (folder / "images").mkdir()
+    for number, path in enumerate(frames):
+        if number == stranger:
+            cv2.imwrite(str(folder / "images" / path.name), texture(100)[:HEIGHT, :WIDTH])
+        else:
+            (folder / "images" / path.name).symlink_to(path)
+    flags = ["--images", folder / "images", "--every", 5, "--distance-m", 1.0, "--camera-out", folder / "camera.json"]
+    with pytest.raises(SystemExit) as exit_:
+        train_command.train(["capture", "--calibrate", *map(str, flags), "--views-out", str(folder / "views.json")])
+    captured = capsys.readouterr()
+    return int(exit_.value.code or 0), captured.out, captured.err
+
+
+@pytest.mark.parametrize(("stranger", "end"), [(0, "first"), (35, "last")], ids=["first", "last"])
+def test_a_distance_to_a_camera_without_a_place_is_refused(
+    stranger: int,
+    end: str,
+    sequence: tuple[list[Path], np.ndarray],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    status, _, err = calibrate_with_a_stranger(sequence[0], stranger, tmp_path, capsys)
+    assert status == 1
+    assert f"from 000.png to 035.png, but {stranger:03}.png was not placed" in err
+    assert f"new {end} photograph" in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["images"], "nothing of a wrong scale is written"
+
+
+def test_photographs_without_a_place_are_named(
+    sequence: tuple[list[Path], np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = calibrate_with_a_stranger(sequence[0], 20, tmp_path, capsys)
+    assert status == 0, err
+    assert "placed 7 of 8 photographs (not placed: 020.png), points off by" in out
+    assert "020.png" not in json.loads((tmp_path / "views.json").read_text())
 
 
 def test_no_texture(tmp_path: Path) -> None:

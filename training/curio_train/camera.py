@@ -5,12 +5,12 @@ width - 0.5. The camera frame is OpenCV's: x right, y down, z forward, metres.
 """
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from curio_serve import errors as serving
+from curio_serve.files import write_whole
 from curio_serve.imaging.camera import PinholeCamera, scaling
 from curio_serve.imaging.camera_files import read_camera_file
 
@@ -84,10 +84,8 @@ def save_intrinsics(path: Path, camera: Intrinsics) -> None:
         "height": camera.height,
         "distortion": list(camera.distortion or (0.0,) * 5),
     }
-    draft = path.with_name(f"{path.name}.part")
     try:
-        draft.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        os.replace(draft, path)
+        write_whole(path, json.dumps(content, indent=2) + "\n")
     except OSError as exc:
         raise CameraError(f"{path}: cannot be written ({exc.strerror}); name another file: --camera-out") from exc
 

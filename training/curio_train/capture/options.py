@@ -38,8 +38,8 @@ class CalibrateCommand:
     rig_out: Path | None = None
     """Several cameras: the folder has one of each, which show --board at the same instants under the same names. File
     to write for curio-detect --rig: each camera and where it stands."""
-    camera_out: Path = Path("camera.json")
-    """The camera file to write."""
+    camera_out: Path | None = None
+    """The camera file to write. None: camera.json; from a scene only where there is no such file yet."""
     views_out: Path | None = None
     """File for where each photograph was taken: cam_from_world, y up, origin on the ground."""
 

@@ -30,7 +30,7 @@ class CameraPoseFile:
 
     Photographs are named by their path from the file's folder, or by their file name. If the camera moves, each may
     name a background image of its own as "plate"; ``"unit": "m"`` says that the pose is in metres, which ``--views``
-    requires.
+    requires; ``--plane`` refuses another unit.
     """
 
     file: Path
@@ -71,12 +71,18 @@ class CameraPoseFile:
         return _rigid(self._entry(photograph)["cam_from_world"], self._where(photograph))
 
     def pose_above_plane(self, photograph: Path) -> np.ndarray:
-        """The same of a camera that has to be above the plane and look down on it.
+        """The same of a camera that has to be above the plane and look down on it, in metres.
 
         Raises:
-            CameraError: The file has no pose, or another one.
+            CameraError: The file has no pose, another one, or says that it is not in metres.
         """
         matrix = self.cam_from_world(photograph)
+        unit = self._entry(photograph).get("unit", "m")
+        if unit != "m":
+            raise CameraError(
+                f"{self._where(photograph)}: the unit is {unit!r}, expected 'm'; make the file again with --distance-m "
+                "or --objects beside --calibrate --views-out, which bring the scene to metres"
+            )
         height, forward = (-matrix[:3, :3].T @ matrix[:3, 3])[1], matrix[2, 1]
         if height <= 0 or forward >= 0:
             raise CameraError(

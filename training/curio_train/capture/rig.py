@@ -5,7 +5,7 @@ camera and each other one are related by the instants in which both see the boar
 """
 
 import json
-import os
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from curio_serve.consensus.poses import angles_deg
+from curio_serve.files import write_whole
 
 from curio_train.camera import Intrinsics
 from curio_train.capture.calibration import Board, Calibration, calibrate
@@ -48,14 +49,17 @@ def calibrate_rig(folder: Path, board: Board) -> RigCalibration:
     """The rig whose cameras took a folder of photographs each.
 
     Args:
-        folder: Holds a folder a camera; photographs of one instant have the same name in each.
+        folder: Holds a folder a camera, beside hidden ones; photographs of one instant have the same name in each.
         board: That they show.
 
     Raises:
-        DataError: A wrong number of folders, or photographs that cannot be used.
+        DataError: The folder cannot be listed, a wrong number of folders, or photographs that cannot be used.
         CameraError: They do not determine a camera, or too few instants show the board to a pair.
     """
-    folders = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    try:
+        folders = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    except OSError as exc:
+        raise DataError(f"{folder}: cannot be listed ({exc.strerror}); expected a folder of each camera in it") from exc
     if not LEAST_CAMERAS <= len(folders) <= MOST_CAMERAS:
         raise DataError(
             f"{folder} has {len(folders)} folders; expected one a camera, {LEAST_CAMERAS} to {MOST_CAMERAS}, with "
@@ -66,7 +70,7 @@ def calibrate_rig(folder: Path, board: Board) -> RigCalibration:
     poses, counts, errors = [np.eye(4)], [len(seen[0])], [0.0]
     for number in range(1, len(folders)):
         names = f"{folders[0].name} and {folders[number].name}"
-        pose, count, error = _relative(names, seen[0], seen[number], cameras[0].camera, cameras[number].camera)
+        pose, count, error = _relative(names, seen[0], seen[number], cameras[0], cameras[number])
         poses.append(pose)
         counts.append(count)
         errors.append(error)
@@ -92,10 +96,8 @@ def save_rig(path: Path, rig: RigCalibration) -> None:
         }
         for name, found, pose in zip(rig.names, rig.cameras, rig.cam_from_rig, strict=True)
     ]
-    draft = path.with_name(f"{path.name}.part")
     try:
-        draft.write_text(json.dumps({"cameras": entries}, indent=2) + "\n", encoding="utf-8")
-        os.replace(draft, path)
+        write_whole(path, json.dumps({"cameras": entries}, indent=2) + "\n")
     except OSError as exc:
         raise CameraError(f"{path}: cannot be written ({exc.strerror}); name another file: --rig-out") from exc
 
@@ -110,7 +112,7 @@ def _corners(folder: Path, board: Board) -> dict[str, Corners]:
 
 
 def _relative(
-    names: str, first: Mapping[str, Corners], other: Mapping[str, Corners], one: Intrinsics, two: Intrinsics
+    names: str, first: Mapping[str, Corners], other: Mapping[str, Corners], one: Calibration, two: Calibration
 ) -> tuple[np.ndarray, int, float]:
     """Pose of the other camera in the first one's frame (other_from_first), instants, error in pixels."""
     pairs = [_common(first[name], other[name]) for name in sorted(first.keys() & other.keys())]
@@ -120,8 +122,9 @@ def _relative(
             f"{names} both see the board in {len(pairs)} photographs of the same name; expected {_FEWEST_INSTANTS} or "
             "more: hold it where both cameras see it, and name the photographs of one instant alike"
         )
-    found = [_solve(_turned(pairs, reference, one, two), one, two) for reference in (False, True)]
-    pose, error = min(found, key=lambda one: one[1])
+    ways = len(_counted(pairs[0][2], two.board))
+    found = [_solve(_turned(pairs, reference, one, two), one.camera, two.camera) for reference in range(ways)]
+    pose, error = min(found, key=lambda result: result[1])
     if not error <= _LARGEST_ERROR_PX:
         raise CameraError(
             f"{names}: corners lie {error:.2g} pixels from where the best pair of cameras sees them, expected at most "
@@ -141,24 +144,38 @@ def _common(first: Corners, other: Corners) -> _Pair:
     return first[0][mine], first[1][mine], other[1][theirs]
 
 
-def _turned(pairs: list[_Pair], reference: bool, one: Intrinsics, two: Intrinsics) -> list[_Pair]:
+def _counted(corners: np.ndarray, board: Board) -> list[np.ndarray]:
+    """The orders in which the corners [n, 2] that a camera sees may be meant.
+
+    A chessboard looks the same after half a turn, and a square one nearly so after a quarter; markers tell the corner.
+    """
+    if board.marker_m is not None:
+        return [corners]
+    if board.columns != board.rows:
+        return [corners, corners[::-1]]
+    side = math.isqrt(len(corners))
+    grid = corners.reshape(side, side, 2)
+    return [np.rot90(grid, quarters).reshape(-1, 2) for quarters in range(4)]
+
+
+def _turned(pairs: list[_Pair], reference: int, one: Calibration, two: Calibration) -> list[_Pair]:
     """The pairs with the other camera's corners so ordered that the cameras stand alike in all of them.
 
-    A chessboard looks the same after half a turn, so its corners may be counted from the other end in one of two
-    photographs. That is told by the pose of the cameras, which has to be the same at every instant.
+    In one of two photographs a chessboard's corners may be counted from another end. That is told by the pose of the
+    cameras, which has to be the same at every instant.
 
     Args:
         pairs: As found.
-        reference: Whether the first pair is to be turned.
-        one: The first camera.
-        two: The other camera.
+        reference: Which order of the first pair is meant.
+        one: The first camera, and the board.
+        two: The other camera, and the board.
     """
     expected, chosen = None, []
     for points, mine, theirs in pairs:
-        orders = [theirs, theirs[::-1]]
-        poses = [_rotation(points, order, two) @ _rotation(points, mine, one).T for order in orders]
+        orders = _counted(theirs, two.board)
+        poses = [_rotation(points, order, two.camera) @ _rotation(points, mine, one.camera).T for order in orders]
         if expected is None:
-            expected = poses[int(reference)]
+            expected = poses[reference]
         nearest = int(angles_deg(np.stack(poses), expected, np.eye(3)[None])[0].argmin())
         chosen.append((points, mine, orders[nearest]))
     return chosen

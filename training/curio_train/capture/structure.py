@@ -17,6 +17,8 @@ _FEWEST_POINTS = 100
 _LARGEST_ERROR_PX = 2.0
 _NEIGHBOURS = 10
 _MOST_FEATURES = 1200  # of a photograph: more cost minutes in matching and move cameras by nothing that counts
+_COEFFICIENTS = 8  # of a lens
+_LARGEST_COEFFICIENT = 1e6  # of a known lens: those of rational models cancel each other, but pycolmap expects 1
 _ALL_PAIRS = 30  # so many photographs are compared pair by pair, longer sequences with neighbours alone
 
 
@@ -101,11 +103,12 @@ def _map(folder: Path, names: list[str], camera: Intrinsics | None, scratch: Pat
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, multiple_models=False)
     if camera is not None:
         (fx, _, cx), (_, fy, cy), _ = camera.matrix
-        reader.camera_model = "OPENCV"
+        reader.camera_model = "FULL_OPENCV"
         # Its pixel centres lie at half-integers.
-        values = (fx, fy, cx + 0.5, cy + 0.5, *(camera.distortion or (0.0,) * 5)[:4])
+        values = (fx, fy, cx + 0.5, cy + 0.5, *(*camera.distortion, *(0.0,) * _COEFFICIENTS)[:_COEFFICIENTS])
         reader.camera_params = ",".join(f"{value:.10g}" for value in values)
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.max_extra_param = _LARGEST_COEFFICIENT
     try:
         pycolmap.extract_features(database, folder, names, pycolmap.CameraMode.SINGLE, reader, extraction)
         if len(names) <= _ALL_PAIRS:

@@ -1,6 +1,8 @@
 """``curio-train capture --assistant``: photographs from a camera, and a page on loopback that says what is missing."""
 
+import contextlib
 import json
+import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -50,6 +52,10 @@ class Page:
         content = self._content
 
         class Answer(BaseHTTPRequestHandler):
+            def handle(self) -> None:
+                with contextlib.suppress(ConnectionError):  # the browser is gone, or has turned to another page
+                    super().handle()
+
             def do_GET(self) -> None:
                 kind, body = content.get(self.path.strip("/").partition("?")[0], ("", b""))
                 self.send_response(HTTPStatus.OK if kind else HTTPStatus.NOT_FOUND)
@@ -108,7 +114,7 @@ def run(command: AssistantCommand, interruption: Interruption, report: Callable[
         if assistant.wants_background:
             report(f"first the empty scene, for {command.background}: leave the part away")
         for number, pixels in enumerate(frames, 1):
-            if assistant.num_kept >= enough or interruption.signum is not None:
+            if _is_done(assistant, enough) or interruption.signum is not None:
                 break
             before, was_background = assistant.num_kept, assistant.wants_background
             found = assistant.take(pixels)
@@ -119,13 +125,19 @@ def run(command: AssistantCommand, interruption: Interruption, report: Callable[
                 report(f"{assistant.num_kept} of {enough} kept")
             text = f"{assistant.num_kept} of {enough} kept; this frame: {found.fault or 'kept'}"
             page.show(pixels, text, _more(found), number)
-    if assistant.num_kept >= enough:
+    if _is_done(assistant, enough):
         print(f"{command.out}: {assistant.num_kept} photographs, enough")
         return 0
     (worst, count), *_ = [*faults.most_common(1), ("", 0)]
     hint = f"; {count} frames were {worst}" if worst else ""
+    if assistant.wants_background:
+        hint = f", {command.background} was not taken{hint}"
     print(f"{command.out}: {assistant.num_kept} of {enough} photographs{hint}; the same command goes on")
     return 1 if interruption.signum is None else 128 + interruption.signum
+
+
+def _is_done(assistant: Assistant, enough: int) -> bool:
+    return assistant.num_kept >= enough and not assistant.wants_background
 
 
 def _frames(source: str) -> Iterator[np.ndarray]:
@@ -135,7 +147,7 @@ def _frames(source: str) -> Iterator[np.ndarray]:
         UsageError: It cannot be opened.
         DataError: A photograph cannot be read.
     """
-    if Path(source).is_dir():
+    if os.path.isdir(source):
         return (read_photograph(path) for path in Photographs(Path(source)).paths)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
     if not capture.isOpened():

@@ -1,6 +1,7 @@
 """The command ``curio-doctor``. Heavy packages are imported only once its arguments are understood."""
 
 import dataclasses
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ class DoctorCommand:
     model: Path | None = None
     """Model folder, version folder or .onnx file, made for that mesh and camera where they are given."""
     symmetries: Path | None = None
-    """File for the symmetries of the mesh's shape, as an entry of BOP's models_info.json."""
+    """New file for the symmetries of the mesh's shape, as an entry of BOP's models_info.json."""
     cache: Path = CACHE
     """Where image sets that a world draws once will be kept."""
 
@@ -49,6 +50,11 @@ def _examine(command: DoctorCommand) -> int:
 
     if command.symmetries is not None and command.mesh is None:
         raise UsageError(f"--symmetries {command.symmetries}: found no --mesh to find them from")
+    if command.symmetries is not None and os.path.lexists(command.symmetries):
+        raise UsageError(
+            f"--symmetries {command.symmetries}: there is such a file already, and other objects may be in it; name "
+            "a new one"
+        )
     colours = {"good": "green", "warning": "yellow", "bad": "bold red"}
     console, status = Console(highlight=False, soft_wrap=True), 0
     names = [field.name for field in dataclasses.fields(Subjects)]

@@ -174,13 +174,16 @@ class Photographs:
         folder: Where they lie.
 
     Raises:
-        DataError: There is no such folder, or no image in it.
+        DataError: There is no such folder, it cannot be listed, or it has no image in it.
     """
 
     def __init__(self, folder: Path) -> None:
-        if not folder.is_dir():
-            raise DataError(f"{folder}: there is no such folder; expected one with photographs")
-        self.paths = image_files(folder)
+        try:
+            self.paths = image_files(folder)
+        except (FileNotFoundError, NotADirectoryError, ValueError) as exc:  # the last: a null byte in its name
+            raise DataError(f"{folder}: there is no such folder; expected one with photographs") from exc
+        except OSError as exc:
+            raise DataError(f"{folder}: cannot be listed ({exc.strerror}); expected a folder of photographs") from exc
         if not self.paths:
             raise DataError(f"{folder}: found no images, expected files ending in {' '.join(SUFFIXES)}")
         # Decoding costs more than rendering the object in front: a few hundred photographs stay in memory, shrunk.

@@ -1,5 +1,6 @@
 """Chooses photographs among the frames of a camera: sharp, well exposed, unlike those already kept."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,9 +10,9 @@ import torch
 
 from curio_train.capture.calibration import Board
 from curio_train.data.background_difference import compare
-from curio_train.data.photographs import image_files, read_photograph
+from curio_train.data.photographs import SUFFIXES, image_files, read_photograph
 from curio_train.doctor.picture_content import BLURRED, MOSTLY_LOST, sharpness_and_exposure, thumbnail
-from curio_train.errors import DataError
+from curio_train.errors import DataError, UsageError
 
 _LEAST_DIFFERENCE = 30.0  # levels of 255 in one of 64x64 places: more than noise and flicker
 _LEAST_IN_SIGHT = 0.002  # fraction of the frame that differs from the empty scene
@@ -40,7 +41,7 @@ class Assistant:
     """Keeps good frames as files in a folder."""
 
     num_kept: int
-    """In the folder, those of earlier calls included."""
+    """In the folder, those of earlier calls included, without the empty scene."""
 
     def __init__(self, folder: Path, board: Board | None, background: Path | None) -> None:
         """Look at what is there.
@@ -51,7 +52,8 @@ class Assistant:
             background: Photograph of the empty scene; one that does not exist is taken first.
 
         Raises:
-            DataError: The folder or a photograph cannot be used.
+            DataError: The folder, a photograph or the background's path cannot be used, or they differ in size.
+            UsageError: The background's name does not say what kind of image it is to be.
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -59,11 +61,13 @@ class Assistant:
         except OSError as exc:
             raise DataError(f"--out {folder}: cannot be made or read: {exc.strerror}") from exc
         self._folder, self._board, self._background = folder, board, background
-        self._kept = [thumbnail(read_photograph(path)) for path in there]
-        self.num_kept = len(self._kept)
+        self._first: tuple[str, int, int] | None = None
         self._empty: torch.Tensor | None = None
-        if background is not None and background.exists():
-            self._empty = _small(read_photograph(background))
+        if background is not None:
+            there = [path for path in there if os.path.realpath(path) != os.path.realpath(background)]
+            self._look_at_background(background)
+        self._kept = [thumbnail(self._read(path)) for path in there]
+        self.num_kept = len(self._kept)
 
     @property
     def wants_background(self) -> bool:
@@ -77,8 +81,9 @@ class Assistant:
             pixels: uint8 RGB [height, width, 3].
 
         Raises:
-            DataError: The file cannot be written.
+            DataError: The file cannot be written, or the frame is not of the photographs' size.
         """
+        self._check_size("this frame", pixels)
         seen = thumbnail(pixels)
         judgement = self._judge(pixels, seen)
         if judgement.fault:
@@ -94,6 +99,28 @@ class Assistant:
         self._kept.append(seen)
         self.num_kept = len(self._kept)
         return judgement
+
+    def _look_at_background(self, background: Path) -> None:
+        if _exists(background):
+            self._empty = _small(self._read(background))
+        elif background.suffix.lower() not in SUFFIXES:
+            raise UsageError(f"--background {background}: expected a file name that ends in {' '.join(SUFFIXES)}")
+
+    def _read(self, path: Path) -> np.ndarray:
+        pixels = read_photograph(path)
+        self._check_size(str(path), pixels)
+        return pixels
+
+    def _check_size(self, name: str, pixels: np.ndarray) -> None:
+        height, width = pixels.shape[:2]
+        if self._first is None:
+            self._first = (name, width, height)
+        first, *size = self._first
+        if [width, height] != size:
+            raise DataError(
+                f"{name} has {width}x{height} pixels, but {first} has {size[0]}x{size[1]}; one camera has to take all "
+                "in one size: set its resolution, or choose other places for the new ones: --out and --background"
+            )
 
     def _judge(self, pixels: np.ndarray, seen: np.ndarray) -> Judgement:
         blur, lost = sharpness_and_exposure(pixels)
@@ -120,13 +147,25 @@ class Assistant:
         return any(reading.find(grey) is not None for reading in self._board.readings)
 
 
+def _exists(background: Path) -> bool:
+    try:
+        background.stat()
+    except FileNotFoundError:
+        return False
+    except OSError as exc:
+        raise DataError(f"--background {background}: cannot be reached ({exc.strerror}); name another file") from exc
+    return True
+
+
 def _small(pixels: np.ndarray) -> torch.Tensor:
     small = cv2.resize(pixels, _SMALL, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(small).permute(2, 0, 1).float() / 255
 
 
 def _write(path: Path, pixels: np.ndarray) -> None:
-    _, encoded = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    kind = path.suffix.lower()
+    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if kind in (".jpg", ".jpeg") else []
+    _, encoded = cv2.imencode(kind, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), options)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(encoded.tobytes())

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from curio_serve.files import write_whole
+
 from curio_train.camera import Intrinsics
 from curio_train.doctor.camera_file import examine_camera
 from curio_train.doctor.finding import Finding
@@ -68,7 +70,7 @@ def examine_files(subjects: Subjects) -> Iterator[Finding]:
     else:
         photographs = []
     if subjects.background is not None:
-        yield from examine_background(subjects.background, photographs)
+        yield from examine_background(subjects.background, photographs, camera)
     if subjects.model is not None:
         from curio_train.doctor.model_file import examine_model
 
@@ -88,7 +90,7 @@ def save_symmetries(mesh: Path, unit: Unit | None, body: str | None, out: Path) 
     for axis, start, size in zip("xyz", low, high - low, strict=True):
         entry |= {f"min_{axis}": float(start), f"size_{axis}": float(size)}
     try:
-        out.write_text(json.dumps({"1": entry | find_symmetries(loaded).as_bop()}, indent=2) + "\n", encoding="utf-8")
+        write_whole(out, json.dumps({"1": entry | find_symmetries(loaded).as_bop()}, indent=2) + "\n")
     except OSError as exc:
         raise DataError(f"{out}: cannot be written ({exc.strerror}); name another file: --symmetries") from exc
 

@@ -55,8 +55,8 @@ def _disk(folder: Path) -> Finding:
 
 
 def _existing(path: Path) -> Path:
-    """The folder, or the closest above it that is there."""
-    return next(folder for folder in (path, *path.absolute().parents) if folder.is_dir())
+    """The folder, or the closest above it that is there and can be reached."""
+    return next(folder for folder in (path, *path.absolute().parents) if os.path.isdir(folder))
 
 
 def _llvm() -> Finding:

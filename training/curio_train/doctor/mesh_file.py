@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from curio_train.doctor.finding import Finding, Sureness
 from curio_train.errors import CurioError
-from curio_train.meshes.cad import named
+from curio_train.meshes.cad import CAD_SUFFIXES, named
 from curio_train.meshes.meshes import METRES, Mesh, Unit, load_mesh
 from curio_train.meshes.symmetries import Symmetries, find_symmetries
 
@@ -28,7 +28,7 @@ def examine_mesh(path: Path, unit: Unit | None, body: str | None = None) -> tupl
         return None, [Finding("mesh", "bad", str(exc), fault=fault)]
     extent = " x ".join(f"{size * 1000:.4g}" for size in np.ptp(mesh.vertices_m, axis=0))
     text = f"{path}: {len(mesh.faces):,} faces, {extent} mm, diameter {mesh.diameter_m * 1000:.4g} mm"
-    findings = [Finding("mesh", "good", text), *_bodies(mesh), *_size(mesh, unit), *_colours(mesh)]
+    findings = [Finding("mesh", "good", text), *_bodies(mesh), *_size(mesh, path, unit), *_colours(mesh)]
     surface = list(examine_surface(mesh))
     if any(finding.fault == "stray parts" for finding in surface):
         return mesh, [*findings, *surface]  # its diameter is not the object's, and every tolerance is a fraction of it
@@ -42,7 +42,7 @@ def _bodies(mesh: Mesh) -> Iterator[Finding]:
         yield Finding("mesh bodies", "warning", text, remedy, "possible", fault="several bodies")
 
 
-def _size(mesh: Mesh, unit: Unit | None) -> Iterator[Finding]:
+def _size(mesh: Mesh, path: Path, unit: Unit | None) -> Iterator[Finding]:
     low, high = _USUAL_M
     if len(mesh.faces) > _MOST_FACES:
         text = f"{len(mesh.faces):,} faces, more than rendering in small images can show"
@@ -57,6 +57,8 @@ def _size(mesh: Mesh, unit: Unit | None) -> Iterator[Finding]:
     ]
     text = f"a diameter of {mesh.diameter_m * 1000:.4g} mm is unusual; the unit may be another"
     remedy = f"If it is not the object's true size, set {' or '.join(others)}" if others else "Check the file's unit"
+    if path.suffix.lower() in CAD_SUFFIXES:  # it says its unit, and --mesh-unit is refused
+        remedy = "If it is not the object's true size, export it again in its true unit"
     yield Finding("mesh unit", "warning", text, remedy, "likely" if others else "possible", fault="mesh unit")
 
 

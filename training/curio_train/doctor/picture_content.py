@@ -1,5 +1,6 @@
 """Examines what photographs show: blur, repetition, exposure, swapped colours, and the image of the empty scene."""
 
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 from PIL import ExifTags, Image
 from skimage.measure import blur_effect
 
+from curio_train.camera import Intrinsics
 from curio_train.data.photographs import read_photograph
 from curio_train.doctor.finding import Finding
 from curio_train.errors import CurioError
@@ -16,6 +18,8 @@ from curio_train.errors import CurioError
 THUMBNAIL_PX = 64
 _MEASURED_PX = 640
 _BLACK, _WHITE = 3, 252
+# What Pillow raises on them; only of a JPEG's it makes an empty entry itself.
+_BROKEN_EXIF = (SyntaxError, struct.error, ArithmeticError, LookupError, OSError, TypeError, ValueError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +82,17 @@ def thumbnail(pixels: np.ndarray) -> np.ndarray:
 
 
 def _exif(path: Path) -> tuple[int, float]:
-    with Image.open(path) as image:
-        entries = image.getexif()
-        details = entries.get_ifd(ExifTags.IFD.Exif)
-    orientation, focal = entries.get(ExifTags.Base.Orientation, 1), details.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)
-    # Broken writers store anything there; what is no number says nothing.
-    numbers = [value if isinstance(value, int | float) else 0 for value in (orientation, focal)]
-    return int(numbers[0]) or 1, float(numbers[1])
+    """Orientation and focal length; of an entry that is missing or broken, what says nothing."""
+    try:
+        with Image.open(path) as image:
+            entries = image.getexif()
+            details = entries.get_ifd(ExifTags.IFD.Exif)
+        given = entries.get(ExifTags.Base.Orientation, 1), details.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)
+        # Broken writers store anything there; what is no number says nothing.
+        orientation, focal = (value if isinstance(value, int | float) else 0 for value in given)
+        return int(orientation) or 1, float(focal)
+    except _BROKEN_EXIF:
+        return 1, 0.0
 
 
 BLURRED = 0.6  # sharp photographs of clutter: up to 0.45; blurred with a sigma of 2.5 pixels: 0.65 and more
@@ -168,12 +176,13 @@ _UNLIKE_WHEN_SHIFTED_BACK = 0.6
 _MOST_COMPARED = 100
 
 
-def examine_background(path: Path, photographs: Sequence[Photograph]) -> Iterator[Finding]:
-    """Whether the background image can be read, and fits to photographs.
+def examine_background(path: Path, photographs: Sequence[Photograph], camera: Intrinsics | None) -> Iterator[Finding]:
+    """Whether the background image can be read, and fits to photographs, or without them to the camera.
 
     Args:
         path: The background image's file.
-        photographs: What was taken before it; nothing is compared where there are none.
+        photographs: What was taken before it.
+        camera: What it was taken with, where known; photographs are compared with it elsewhere.
     """
     try:
         pixels = read_photograph(path)
@@ -181,9 +190,11 @@ def examine_background(path: Path, photographs: Sequence[Photograph]) -> Iterato
         yield Finding("background", "bad", str(exc), fault="background unreadable")
         return
     height, width = pixels.shape[:2]
-    sizes = {(photo.width, photo.height) for photo in photographs}
+    others, sizes = "photographs have", {(photo.width, photo.height) for photo in photographs}
+    if not sizes and camera is not None:
+        others, sizes = "the camera file is for", {(camera.width, camera.height)}
     if sizes and (width, height) not in sizes:
-        text = f"{path} has {width}x{height} pixels, photographs have {' '.join(f'{w}x{h}' for w, h in sorted(sizes))}"
+        text = f"{path} has {width}x{height} pixels, {others} {' '.join(f'{w}x{h}' for w, h in sorted(sizes))}"
         yield Finding("background", "bad", text, "Take it with the same camera and settings", fault="background size")
         return
     yield Finding("background", "good", f"{path}: {width}x{height}")
