@@ -303,3 +303,14 @@ def test_a_code_that_cannot_be_saved(files: Path, tmp_path: Path) -> None:
     (scene,) = read_scenes(files / "found.jsonl")
     with pytest.raises(DataError, match="choose another --out"):
         save(scene, tmp_path)
+
+
+def test_a_scene_of_a_generated_world_is_opened_again(tmp_path: Path) -> None:
+    page = next(iter(open_pages(Opening("chairs", cache=tmp_path))))
+    save(page.scene, tmp_path / "edited.jsonl")
+    (again,) = open_pages(Opening(str(tmp_path / "edited.jsonl"), cache=tmp_path))
+    assert again.scene.world == "chairs"
+    assert again.scene.photograph is None
+    for one, other in zip(again.scene.objects, page.scene.objects, strict=True):
+        np.testing.assert_allclose(one.pose.translation_m, other.pose.translation_m)
+        assert again.context.mesh(one.kind).diameter_m == page.context.mesh(other.kind).diameter_m

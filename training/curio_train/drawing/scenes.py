@@ -142,7 +142,7 @@ def _from_detections(record: Mapping[str, Any], number: int, path: Path) -> Scen
     if record["camera_matrix"] is None:
         raise DataError(f"{where}: it has no camera_matrix, so it is flat; expected poses in three dimensions")
     width, height = int(record["width"]), int(record["height"])
-    light = record.get("light")
+    light, world = record.get("light"), record.get("world")
     return Scene(
         f"{number:06d}-{Path(record['image']).stem}",
         width,
@@ -150,7 +150,8 @@ def _from_detections(record: Mapping[str, Any], number: int, path: Path) -> Scen
         check_matrix(record["camera_matrix"], width, height, f"{where}, camera_matrix"),
         tuple(_placed(detection) for detection in record["detections"]),
         None if light is None else _numbers(light, (3,), "light"),
-        located(Path(record["image"]), path.parent),
+        located(Path(record["image"]), path.parent) if world is None else None,
+        None if world is None else mesh_world(str(world)).name,
         distortion=tuple(map(float, record.get("distortion") or ())),
         exif_rotation=record.get("exif_rotation") is True,
     )
