@@ -1,6 +1,7 @@
 """The client against our server, and against one that fails as it is told."""
 
 import asyncio
+import math
 import subprocess
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -103,6 +104,20 @@ def test_what_is_loaded(client: PoseClient) -> None:
     assert [m.name for m in client.list_models()] == ["flat", "pinhole"]
     assert client.get_model("flat").spec.world == "spots"
     assert client.get_model("flat/1").version == 1
+
+
+def test_a_call_or_a_stream_may_have_no_deadline(client: PoseClient, png: Path) -> None:
+    request = detect_request("flat", png)
+    assert client.detect("flat", png, timeout_s=math.inf).width == 320
+    assert [answer.width for answer in client.detect_stream([request], timeout_s=math.inf)] == [320]
+
+
+def test_a_token_is_text_in_one_line(server) -> None:
+    with PoseClient(server.address, token="read from a file\n") as client:
+        assert client.list_models()
+    for token in ("two\nlines", "sésame"):
+        with pytest.raises(errors.UsageError, match="printable ASCII"):
+            PoseClient(server.address, token=token)
 
 
 def test_a_stream_answers_in_order_with_ids(client: PoseClient, png: Path) -> None:

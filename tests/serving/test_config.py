@@ -74,7 +74,11 @@ def test_bad_variables_are_named(environment: dict[str, str], words: str) -> Non
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("port = ", "is not TOML"), ("prot = 1", r"unknown keys \['prot'\]"), ("[port]\nx = 1", "port: found a dict")],
+    [
+        ("port = ", "is not TOML"),
+        ("prot = 1", r"unknown keys \['prot'\]"),
+        ("[port]\nx = 1", r"port: found \{.x.: 1\}, expected text or a number"),
+    ],
 )
 def test_bad_files_are_named(tmp_path: Path, text: str, words: str) -> None:
     file = tmp_path / "serve.toml"
@@ -99,3 +103,36 @@ def test_values_of_another_kind_end_with_usage_and_source(
     said = capsys.readouterr()
     assert "--port" in said.err + said.out
     assert source in said.err + said.out
+
+
+def test_what_belongs_together_may_come_from_several_sources(tmp_path: Path) -> None:
+    file = tmp_path / "tls.toml"
+    file.write_text('tls_certificate = "c.pem"\n')
+    config = read_config(["--config", str(file), "--client-ca", "ca.pem"], {"CURIO_SERVE_TLS_KEY": "k.pem"})
+    assert [str(path) for path in (config.tls_certificate, config.tls_key, config.client_ca)] == [
+        "c.pem",
+        "k.pem",
+        "ca.pem",
+    ]
+    with pytest.raises(UsageError, match="come together"):
+        read_config(["--config", str(file)], {})
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ('full_decode = "yes"', "full_decode: found 'yes', expected true or false"),
+        ('port = [8500, "mymodels"]', "port: found .*, expected text or a number"),
+        ("models = true", "models: found True, expected text or a number"),
+    ],
+)
+def test_values_of_another_kind_in_the_file_are_refused(tmp_path: Path, line: str, told: str) -> None:
+    (tmp_path / "b.toml").write_text(line + "\n")
+    with pytest.raises(UsageError, match=told):
+        read_config(["--config", str(tmp_path / "b.toml")], {})
+
+
+@pytest.mark.parametrize("flag", ["--refresh-s", "--grace-s", "--idle-s", "--message-s"])
+def test_times_without_an_end_are_refused(flag: str) -> None:
+    with pytest.raises(UsageError, match="expected at most 1e"):
+        read_config([flag, "inf"], {})

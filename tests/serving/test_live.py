@@ -84,7 +84,7 @@ def test_the_page_shows_rates_and_detections(models_dir: Path, tmp_path: Path) -
     process.communicate(timeout=30)
 
 
-@pytest.mark.parametrize("source", ["none.mp4", "99"])
+@pytest.mark.parametrize("source", ["none.mp4", "99", "²", "99999999999999999999"])
 def test_a_source_that_is_not_there(source: str) -> None:
     with pytest.raises(UsageError, match="cannot be opened"):
         LatestFrame(source)
@@ -96,4 +96,18 @@ def test_calls_that_cannot_be(models_dir: Path, clip: Path, tmp_path: Path) -> N
     with socket.create_server(("127.0.0.1", 0)) as taken:
         process = detect(models_dir / "flat", "--video", clip, "--port", taken.getsockname()[1])
         assert "cannot listen on 127.0.0.1" in process.communicate(timeout=60)[1]
+    assert process.returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("flags", "told"),
+    [
+        (["--video", "0", "--track"], "--track has no effect on --video"),
+        (["--video", "0", "--format", "bop"], "--format has no effect on --video"),
+        (["photo.jpg", "--port", "8081"], "are of the page that --video makes"),
+    ],
+)
+def test_flags_without_effect_are_refused(models_dir: Path, flags: list[str], told: str) -> None:
+    process = detect(models_dir / "flat", *flags)
+    assert told in process.communicate(timeout=60)[1]
     assert process.returncode == 2

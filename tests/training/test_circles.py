@@ -141,3 +141,15 @@ def test_a_cache_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> No
     blocked.write_text("not a folder")
     with pytest.raises(DataError, match=r"cannot write .*--cache"):
         Circles().source("test", 0, with_code=False, cache=blocked)
+
+
+def test_an_image_set_that_was_emptied_is_named_and_made_anew(tmp_path: Path) -> None:
+    world = Circles()
+    world.source("validation", 0, with_code=True, cache=tmp_path)
+    for name in ("images", "codes"):
+        (file,) = tmp_path.glob(f"circles-*/validation.{name}.npz")
+        file.write_bytes(b"")
+        with pytest.raises(DataError, match=rf"validation\.{name}\.npz is damaged .*delete it"):
+            world.source("validation", 0, with_code=True, cache=tmp_path)
+        file.unlink()
+        assert world.source("validation", 0, with_code=True, cache=tmp_path).batch(0, 2).code is not None

@@ -246,3 +246,10 @@ def test_a_run_without_such_frames_learns_nothing_from_them(data, tmp_path):
         prepared(parse([*call, "--self-training", "0.5"]).config, tmp_path, print, print)
     with pytest.raises(UsageError, match="--method hypotheses does not learn from photographs"):
         prepared(parse([*call, "--photos", str(frames), "--method", "hypotheses"]).config, tmp_path, print, print)
+
+
+@pytest.mark.parametrize("flag", ["--two-stage", "--two_stage"])
+def test_a_flag_with_underscores_counts_as_with_dashes(data: Path, flag: str) -> None:
+    """Also where it decides about the recipe of its network."""
+    config = parse(["linemod", "--class", "ape", "--data", str(data), flag]).config
+    assert (config.recipe.batch_size, config.recipe.budget_images) == (64, 240_000)

@@ -251,6 +251,8 @@ def test_supervision_sees_only_its_share_of_the_images(tmp_path: Path, cache: Pa
         ({"minutes": 0.0}, "--minutes is 0.0, expected more than 0"),
         ({"method": "super", "stop_below": 1.0}, "--stop-below watches the image loss"),
         ({"images": -1}, "--images is -1, expected more than 0"),
+        ({"minutes": float("nan")}, "--minutes is nan, expected more than 0"),
+        ({"seed": -1}, "--seed is -1, expected 0 or more"),
     ],
 )
 def test_configurations_that_make_no_sense_are_refused(change: dict[str, object], message: str) -> None:
@@ -264,6 +266,10 @@ def test_configurations_that_make_no_sense_are_refused(change: dict[str, object]
         ({"batch_size": 10, "micro_batch_size": 4}, "cannot be cut into micro-batches of 4"),
         ({"micro_batch_size": 1}, "batch norm needs two images"),
         ({"learning_rate": 0.0}, "--learning-rate is 0.0"),
+        ({"learning_rate": float("nan")}, "--learning-rate is nan"),
+        ({"warm_up_steps": -1}, "--warm-up-steps is -1, expected 0 or more"),
+        ({"critic_learning_rate": -1.0}, "--critic-learning-rate is -1.0, expected 0 or more"),
+        ({"sleep_drawn": 2.0}, "--sleep-drawn 2.0 is no fraction"),
     ],
 )
 def test_recipes_that_make_no_sense_are_refused(change: dict[str, float], message: str) -> None:

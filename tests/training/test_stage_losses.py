@@ -1,6 +1,9 @@
 """What the two stages of a two-stage network are taught: each cell what it can know, confidence whether the answer is
 right."""
 
+from dataclasses import replace
+
+import numpy as np
 import torch
 from curio_train.config import NetworkConfig
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
@@ -11,6 +14,7 @@ from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 from curio_train.worlds.single_object.localisation_stage import LocalisationStage
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 
@@ -125,3 +129,20 @@ def test_gradients_reach_every_weight_of_both_looks(brick_world: TwoStageWorld, 
         code = look.sample(4, (1,))
         look.code_loss(network(look.render(code)), code).backward()
         assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
+
+
+def test_every_rotation_of_a_ball_is_right(brick: Object) -> None:
+    """Whatever is read of it, the loss is that of the truth, and a confidence of 1 is right."""
+    axes = tuple((np.eye(3)[number], np.zeros(3)) for number in (0, 2))
+    ball = replace(brick, kind=replace(brick.kind, symmetries=(), symmetry_axes=axes))
+    second = TwoStageWorld("linemod", ball).stages[1]
+    true = second.sample(4, (2,))
+    true[CONFIDENCE][:] = 1
+    points, seen = true[OBJECT_COORDINATES].split((3, 1), dim=1)
+    surface = torch.cat([points, 20 * seen - 10], dim=1)
+    turns = torch.from_numpy(Rotation.random(4, random_state=0).as_matrix()).float()
+    rotation = matrix_from_rotation_6d(true[ROTATION_6D][:, 0]) @ turns
+    turned = {**true, OBJECT_COORDINATES: surface, ROTATION_6D: rotation_6d_from_matrix(rotation)[:, None]}
+    assert float(second.code_loss(told_by_cells(turned), true)) < 1e-3
+    farther = turned | {TRANSLATION: true[TRANSLATION] * torch.tensor([1, 1, 1.2])}
+    assert float(second.code_loss(told_by_cells(farther), true)) > 0.1

@@ -11,6 +11,7 @@ from curio_train.geometry import Pose
 from curio_train.meshes import shapes
 from curio_train.meshes.meshes import Mesh
 from curio_train.meshes.symmetries import find_symmetries
+from curio_train.worlds.tabletop.files import yaw_fold
 from scipy.spatial.transform import Rotation
 
 LARGEST_DISAGREEMENT = 0.03
@@ -81,3 +82,11 @@ def test_agrees_with_bop(name: str) -> None:
         ends = [Pose.from_matrix(motion).apply(mesh.vertices_m) for motion in (ours, theirs)]
         apart = np.linalg.norm(ends[0] - ends[1], axis=1).max() / mesh.diameter_m
         assert apart < LARGEST_DISAGREEMENT, f"{name}: {apart:.3f} diameters apart"
+
+
+@pytest.mark.parametrize(("up", "fold"), [((0, 0, 1), 0), ((1, 0, 0), 2), ((0, 1, 0), 2)])
+def test_a_lying_rod_looks_the_same_after_half_a_turn_about_the_vertical(up: tuple[int, ...], fold: int) -> None:
+    """Its flip and any turn about its axis make that half turn; a cone has no flip."""
+    for shape, expected in ((trimesh.creation.cylinder(0.01, 0.08), fold), (trimesh.creation.cone(0.02, 0.08), 1)):
+        found = find_symmetries(Mesh(np.asarray(shape.vertices), np.asarray(shape.faces)))
+        assert yaw_fold(found, np.array(up, float)) == (0 if up == (0, 0, 1) else expected)

@@ -112,6 +112,12 @@ class NetworkConfig:
     hidden: int = 64
     """Width of each branch's hidden layer."""
 
+    def __post_init__(self) -> None:
+        """Refuse layers without a value."""
+        for name in ("row", "hidden"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected at least 1")
+
 
 @dataclass(frozen=True)
 class WorldOptions:
@@ -191,8 +197,13 @@ class Recipe:
             "gradient_penalty_every",
             "budget_images",
         ):
-            if getattr(self, name) <= 0:
+            if not getattr(self, name) > 0:
                 raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected more than 0")
+        for name in ("matrix_learning_rate", "critic_learning_rate", "warm_up_steps", "final_learning_rate"):
+            if not getattr(self, name) >= 0:
+                raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected 0 or more")
+        if not 0 <= self.sleep_drawn <= 1:
+            raise UsageError(f"--sleep-drawn {self.sleep_drawn} is no fraction, expected 0 to 1")
         if not 0 <= self.self_training < 1:
             raise UsageError(f"--self-training {self.self_training}: expected 0 or more, and less than 1")
         if self.batch_size % self.micro_batch_size or self.micro_batch_size < 2:
@@ -261,6 +272,8 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Refuse what contradicts itself."""
+        if self.seed < 0:
+            raise UsageError(f"--seed is {self.seed}, expected 0 or more")
         if not 0 < self.labels <= 1:
             raise UsageError(f"--labels {self.labels} is no fraction, expected more than 0 and at most 1")
         if self.labels != 1 and self.method != "super":

@@ -29,6 +29,17 @@ def check_numbers(arguments: DetectArguments) -> None:
     """
     if arguments.video is not None and (arguments.images or arguments.out or arguments.overlays or arguments.ray):
         raise UsageError("--video shows a video and writes nothing: leave out IMAGES, --out, --overlays and --ray")
+    of_images = {
+        "--track": arguments.track,
+        "--format": arguments.format != DetectArguments.format,
+        "--overwrite": arguments.overwrite,
+        "--exif-rotation": arguments.exif_rotation,
+    }
+    if arguments.video is not None and (given := [flag for flag, is_given in of_images.items() if is_given]):
+        raise UsageError(f"{given[0]} has no effect on --video, which reads each frame by itself; leave it out")
+    where = arguments.host, arguments.port
+    if arguments.video is None and where != (DetectArguments.host, DetectArguments.port):
+        raise UsageError("--host and --port are of the page that --video makes; leave them out")
     if arguments.jobs < 1:
         raise UsageError(f"--jobs {arguments.jobs}: expected at least 1")
     if not 0 <= arguments.min_confidence <= 1:

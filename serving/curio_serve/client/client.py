@@ -21,7 +21,7 @@ from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
 
 from curio_serve.client.request import CameraLike, ImageLike, RegionLike, detect_request, selector, views_request
-from curio_serve.client.retries import Attempts, error_from_call
+from curio_serve.client.retries import Attempts, deadline_s, error_from_call
 from curio_serve.deferred import DeferredError
 from curio_serve.errors import UsageError
 from curio_serve.files import read_given
@@ -72,6 +72,9 @@ class _Client:
         self._timeout_s = timeout_s
         self._max_attempts = max_attempts
         self._tls = tls
+        token = token.strip()  # files end with a line feed
+        if not (token.isascii() and (token.isprintable())):
+            raise UsageError("token: expected printable ASCII text in one line, as in the server's --token-file")
         self._metadata = (("authorization", f"Bearer {token}"),) if token else ()
 
     def _attempts(self, timeout_s: float | None) -> Attempts:
@@ -178,14 +181,14 @@ class PoseClient(_Client):
 
         Args:
             requests: May be endless; sent as the server takes them.
-            timeout_s: Deadline of the whole stream.
+            timeout_s: Deadline of the whole stream; ``math.inf``: none.
 
         Raises:
             CurioError: The stream as a whole failed, or the server is out of reach.
             Exception: What the iterable raised, after the answers to the requests before it.
         """
         failed = DeferredError()  # gRPC would call it an unknown error, and drop answers
-        call = self._stub.DetectStream(failed.each(requests), timeout=timeout_s, metadata=self._metadata)
+        call = self._stub.DetectStream(failed.each(requests), timeout=deadline_s(timeout_s), metadata=self._metadata)
         try:
             yield from call
         except grpc.RpcError as exc:
@@ -263,7 +266,9 @@ class AsyncPoseClient(_Client):
     ) -> AsyncIterator[messages.DetectResponse]:
         """Answers in the order of the requests; see :meth:`PoseClient.detect_stream`."""
         failed = DeferredError()  # gRPC would call it an unknown error, and drop answers
-        call = self._stub.DetectStream(failed.each_async(requests), timeout=timeout_s, metadata=self._metadata)
+        call = self._stub.DetectStream(
+            failed.each_async(requests), timeout=deadline_s(timeout_s), metadata=self._metadata
+        )
         try:
             async for answer in call:
                 yield answer

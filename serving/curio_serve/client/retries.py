@@ -12,7 +12,13 @@ from google.rpc import error_details_pb2, status_pb2
 from curio_serve.errors import CurioError, ImageError, Overloaded, Unavailable, error_from_status
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
+_LONGEST_S = 1e9  # thirty years
 _STATUS_DETAILS_KEY = "grpc-status-details-bin"
+
+
+def deadline_s(timeout_s: float) -> float:
+    """A deadline as gRPC can keep it: longer ones, and none (infinity), would have passed at once."""
+    return min(timeout_s, _LONGEST_S)
 
 
 class Attempts:
@@ -20,7 +26,7 @@ class Attempts:
 
     def __init__(self, address: str, timeout_s: float, max_attempts: int) -> None:
         self._address = address
-        self._end = time.monotonic() + timeout_s
+        self._end = time.monotonic() + deadline_s(timeout_s)
         self._left = max_attempts - 1
         self._pause_s = _FIRST_PAUSE_S
 

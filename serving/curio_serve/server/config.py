@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import tyro
 
@@ -15,6 +15,7 @@ from curio_serve.settings import environment_settings, read_toml, to_arguments
 ENV_PREFIX = "CURIO_SERVE_"
 _NOT_STORED = {"config", "dump_config"}
 _MAX_WORKERS = 1024
+_LONGEST_S = 1e9  # thirty years; clocks hold no more
 
 
 @dataclass(frozen=True)
@@ -111,12 +112,23 @@ class ServeConfig:
             raise UsageError("--host is empty; expected an address such as 127.0.0.1, or 0.0.0.0 for all interfaces")
         if self.log_level not in ("debug", "info", "warning", "error"):
             raise UsageError(f"--log-level is {self.log_level!r}; expected debug, info, warning or error")
+        for name in ("refresh_s", "message_s", "idle_s", "grace_s"):
+            if not getattr(self, name) <= _LONGEST_S:
+                raise UsageError(f"--{_flag(name)} is {getattr(self, name)}; expected at most {_LONGEST_S:g} seconds")
+
+    def checked(self) -> Self:
+        """The settings, once all sources have been read: what belongs together may come from several of them.
+
+        Raises:
+            UsageError: They contradict each other.
+        """
         if (self.tls_certificate is None) != (self.tls_key is None):
             raise UsageError("--tls-certificate and --tls-key come together; give both or neither")
         if self.client_ca is not None and self.tls_certificate is None:
             raise UsageError(
                 "--client-ca needs --tls-certificate and --tls-key: clients show certificates over TLS only"
             )
+        return self
 
 
 def read_config(arguments: list[str], environment: Mapping[str, str]) -> ServeConfig:
@@ -137,7 +149,7 @@ def read_config(arguments: list[str], environment: Mapping[str, str]) -> ServeCo
     if named:
         config = _parse(_file_arguments(Path(named)), config, f"(settings in {named})")
     config = _parse(_environment_arguments(environment), config, f"(variables {ENV_PREFIX}...)")
-    return _parse(arguments, config)
+    return _parse(arguments, config).checked()
 
 
 def _parse(arguments: list[str], default: ServeConfig, source: str = "") -> ServeConfig:
@@ -154,6 +166,11 @@ def _file_arguments(path: Path) -> list[str]:
     known = {field.name for field in fields(ServeConfig)} - _NOT_STORED
     if unknown := content.keys() - known:
         raise UsageError(f"--config {path} has unknown keys {sorted(unknown)}; known are {sorted(known)}")
+    for name, value in content.items():
+        is_flag = isinstance(getattr(ServeConfig, name), bool)
+        if isinstance(value, bool) != is_flag or not isinstance(value, str | int | float):
+            expected = "true or false" if is_flag else "text or a number"
+            raise UsageError(f"--config {path}, {name}: found {value!r}, expected {expected}")
     return [argument for name, value in content.items() for argument in _arguments(name, value, str(path))]
 
 

@@ -48,6 +48,11 @@ class Session:
     checkpoint_minutes: float = 1.0
     """Minutes of training between checkpoints."""
 
+    def __post_init__(self) -> None:
+        """Refuse what is no time."""
+        if not self.checkpoint_minutes > 0:
+            raise UsageError(f"--checkpoint-minutes is {self.checkpoint_minutes}, expected more than 0")
+
 
 @dataclass(frozen=True)
 class TrainCommand:
@@ -99,7 +104,7 @@ def parse(arguments: list[str]) -> TrainCommand:
     if world not in WORLDS:
         return _refuse_world(arguments)
     kind = WORLDS[world]
-    typed = with_project(arguments, _path_flags())[1:]
+    typed = [_dashed(word) for word in with_project(arguments, _path_flags())[1:]]
     default, stored = _defaults(world, typed)
     prog, about = f"curio-train {world}", (kind.__doc__ or "").partition("\n\n")[0]
     join_help_lines([RunConfig, Recipe, NetworkConfig, *WORLDS.values()])
@@ -109,6 +114,12 @@ def parse(arguments: list[str]) -> TrainCommand:
     if stored is not None and command.session.resume is not None:
         refuse_other(stored, command.config, command.session.resume)
     return command
+
+
+def _dashed(word: str) -> str:
+    """A flag as its help writes it, where it was typed with underscores, which count as dashes."""
+    flag, equals, value = word.partition("=")
+    return flag.replace("_", "-") + equals + value if flag.startswith("--") else word
 
 
 def _defaults(world: str, typed: list[str]) -> tuple[RunConfig, RunConfig | None]:
@@ -204,7 +215,8 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         config = with_kept_meshes(config, path)
     if config.terms.templates:
         with one_thread() as num_threads, _traced_ahead(config, num_threads) as ahead:
-            seconds = draw_templates(config, path, session.cache, num_threads).seconds
+            is_old = session.resume is not None
+            seconds = draw_templates(config, path, session.cache, num_threads, resume=is_old).seconds
             print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
             report(end(path, config, session.cache, warn, ahead))
         return 0

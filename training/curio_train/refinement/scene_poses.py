@@ -80,6 +80,8 @@ def _of_object(
     """Its poses in the photographs."""
     photograph = reads.photograph[chosen]
     rotation = matrix_from_rotation_6d(reads.code[ROTATION_6D][:, slot]).double().numpy()[chosen]
+    if kind.info.turns_any_way:  # then every rotation is right, and one that stays in the scene agrees with itself
+        rotation = cam_from_world.rotation[photograph]
     position_m = correction * reads.code[TRANSLATION][:, slot].double().numpy()[chosen]
     symmetries = np.stack([pose.rotation for pose in symmetry_poses(kind.info, SYMMETRY_STEP)])
     found = consensus_in_scene(

@@ -11,6 +11,7 @@ import json
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,7 @@ def stored_images(
     digest = hashlib.sha256(json.dumps({**recipe, "num": NUM_IMAGES[split]}, sort_keys=True).encode()).hexdigest()[:16]
     folder = cache.expanduser() / f"{world.name}-{digest}"
     images, codes = folder / f"{split}.images.npz", folder / f"{split}.codes.npz"
-    if not images.exists():
+    if not (images.exists() and codes.exists()):
         _draw(world, split, images, codes)
     code = {name: torch.from_numpy(value) for name, value in load_arrays(codes).items()} if with_code else None
     return StoredImages(torch.from_numpy(load_arrays(images)["images"]), code, seed=seed, shuffle=split == "train")
@@ -122,7 +123,7 @@ def _draw(world: World, split: Split, images: Path, codes: Path) -> None:
     pixels = (torch.cat(chunks).clamp(0, 1) * 255).round().byte()
     try:
         save_arrays(codes, {name: value.numpy() for name, value in code.items()})
-        save_arrays(images, {"images": pixels.numpy()})  # last: its presence says that both are there
+        save_arrays(images, {"images": pixels.numpy()})  # last, so that codes of another version are never beside them
     except OSError as exc:
         raise DataError(
             f"cannot write {images}: {exc.strerror}; name a writable folder with enough space: --cache"
@@ -154,5 +155,5 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as exc:
-        raise DataError(f"{path} is damaged ({exc}); delete the folder {path.parent}, it is made anew") from exc
+    except (OSError, EOFError, ValueError, zlib.error, zipfile.BadZipFile) as exc:
+        raise DataError(f"{path} is damaged ({exc}); delete it, it is made anew") from exc

@@ -16,14 +16,17 @@ from curio_train.worlds import build
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 
-def draw_templates(config: RunConfig, path: Path, cache: Path, num_threads: int = 1) -> TrainingProgress:
+def draw_templates(
+    config: RunConfig, path: Path, cache: Path, num_threads: int = 1, *, resume: bool = False
+) -> TrainingProgress:
     """Draw an object's templates, calibrate their confidence, and write both as a run.
 
     Args:
         config: Of the object.
-        path: The run folder, a new one.
+        path: The run folder.
         cache: Where worlds keep the image sets that they render once.
         num_threads: In how many the calibration reads frames.
+        resume: Whether the folder holds a run already; its templates are drawn unless it has them.
 
     Raises:
         CurioError: Any of this package's errors. The folder then holds no checkpoint.
@@ -36,8 +39,10 @@ def draw_templates(config: RunConfig, path: Path, cache: Path, num_threads: int 
     world = without_scan_excess(world)
     run = RunFolder(path, config)
     with run.lock():
-        run.write_config(new=True)
+        run.write_config(new=not resume)
         record_session(path)
+        if resume and run.checkpoints():
+            return run.trained(world).progress
         begin = time.monotonic()
         fill(network, world, cache)
         calibrate(network, world, cache, num_threads)

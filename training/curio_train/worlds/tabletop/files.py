@@ -25,7 +25,7 @@ from curio_train.worlds.single_object.world import resized
 from curio_train.worlds.tabletop.world import Part, TabletopPhotographs, TabletopWorld
 
 SIDE_PX = 128
-_PARALLEL = 0.999  # cosine of the angle between an axis and the vertical
+_PARALLEL, _LEVEL = 0.999, 0.04  # cosine of the angle between an axis and the vertical: the same, and across it
 
 # Rotations from the mesh file's frame, with the named axis up, to one with y up; right-handed.
 _Y_UP_FROM = {
@@ -85,15 +85,19 @@ def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_co
     found = find_symmetries(mesh)
     kind = ObjectKind(name, (), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous)
     unpainted = is_unpainted(mesh)
-    fold = _fold(found, rotation[1]) if unpainted else 1
+    fold = yaw_fold(found, rotation[1]) if unpainted else 1
     file_from_own = Pose(rotation.T, rotation.T @ origin)
     return Part(kind, own, file_from_own, radius_m, min_count, max_count, fold, unpainted)
 
 
-def _fold(found: Symmetries, up: np.ndarray) -> int:
+def yaw_fold(found: Symmetries, up: np.ndarray) -> int:
     """Order of the rotational symmetry about the vertical axis, 1 without one; 0: of revolution."""
     if len(found.continuous) > 1 or any(abs(axis @ up) > _PARALLEL for axis, _ in found.continuous):
         return 0
+    for axis, _ in found.continuous:
+        # A turn about a level axis and a flip of it make half a turn about the vertical.
+        if abs(axis @ up) < _LEVEL and any(axis @ matrix[:3, :3] @ axis < -_PARALLEL for matrix in found.discrete):
+            return 2
     return 1 + sum(bool(up @ matrix[:3, :3] @ up > _PARALLEL) for matrix in found.discrete)
 
 
