@@ -196,4 +196,4 @@ def test_poses_are_refined_alike(worlds: tuple[TwoStageWorld, TwoStageWorld]) ->
         found = np.reshape(detection.rotation, (3, 3))
         assert np.degrees(Rotation.from_matrix(found @ true.T).magnitude()) < 4
         middle_m = detection.translation_m + found @ world.object.kind.center_m
-        np.testing.assert_allclose(middle_m, code[TRANSLATION][0, 0], atol=0.004)
+        np.testing.assert_allclose(middle_m, code[TRANSLATION][0, 0], atol=0.006)

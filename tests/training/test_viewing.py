@@ -245,7 +245,7 @@ def with_far_origin(files: Path) -> Page:
 def test_an_object_is_fitted_wherever_its_origin_is(files: Path) -> None:
     *_, last = walk(with_far_origin(files), 0)
     found = last.pose @ OFF
-    assert found.translation_m == pytest.approx(TRUE.translation_m, abs=0.002)
+    assert found.translation_m == pytest.approx(TRUE.translation_m, abs=0.006)
     assert np.degrees(Rotation.from_matrix(found.rotation.T @ TRUE.rotation).magnitude()) < 2
 
 
