@@ -36,16 +36,15 @@ def draw_templates(
     network = state.pose.network
     assert isinstance(world, TwoStageWorld)  # template networks are made for no other
     assert isinstance(network, TemplateNetwork)
-    world = without_scan_excess(world)
     run = RunFolder(path, config)
     with run.lock():
         run.write_config(new=not resume)
         record_session(path)
         if resume and run.checkpoints():
             return run.trained(world).progress
-        begin = time.monotonic()
-        fill(network, world, cache)
-        calibrate(network, world, cache, num_threads)
+        begin, exact = time.monotonic(), without_scan_excess(world)
+        fill(network, exact, cache)
+        calibrate(network, exact, cache, num_threads)
         state.progress.seconds = time.monotonic() - begin
         run.save(state)
     return state.progress
