@@ -46,12 +46,12 @@ class Session:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto takes CUDA where there is one."""
     checkpoint_minutes: float = 1.0
-    """Minutes of training between checkpoints."""
+    """Minutes of training between checkpoints; 0: after every step."""
 
     def __post_init__(self) -> None:
         """Refuse what is no time."""
-        if not self.checkpoint_minutes > 0:
-            raise UsageError(f"--checkpoint-minutes is {self.checkpoint_minutes}, expected more than 0")
+        if not self.checkpoint_minutes >= 0:
+            raise UsageError(f"--checkpoint-minutes is {self.checkpoint_minutes}, expected 0 or more")
 
 
 @dataclass(frozen=True)
