@@ -138,6 +138,7 @@ def test_only_frames_with_the_board_are_kept(tmp_path: Path, capsys: pytest.Capt
     [
         (["--count", 0], "--count 0"),
         (["--video", "nowhere.avi"], "--video nowhere.avi"),
+        (["--video", "²"], "--video ²: cannot be opened"),
         (["--video", ".", "--background", "empty.heic"], "--background empty.heic: expected a file name that ends in"),
     ],
 )

@@ -140,7 +140,7 @@ def test_neither_training_nor_evaluation_fails_for_want_of_a_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
-    (run / (REPORT_FILE + ".tmp")).mkdir(parents=True)  # in the way of every report
+    (run / (REPORT_FILE + ".part")).mkdir(parents=True)  # in the way of every report
     flags = ["--batch-size", "4", "--micro-batch-size", "4", "--images", "4", "--out", str(run)]
     for command, arguments in (
         (train_command.train, ["circles", "--method", "noncur", *flags]),

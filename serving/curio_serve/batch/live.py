@@ -14,9 +14,9 @@ from curio_proto.v1.detector_pb2 import Detection
 
 from curio_serve.batch.estimators import Estimator
 from curio_serve.errors import RequestError, UsageError
+from curio_serve.imaging.video import open_video
 from curio_serve.ports import port_fault
 
-_MOST_DIGITS = 6  # of a camera's number
 _RECENT = 30  # frames that the rates are means of
 
 
@@ -37,8 +37,7 @@ class LatestFrame:
         Raises:
             UsageError: It cannot be opened.
         """
-        is_number = source.isascii() and source.isdigit() and len(source) < _MOST_DIGITS
-        self._capture = cv2.VideoCapture(int(source) if is_number else source)
+        self._capture = open_video(source)
         if not self._capture.isOpened():
             raise UsageError(f"--video {source}: cannot be opened; expected a camera's number, a video file or a URL")
         self._period_s = 1 / (self._capture.get(cv2.CAP_PROP_FPS) or 30.0)

@@ -15,6 +15,7 @@ from typing import Self
 
 import cv2
 import numpy as np
+from curio_serve.imaging.video import open_video
 
 from curio_train.capture.calibration import Board
 from curio_train.capture.options import AssistantCommand
@@ -149,7 +150,7 @@ def _frames(source: str) -> Iterator[np.ndarray]:
     """
     if os.path.isdir(source):
         return (read_photograph(path) for path in Photographs(Path(source)).paths)
-    capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+    capture = open_video(source)
     if not capture.isOpened():
         raise UsageError(f"--video {source}: cannot be opened; expected a camera's number, a video file or a folder")
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # of a camera, the newest frame; other sources ignore it

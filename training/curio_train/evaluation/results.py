@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from curio_serve.files import write_whole
+
 from curio_train.errors import CheckpointError
 
 
@@ -14,9 +16,7 @@ def keep(file: Path, result: Mapping[str, Any]) -> None:
     Raises:
         CheckpointError: The run folder cannot be written.
     """
-    draft = file.with_name(file.name + ".tmp")
     try:
-        draft.write_text(json.dumps(result, indent=2), encoding="utf-8")
-        draft.replace(file)
+        write_whole(file, json.dumps(result, indent=2))
     except OSError as exc:
         raise CheckpointError(f"cannot write {file}: {exc.strerror}; make the run folder writable") from exc

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from curio_proto.v1.model_spec_pb2 import Reliability
+from curio_serve.files import write_whole
 from curio_serve.models.golden import GOLDEN_FILE
 from curio_serve.models.model_folder import CONFIG_FILE, MODEL_FILE, SUMS_FILE, is_model_name, versions
 from curio_serve.models.reliability import RELIABILITY_FILE
@@ -141,8 +142,8 @@ class ModelFolder:
         lines = [line for line in _text(self.path / SUMS_FILE).splitlines() if not line.endswith(f"  {listed}")]
         lines.append(f"{hashlib.sha256(text.encode()).hexdigest()}  {listed}")
         try:
-            _replace(path, text)
-            _replace(self.path / SUMS_FILE, "".join(f"{line}\n" for line in lines))
+            write_whole(path, text)
+            write_whole(self.path / SUMS_FILE, "".join(f"{line}\n" for line in lines))
         except OSError as exc:
             raise ExportError(f"cannot write {path}: {exc.strerror}") from exc
         return path
@@ -154,10 +155,10 @@ class ModelFolder:
         sums = "".join(f"{line}\n" for line in others) + _sums(target.name, files)
         title, _, earlier = _text(self.path / _CARD).partition("\n\n")
         if not (self.path / CONFIG_FILE).exists():
-            _replace(self.path / CONFIG_FILE, config)
-        _replace(self.path / SUMS_FILE, sums)
+            write_whole(self.path / CONFIG_FILE, config)
+        write_whole(self.path / SUMS_FILE, sums)
         draft.rename(target)
-        _replace(self.path / _CARD, f"{title or _title(self.path.name)}\n\n{card}\n{earlier}")
+        write_whole(self.path / _CARD, f"{title or _title(self.path.name)}\n\n{card}\n{earlier}")
 
 
 def triton_config(name: str, image: Sequence[int], outputs: Mapping[str, Sequence[int]]) -> str:
@@ -213,12 +214,3 @@ def _sums(version: str, files: Mapping[str, bytes]) -> str:
 
 def _text(path: Path) -> str:
     return path.read_text(encoding="utf-8") if path.exists() else ""
-
-
-def _replace(path: Path, text: str) -> None:
-    draft = path.with_name(path.name + ".tmp")
-    try:
-        draft.write_text(text, encoding="utf-8")
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)

@@ -73,9 +73,10 @@ class Graph(nn.Module):
         return self._outputs.at_middles(outputs)
 
     def where(self, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The stable answers, one a row: of objects, or of scenes whose every answer is stable."""
+        """The stable answers as they are compared, one a row: of objects, or of scenes whose every answer is stable."""
         whole = stable.all(dim=1)
-        return {name: values[whole if name in self.of_scene else stable] for name, values in outputs.items()}
+        compared = self.judged(outputs).items()
+        return {name: values[whole if name in self.of_scene else stable] for name, values in compared}
 
     def unmoved(
         self, outputs: Mapping[str, Tensor], others: Mapping[str, Tensor], largest: float = LARGEST_PARITY_ERROR

@@ -129,14 +129,14 @@ def export(
 
     found = ExportedModel(model.SerializeToString(), "the exported graph")(images)
     weights = _weights(half, rounding_error)
-    parity_error = refuse_disparity(*(deployed.where(stable, deployed.judged(of)) for of in (expected, found)))
+    parity_error = refuse_disparity(deployed.where(stable, expected), deployed.where(stable, found))
     if reduce is not None:
         reduced = reduce(world, model)
         model, weights = reduced.model, reduced.weights
         put_spec(model, spec)
         found = ExportedModel(model.SerializeToString(), "the reduced graph")(images)
         stable &= _unmoved_by_rounding(deployed, model, images, found)
-        rounding_error = largest_difference(*(deployed.where(stable, deployed.judged(of)) for of in (learned, found)))
+        rounding_error = largest_difference(deployed.where(stable, learned), deployed.where(stable, found))
     spec.parity_max_abs_error = parity_error if reduce is None else rounding_error
     put_spec(model, spec)
     version = target.next_version()

@@ -42,10 +42,12 @@ def _draw(trainer: Trainer, cache: Path) -> None:
 
 def _forget_photographs(trainer: Trainer, cache: Path) -> None:
     """Draw the templates of a finished run that is gone on with: they look as photographs do, and would learn twice."""
-    progress = trainer.state.progress
-    spent = trainer.config.progress(progress.images, progress.seconds)
-    if progress.finished_step is not None and spent < 1 and isinstance(trainer.state.pose.network, ObjectsNetwork):
+    progress, config = trainer.state.progress, trainer.config
+    goes_on = config.progress(progress.images, progress.seconds) < 1
+    has_learned = progress.finished_step is not None and config.recipe.self_training > 0
+    if goes_on and has_learned and isinstance(trainer.state.pose.network, ObjectsNetwork):
         _draw(trainer, cache)
+        progress.finished_step = None
 
 
 def _training_images(config: RunConfig, world: World, cache: Path) -> Callable[[Path], Found]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from curio_serve.files import write_whole
 from jinja2 import Environment, PackageLoader, TemplateError
 from torch import Tensor
 
@@ -81,9 +82,7 @@ def write_report(
     """
     try:
         html = _page(run, subject, split, cache, errors, evaluation, judgement)
-        draft = run / (REPORT_FILE + ".tmp")
-        draft.write_text(html, encoding="utf-8")
-        draft.replace(run / REPORT_FILE)
+        write_whole(run / REPORT_FILE, html)
     except (DataError, CheckpointError) as exc:
         raise ReportError(f"{run / REPORT_FILE} could not be written ({exc}); the run itself is whole") from exc
     except (OSError, LookupError, RuntimeError, TemplateError, TypeError, ValueError, MemoryError) as exc:

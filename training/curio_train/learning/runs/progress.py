@@ -18,7 +18,7 @@ from typing import Any
 
 import cv2
 import torch
-from curio_serve.files import read_file
+from curio_serve.files import read_file, write_whole
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Column
@@ -196,9 +196,7 @@ def _named(loss: str) -> str:
 def _drop_after(run: Path, step: int) -> None:
     if (run / _HISTORY).exists():
         kept = [row for row in read_history(run) if row["step"] <= step]
-        draft = run / f"{_HISTORY}.tmp"
-        draft.write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
-        draft.replace(run / _HISTORY)
+        write_whole(run / _HISTORY, "".join(json.dumps(row) + "\n" for row in kept))
 
 
 def _clock(seconds: float) -> str:
