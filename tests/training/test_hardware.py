@@ -8,7 +8,7 @@ import pytest
 import torch
 from curio_train.learning.hardware import autocast, choose_threads, one_thread, quick_bfloat16
 from curio_train.learning.muon import orthogonal
-from curio_train.templates.threads import in_threads
+from curio_train.threads import in_threads
 
 
 @pytest.fixture(autouse=True)

@@ -1,8 +1,7 @@
 """The graph that is exported: encoder and heads alone, and which of its answers rounding does not decide."""
 
 import copy
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from curio_train.export.stages import stage_tensors
 from curio_train.networks.layers import fold_batch_norm
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import CONFIDENCE, TRANSLATION, joined
+from curio_train.threads import in_threads
 from curio_train.worlds.base import World
 from curio_train.worlds.several_objects.scenes import ObjectScenes
 
@@ -24,7 +24,7 @@ NUM_JITTERED = 8
 
 _NUM_CHECK_IMAGES = 4  # of either kind
 _IMAGES_AT_ONCE = 2  # that torch reads: eight images of eight objects take 13 GB
-_CHECK_SEED = (20_210,)
+_CHECK_SEED = 20_210
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
 _NUM_NOISE = 1_000_003  # drawn values of jitter, shifted and repeated: drawing as many as layers have takes minutes
@@ -64,9 +64,9 @@ class Graph(nn.Module):
         """Outputs by name, for pixels [batch, 3, height, width] in [0, 1]."""
         return self._outputs.from_code(self.network(pixels))
 
-    def in_parts(self, pixels: Tensor) -> dict[str, Tensor]:
+    def in_parts(self, pixels: Tensor, num_at_once: int = _IMAGES_AT_ONCE) -> dict[str, Tensor]:
         """The same, few images at once."""
-        return joined([self.read(part) for part in pixels.split(_IMAGES_AT_ONCE)])
+        return joined([self.read(part) for part in pixels.split(num_at_once)])
 
     def judged(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """What is compared of outputs: positions of the middles. Those of a distant origin move with every rounding."""
@@ -116,11 +116,11 @@ def check_images(world: World) -> Tensor:
     between white pixels, and where nothing is to be found the last digit decides between places that are equally
     unlikely.
     """
-    code = world.sample(_NUM_CHECK_IMAGES, _CHECK_SEED)
+    code = world.sample(_NUM_CHECK_IMAGES, (_CHECK_SEED,))
     if isinstance(world, ObjectScenes):
         code[CONFIDENCE] = torch.ones_like(code[CONFIDENCE])  # each is there
     size = (world.camera.height, world.camera.width)
-    coarse = np.random.default_rng(_CHECK_SEED).random((_NUM_CHECK_IMAGES, 3, *(side // 8 for side in size)))
+    coarse = np.random.default_rng((_CHECK_SEED,)).random((_NUM_CHECK_IMAGES, 3, *(side // 8 for side in size)))
     noise = F.interpolate(torch.from_numpy(coarse).float(), size, mode="bilinear")
     images = torch.cat([world.render(code).cpu(), world.render(code, noise).cpu()]).clamp(0, 1)
     return (images * 255).round().byte().permute(0, 2, 3, 1).contiguous()
@@ -142,13 +142,15 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slot
     Raises:
         ExportError: Too few can.
     """
-    pixels, generator = pixels_of(images), torch.Generator().manual_seed(*_CHECK_SEED)
+    pixels = pixels_of(images)
     answers = graph.in_parts(pixels)
-    stable = torch.ones(answers[TRANSLATION].shape[:2], dtype=torch.bool)
-    with _jittered_layers(graph.network, generator):
-        for _ in range(NUM_JITTERED):
-            jittered = graph.in_parts(pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator))
-            stable &= graph.unmoved(answers, jittered)
+
+    def unmoved(number: int) -> Tensor:
+        generator = torch.Generator().manual_seed(_CHECK_SEED + number)
+        jittered = pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator)
+        return graph.unmoved(answers, _with_jittered_layers(graph, generator).in_parts(jittered, 1))
+
+    stable = torch.stack(list(in_threads(unmoved, range(NUM_JITTERED), _IMAGES_AT_ONCE))).all(dim=0)
     if stable.float().mean() < _LEAST_STABLE:
         raise ExportError(
             f"{int((~stable).sum())} of the network's {stable.numel()} answers to check images change with the images' "
@@ -157,11 +159,10 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slot
     return stable
 
 
-@contextmanager
-def _jittered_layers(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
-    """Within the block every layer's output is jittered by about as much as another order of rounding changes it."""
+def _with_jittered_layers(graph: Graph, generator: torch.Generator) -> Graph:
+    """A copy whose every layer's output is jittered by about as much as another order of rounding changes it."""
     noise = _LAYER_JITTER * torch.randn(_NUM_NOISE, generator=generator)
-    repeated = noise
+    repeated, graph = noise, copy.deepcopy(graph)
 
     def off(_layer: nn.Module, _given: object, output: object) -> object:
         nonlocal repeated
@@ -174,10 +175,7 @@ def _jittered_layers(network: nn.Module, generator: torch.Generator) -> Iterator
         ordered = torch.empty_like(output).stride()
         return torch.addcmul(output, output, repeated.as_strided(output.shape, ordered, first))
 
-    layers = [module for module in network.modules() if module is not network and not list(module.children())]
-    hooks = [layer.register_forward_hook(off) for layer in layers]
-    try:
-        yield
-    finally:
-        for hook in hooks:
-            hook.remove()
+    for layer in graph.network.modules():
+        if layer is not graph.network and not list(layer.children()):
+            layer.register_forward_hook(off)
+    return graph

@@ -8,7 +8,7 @@ from typing import Literal
 
 from curio_train.config import RunConfig
 from curio_train.learning.explaining import Found, search_of
-from curio_train.learning.hardware import choose_threads
+from curio_train.learning.hardware import choose_threads, one_thread
 from curio_train.learning.loop import Outcome, train
 from curio_train.learning.parallel import ranks
 from curio_train.learning.runs.checkpoint import RunFolder
@@ -31,7 +31,8 @@ def _draw(trainer: Trainer, cache: Path) -> None:
     """Draw what networks read or align poses by, before training begins: templates, or outlines."""
     network, world, begin = trainer.state.pose.network, trainer.world, time.monotonic()
     if isinstance(network, ObjectsNetwork) and isinstance(world, SeveralObjectsWorld):
-        fill_objects(network.cpu(), world, cache)  # where the drawings are
+        with one_thread() as num_threads:
+            fill_objects(network.cpu(), world, cache, num_threads)  # where the drawings are
     elif isinstance(network, TwoStageNetwork) and isinstance(world, TwoStageWorld):
         fill_outline(network.cpu(), world)
     else:

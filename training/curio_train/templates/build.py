@@ -26,9 +26,10 @@ from curio_train.networks.templates.quick_trunk import QuickTrunk
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.templates.describe import low_rank, mean_cosine
-from curio_train.templates.drawing import TemplateRenderer
+from curio_train.templates.drawing import Drawn, TemplateRenderer
 from curio_train.templates.fill_bank import filled_bank
 from curio_train.templates.outline import outlines
+from curio_train.threads import in_threads
 from curio_train.worlds.base import World
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
@@ -69,8 +70,14 @@ def without_scan_excess(world: TwoStageWorld) -> TwoStageWorld:
 
 
 @torch.no_grad()
-def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> None:
+def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, num_threads: int = 1) -> None:
     """Draw and store all templates.
+
+    Args:
+        network: Whose templates are replaced.
+        world: Of the object.
+        cache: Where worlds keep their image sets.
+        num_threads: In how many the trunk reads what this thread draws.
 
     Raises:
         CheckpointError: The trunk's weights are missing or damaged.
@@ -86,14 +93,20 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path) -> Non
         mesh = replace(mesh, vertex_colors_srgb=np.broadcast_to(color, mesh.vertices_m.shape))
         network.color.copy_(torch.tensor(color))
     trunk = QuickTrunk(network.trunk)
-    _fill_localiser(network.localiser, trunk, geometry, mesh, frames)
-    network.reader.banks.put(0, filled_bank(trunk, geometry, mesh, _crops(backgrounds, geometry)))
+    _fill_localiser(network.localiser, trunk, geometry, mesh, frames, num_threads)
+    network.reader.banks.put(0, filled_bank(trunk, geometry, mesh, _crops(backgrounds, geometry), num_threads))
     fill_outline(network, world)
 
 
 @torch.no_grad()
-def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Path) -> None:
+def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Path, num_threads: int = 1) -> None:
     """Draw and store templates and outlines of several objects, and load the trunk's weights; what is trained stays.
+
+    Args:
+        network: Whose templates are replaced.
+        world: Of the objects.
+        cache: Where worlds keep their image sets.
+        num_threads: In how many the trunk reads what this thread draws.
 
     Raises:
         CheckpointError: The trunk's weights are missing or damaged.
@@ -104,7 +117,8 @@ def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Pat
     trunk = QuickTrunk(network.locator.trunk)
     backgrounds = world.members[0].backgrounds(cache).split(True)
     for number, (member, geometry) in enumerate(zip(world.members, network.geometries, strict=True)):
-        network.reader.banks.put(number, filled_bank(trunk, geometry, member.mesh, _crops(backgrounds, geometry)))
+        crops = _crops(backgrounds, geometry)
+        network.reader.banks.put(number, filled_bank(trunk, geometry, member.mesh, crops, num_threads))
         if network.outline is not None:
             network.outline.put(*_outlines(member.mesh, geometry), number)
 
@@ -132,22 +146,26 @@ def _crops(backgrounds: Backgrounds, geometry: Geometry) -> Float[Tensor, "num 3
     return backgrounds.of_crops(least, largest).draw(_NUM_CROPS, CROP_PX, CROP_PX, (_SEED, 1))
 
 
-def _fill_localiser(localiser: Localiser, trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, frames: Tensor) -> None:
+def _fill_localiser(
+    localiser: Localiser, trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, frames: Tensor, num_threads: int
+) -> None:
     """Templates over grey at every distance, whitened by the backgrounds, then their scores there."""
     background = trunk(F.avg_pool2d(frames, FRAME_STRIDE))[1]
     whitening = localiser.descriptors.whiten(background)
     rotations = geometry.localising_rotations
     features, masks = [], []
+
+    def read(drawn: Drawn) -> tuple[Tensor, Tensor]:
+        return trunk(drawn.over(0, torch.tensor(0.5)))[1], drawn.alpha
+
     for depth in geometry.depths_m:
         cells = geometry.kernel_cells(depth)
         side = (cells + 2 * _PAD_CELLS - 1) * COARSE_STRIDE + 1
         renderer = TemplateRenderer(mesh, depth, geometry.focal_px / FRAME_STRIDE, side)
-        drawn = [renderer.draw(some) for some in rotations.split(_BATCH)]
         kernel = slice(_PAD_CELLS, _PAD_CELLS + cells)
-        seen = torch.cat([trunk(some.over(0, torch.tensor(0.5)))[1] for some in drawn])
-        alpha = torch.cat([some.alpha for some in drawn])
-        features.append(seen[:, :, kernel, kernel])
-        masks.append(alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE][:, :, kernel, kernel])
+        seen, alpha = zip(*in_threads(read, map(renderer.draw, rotations.split(_BATCH)), num_threads), strict=True)
+        features.append(torch.cat(seen)[:, :, kernel, kernel])
+        masks.append(torch.cat(alpha)[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE][:, :, kernel, kernel])
     flat = torch.cat([of_depth.flatten(2) for of_depth in features], dim=2)[..., None]
     mask = torch.cat([of_depth.flatten(2) for of_depth in masks], dim=2)[..., None]
     localiser.descriptors.compress(whitening, flat, mask)

@@ -17,10 +17,10 @@ from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.networks.templates.network import TemplateNetwork
 from curio_train.networks.templates.quick_trunk import with_quick_trunk
 from curio_train.scene_code import poses
-from curio_train.templates.threads import in_threads
+from curio_train.threads import in_threads
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
-_NUM_FRAMES, _BATCH_SIZE = 120, 2  # larger batches take longer a frame
+_NUM_FRAMES, _BATCH_SIZE = 80, 2  # larger batches take longer a frame
 _NUM_POINTS = 500  # vertices that ADD is measured at, about
 
 

@@ -1,6 +1,6 @@
 """The templates of one object: drawn from all sides, described and compressed."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import torch
@@ -18,13 +18,14 @@ from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.templates.describe import low_rank, mean_cosine
 from curio_train.templates.drawing import APPEARANCES, CropTemplateRenderer
 from curio_train.templates.outline import outlines
+from curio_train.threads import in_threads
 
 _SEED = 20_211
 _BATCH = 64  # of drawings
 _INSIDE = 0.98  # of the pixels around a surface point show the object
 
 
-def filled_bank(trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, crops: Tensor) -> Bank:
+def filled_bank(trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, crops: Tensor, num_threads: int = 1) -> Bank:
     """The templates of an object: descriptors averaged over lamps and backgrounds, because what changes counts less.
 
     Args:
@@ -32,6 +33,7 @@ def filled_bank(trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, crops: Tensor
         geometry: Of frames and object.
         mesh: Of the object.
         crops: Backgrounds [num, 3, CROP_PX, CROP_PX] in [0, 1].
+        num_threads: In how many the trunk reads what this thread draws.
 
     Raises:
         RendererError: The mesh cannot be rendered.
@@ -43,16 +45,24 @@ def filled_bank(trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, crops: Tensor
     renderer = CropTemplateRenderer(mesh, depth, geometry.focal_px, focal_px, CROP_PX)
     choice = _PointChoice()
     fine, coarse, covers, chosen, of_object = [], [], [], [], []  # of all templates, batch after batch
-    for rotations in views.split(_BATCH):
-        drawn = renderer.draw(rotations)
-        behind = [crops[torch.from_numpy(random.integers(0, len(crops), len(rotations)))] for _ in APPEARANCES]
-        seen = [trunk(drawn.over(n, behind[n], exposure)) for n, (_, exposure) in enumerate(APPEARANCES)]
-        inside = _inside(drawn.alpha)
+
+    def pictures() -> Iterator[tuple[Tensor, list[Tensor]]]:
+        """Which pixels show the object, and the object before backgrounds in each appearance."""
+        for rotations in views.split(_BATCH):
+            drawn = renderer.draw(rotations)
+            behind = [crops[torch.from_numpy(random.integers(0, len(crops), len(rotations)))] for _ in APPEARANCES]
+            yield drawn.alpha, [drawn.over(n, behind[n], exposure) for n, (_, exposure) in enumerate(APPEARANCES)]
+
+    def read(drawn: tuple[Tensor, list[Tensor]]) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        return drawn[0], [trunk(picture) for picture in drawn[1]]
+
+    for alpha, seen in in_threads(read, pictures(), num_threads):
+        inside = _inside(alpha)
         chosen.append(choice(inside))
         of_object.append(seen[0][0].movedim(1, 0)[:, inside])
         fine.append(torch.stack([_at(one, chosen[-1]) for one, _ in seen]))
         coarse.append(torch.stack([one for _, one in seen]))
-        covers.append(drawn.alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE].clone())
+        covers.append(alpha[:, :, ::COARSE_STRIDE, ::COARSE_STRIDE].clone())
     fine_background, coarse_background = trunk(crops)
     covered, of_coarse = torch.cat(covers), torch.cat(coarse, dim=1)
     of_crop.compress(of_crop.whiten(coarse_background), of_coarse[0], covered)

@@ -25,7 +25,7 @@ def draw_templates(
         config: Of the object.
         path: The run folder.
         cache: Where worlds keep the image sets that they render once.
-        num_threads: In how many the calibration reads frames.
+        num_threads: In how many templates and frames are read.
         resume: Whether the folder holds a run already; its templates are drawn unless it has them.
 
     Raises:
@@ -43,7 +43,7 @@ def draw_templates(
         if resume and run.checkpoints():
             return run.trained(world).progress
         begin, exact = time.monotonic(), without_scan_excess(world)
-        fill(network, exact, cache)
+        fill(network, exact, cache, num_threads)
         calibrate(network, exact, cache, num_threads)
         state.progress.seconds = time.monotonic() - begin
         run.save(state)
