@@ -54,7 +54,7 @@ def scene_errors(world: World, predicted: SceneCode, true: SceneCode) -> dict[st
         "scene_error": scene_error(world.layout, predicted, true, groups),
         "novel_view_dssim": novel_view_dssim(world, predicted, true),
     }
-    parameters = each_parameter_error(world.layout, predicted, true, groups)
+    parameters = each_parameter_error(world.layout, predicted, true, groups, world.yaw_folds)
     position = parameters.pop("position")
     if world.layout[TRANSLATION].unit == "image_width":
         errors["position_image_widths"] = position
@@ -100,7 +100,8 @@ def accuracy(world: World, predicted: SceneCode, true: SceneCode) -> float:
         errors = add_errors(poses(predicted), poses(true), world.object.mesh.vertices_m, kind.info)
         return recall(errors, ADD_THRESHOLD)
     true = _nearest_alike(world, predicted, true)
-    found = each_parameter_error(world.layout, predicted, true, [kind.slots for kind in world.objects])
+    groups = [kind.slots for kind in world.objects]
+    found = each_parameter_error(world.layout, predicted, true, groups, world.yaw_folds)
     right = found["position"] < ADD_THRESHOLD * min(kind.diameter_m for kind in world.objects)
     if "rotation_deg" in found:
         right &= found["rotation_deg"] < _MOST_TURNED_DEG

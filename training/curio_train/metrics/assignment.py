@@ -111,14 +111,27 @@ def parameter_errors(
 
 
 def each_parameter_error(
-    layout: Layout, predicted: SceneCode, true: SceneCode, groups: Groups | None = None
+    layout: Layout,
+    predicted: SceneCode,
+    true: SceneCode,
+    groups: Groups | None = None,
+    yaw_folds: Int[Tensor, " slots"] | None = None,
 ) -> dict[str, Tensor]:
     """Errors of each kind of parameter, for those the layout has; one value a pair unless said otherwise.
 
+    Args:
+        layout: Of both codes.
+        predicted: As in :func:`assign`.
+        true: As in :func:`assign`.
+        groups: As in :func:`assign`.
+        yaw_folds: By what the angle of each slot's object is multiplied to give the yaw in the codes, 0 if its angle
+            cannot be seen; None: by 1.
+
     Returns:
         ``position``: distance, metres (image widths in 2D worlds). ``color_mse``: squared difference, a value a channel
-        [pairs, 3]. ``rotation_deg``: angle. ``confidence_mse``: squared difference from 1 of paired predictions and
-        from 0 of the others, [batch, num_predicted]. ``light_deg``: angle of the light directions, [batch].
+        [pairs, 3]. ``rotation_deg``: angle between the objects' rotations. ``confidence_mse``: squared difference from
+        1 of paired predictions and from 0 of the others, [batch, num_predicted]. ``light_deg``: angle of the light
+        directions, [batch].
     """
     pairs = assign(layout, predicted, true, groups)
 
@@ -134,6 +147,9 @@ def each_parameter_error(
         if name in layout:
             found, objects = paired(name)
             errors["rotation_deg"] = rotation_angle_deg(matrix(found), matrix(objects))
+    if YAW in layout and yaw_folds is not None:
+        fold = yaw_folds.to(pairs.true)[pairs.true]
+        errors["rotation_deg"] = torch.where(fold > 0, errors["rotation_deg"] / fold.clamp(min=1), 0.0)
     if CONFIDENCE in layout:
         errors["confidence_mse"] = (predicted[CONFIDENCE][..., 0] - (~pairs.surplus).float()).square()
     if LIGHT in layout:

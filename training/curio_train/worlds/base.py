@@ -199,6 +199,8 @@ class World(ABC):
     """Whether a scene with exchanged colour channels is as likely, and looks like its image with exchanged channels."""
     comparison_blur_px: int = 1
     """Image loss and critic compare images behind a Gaussian filter of this side; 1 compares them as they are."""
+    yaw_folds: Tensor | None = None
+    """[slots] int: by what the angle of each slot's object is multiplied to give the yaw in scene codes; None: by 1."""
 
     @property
     def model_name(self) -> str:

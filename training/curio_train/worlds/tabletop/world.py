@@ -102,6 +102,9 @@ class TabletopPhotographs:
 class TabletopWorld(MeshWorld):
     """The world of parts on a plane."""
 
+    yaw_folds: Tensor
+    """[slots] int: the fold of each slot's part."""
+
     def __init__(
         self, parts: Sequence[Part], setup: SceneSetup, photographs: TabletopPhotographs, *, lying: bool, blur_px: int
     ) -> None:
@@ -119,9 +122,9 @@ class TabletopWorld(MeshWorld):
         """
         self.parts, self.photographs, self._lying = tuple(parts), photographs, lying
         self._part_of_slot = [part for part in parts for _ in range(part.max_count)]
-        self._folds = torch.tensor([part.fold for part in self._part_of_slot])
+        self.yaw_folds = torch.tensor([part.fold for part in self._part_of_slot])
         self._unpainted = torch.tensor([part.unpainted for part in self._part_of_slot])
-        orientation: Orientation = FoldedYaw(self._folds) if self._folds.any() else NoRotation()
+        orientation: Orientation = FoldedYaw(self.yaw_folds) if self.yaw_folds.any() else NoRotation()
         if lying:
             orientation = FreeRotation()
         fields = [photographs.position] + ([] if orientation.field is None else [orientation.field])
@@ -171,7 +174,7 @@ class TabletopWorld(MeshWorld):
             code[TRANSLATION][..., 1] = self._touching_height(rotation)
         elif YAW in self.layout:
             yaws = random_yaws(count, num_slots, random)
-            code[YAW] = torch.where(self._folds[:, None] > 0, yaws, torch.tensor([1.0, 0.0]))
+            code[YAW] = torch.where(self.yaw_folds[:, None] > 0, yaws, torch.tensor([1.0, 0.0]))
         if COLOR in self.layout:
             colors = random_colors(count, num_slots, random, 0.0, MIN_BASE_VALUE)
             code[COLOR] = torch.where(self._unpainted[:, None], colors, 1.0)

@@ -1,0 +1,104 @@
+"""Parts on a plane that look alike in several poses: no loss and no score tells these apart."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from curio_train.evaluation.scores import accuracy, scene_errors, scene_scores
+from curio_train.geometry import camera_looking_at
+from curio_train.scene_code import YAW, SceneCode
+from curio_train.worlds import build
+from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.tabletop.world import TabletopWorld
+from scipy.spatial.transform import Rotation
+
+WIDTH, HEIGHT = 96, 72
+UP, ACROSS = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)  # of frames with y up; z of the files is up
+
+
+def prism(sides: int, radius_mm: float) -> trimesh.Trimesh:
+    """Upright, and turned so that no axis of the file is one of its sides'."""
+    angles = 0.3 + 2 * np.pi * np.arange(sides) / sides
+    ring = radius_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ends = [np.column_stack([ring, np.full(sides, height)]) for height in (0.0, 30.0)]
+    return trimesh.Trimesh(np.concatenate(ends)).convex_hull
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Meshes, in millimetres, and photographs of a grey plane with something dark on it."""
+    root = tmp_path_factory.mktemp("alike")
+    rod = trimesh.creation.cylinder(8, 70, sections=48)
+    rod.export(root / "rod.stl")
+    rod.visual.vertex_colors = np.array([200, 30, 30, 255], np.uint8)
+    rod.export(root / "painted.ply")
+    prism(6, 35).export(root / "nut.stl")
+    prism(3, 40).export(root / "triangle.stl")
+    trimesh.creation.cone(20, 50, sections=48).export(root / "cone.stl")
+    trimesh.creation.icosphere(3, 20).export(root / "ball.stl")
+    matrix = [[110.0, 0, 47.5], [0, 110, 35.5], [0, 0, 1]]
+    (root / "camera.json").write_text(json.dumps({"camera_matrix": matrix, "width": WIDTH, "height": HEIGHT}))
+    camera = np.eye(4)
+    camera[:3, :3], camera[:3, 3] = camera_looking_at(torch.tensor([0.0, 0.5, 0.55]).double(), torch.zeros(3).double())
+    (root / "views.json").write_text(json.dumps({"empty.png": {"cam_from_world": camera.tolist()}}))
+    empty = np.full((HEIGHT, WIDTH, 3), 130, np.uint8)
+    cv2.imwrite(str(root / "empty.png"), empty)
+    (root / "photos").mkdir()
+    for number in range(4):
+        photo = empty.copy()
+        photo[20:60, 10 + 15 * number : 40 + 15 * number] = 40
+        cv2.imwrite(str(root / "photos" / f"{number}.png"), photo)
+    return root
+
+
+def world_of(folder: Path, *meshes: str, lying: bool = False, count: int = 1, centered: bool = True) -> TabletopWorld:
+    found = build(
+        CaptureOptions(
+            mesh=tuple(folder / mesh for mesh in meshes),
+            camera=folder / "camera.json",
+            photos=folder / "photos",
+            mesh_unit="mm",
+            background=folder / "empty.png",
+            plane=folder / "views.json",
+            counts=(str(count),) * len(meshes),
+            lying=lying,
+            centered=centered,
+        )
+    )
+    assert isinstance(found, TabletopWorld)
+    return found
+
+
+def about(axis: tuple[float, ...], degrees: float) -> torch.Tensor:
+    return torch.from_numpy(Rotation.from_rotvec(np.radians(degrees) * np.array(axis)).as_matrix()).float()
+
+
+def turned(world: TabletopWorld, code: SceneCode, turn: torch.Tensor) -> dict[str, torch.Tensor]:
+    """The same scene with each part turned in its own frame."""
+    return {**code, **world.orientation.entries(world.orientation.rotation(code) @ turn)}
+
+
+@pytest.mark.parametrize(("mesh", "order"), [("nut.stl", 6), ("triangle.stl", 3)])
+def test_errors_of_folded_yaws_are_degrees_of_the_part(folder: Path, mesh: str, order: int) -> None:
+    world = world_of(folder, mesh)
+    assert world.yaw_folds.tolist() == [order]
+    true = world.sample(5, (0,))
+    for turn_deg, expected in ((8, 8), (180 / order, 180 / order), (360 / order, 0), (360 / order - 3, 3)):
+        predicted = turned(world, true, about(UP, turn_deg))
+        errors = scene_errors(world, predicted, true)["rotation_deg"]
+        assert errors.tolist() == pytest.approx([expected] * 5, abs=0.01)
+        assert accuracy(world, predicted, true) == (expected < 10)
+
+
+def test_the_yaw_of_a_round_part_is_no_error(folder: Path) -> None:
+    world = world_of(folder, "cone.stl", "nut.stl")
+    true = world.sample(2, (0,))
+    predicted = dict(true) | {YAW: true[YAW].clone()}
+    predicted[YAW][:, 0] = torch.tensor([0.0, 1.0])
+    scores = scene_scores(world, predicted, true)
+    assert scores["rotation_deg"] == pytest.approx(0, abs=1e-3)
+    assert accuracy(world, predicted, true) == 1
