@@ -2,12 +2,15 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from curio_train.data.bop import ModelInfo
 from curio_train.metrics.assignment import (
     assign,
     canonical,
     each_parameter_error,
+    nearest_alike,
     parameter_errors,
     scene_error,
 )
@@ -141,6 +144,19 @@ def test_yaws_that_are_multiples_of_angles() -> None:
     swapped = {name: value.flip(1) for name, value in predicted.items()}
     errors = each_parameter_error(layout, swapped, true, yaw_folds=folds)["rotation_deg"]
     assert sorted(errors.tolist()) == pytest.approx([0, 10, 60], abs=1e-4)
+
+
+def test_a_rotation_that_looks_alike_is_found_for_each_pair() -> None:
+    """Half a turn about z is none of the second object, wherever the prediction has its slot."""
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    infos = [ModelInfo(0.1), ModelInfo(0.1, (half,))]
+    layout = Layout((POSITION, Field(ROTATION_6D, 6)), num_slots=2)
+    true = positions([0.0, 0.0, 0.0], [0.5, 0.0, 0.0]) | {ROTATION_6D: torch.eye(3)[:2].flatten().expand(1, 2, 6)}
+    predicted = {**positions([0.5, 0.0, 0.0], [0.0, 0.0, 0.0]), ROTATION_6D: -true[ROTATION_6D]}
+    alike = nearest_alike(layout, predicted, true, infos)
+    assert torch.allclose(alike[ROTATION_6D], torch.stack([true[ROTATION_6D][:, 0], -true[ROTATION_6D][:, 0]], dim=1))
+    apart = nearest_alike(layout, predicted, true, infos, groups=[(0,), (1,)])
+    assert torch.equal(apart[ROTATION_6D], alike[ROTATION_6D])
 
 
 @pytest.mark.parametrize(

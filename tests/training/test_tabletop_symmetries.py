@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from curio_train.config import NetworkConfig
 from curio_train.evaluation.scores import accuracy, scene_errors, scene_scores
-from curio_train.geometry import camera_looking_at
-from curio_train.scene_code import YAW, SceneCode
+from curio_train.geometry import camera_looking_at, rotation_6d_from_matrix
+from curio_train.networks.grid import per_cell
+from curio_train.scene_code import ROTATION_6D, YAW, SceneCode
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions
 from curio_train.worlds.tabletop.world import TabletopWorld
@@ -80,6 +82,62 @@ def about(axis: tuple[float, ...], degrees: float) -> torch.Tensor:
 def turned(world: TabletopWorld, code: SceneCode, turn: torch.Tensor) -> dict[str, torch.Tensor]:
     """The same scene with each part turned in its own frame."""
     return {**code, **world.orientation.entries(world.orientation.rotation(code) @ turn)}
+
+
+TURNS = [
+    pytest.param("rod.stl", about(UP, 70), 0, id="a rod about its axis"),
+    pytest.param("rod.stl", about(ACROSS, 180) @ about(UP, 33), 0, id="a rod the other way round"),
+    pytest.param("rod.stl", about(UP, 50) @ about(ACROSS, 20), 20, id="a rod that points elsewhere"),
+    pytest.param("cone.stl", about(ACROSS, 180), 180, id="a cone the other way round"),
+    pytest.param("ball.stl", about(ACROSS, 77), 0, id="a ball"),
+    pytest.param("painted.ply", about(UP, 70), 70, id="a painted rod about its axis"),
+]
+
+
+@pytest.mark.parametrize(("mesh", "turn", "degrees"), TURNS)
+def test_lying_parts_are_scored_by_how_they_look(folder: Path, mesh: str, turn: torch.Tensor, degrees: float) -> None:
+    world = world_of(folder, mesh, lying=True, count=2)
+    true = world.sample(3, (0,))
+    predicted = {name: value.flip(1) if value.ndim == 3 else value for name, value in turned(world, true, turn).items()}
+    errors = scene_errors(world, predicted, true)
+    assert errors["rotation_deg"].tolist() == pytest.approx([degrees] * 6, abs=0.2)
+    assert accuracy(world, predicted, true) == (degrees < 10)
+    loss = float(world.code_loss(predicted, true))
+    assert loss == pytest.approx(float(errors["scene_error"].mean()))
+    assert (loss > 0.1) == (degrees > 10)
+    assert loss > 0.1 or loss < 0.01
+
+
+@pytest.mark.parametrize(("mesh", "turn", "degrees"), TURNS)
+def test_cells_are_taught_by_how_lying_parts_look(folder: Path, mesh: str, turn: torch.Tensor, degrees: float) -> None:
+    world = world_of(folder, mesh, lying=True)
+    true = world.sample(1, (0,))
+    network = world.network(NetworkConfig(reading="cells"))
+    with torch.no_grad():
+        read = network(world.render(true))
+
+    def loss(rotation_6d: torch.Tensor) -> float:
+        of_cells = rotation_6d.expand_as(read[per_cell(ROTATION_6D)])
+        return float(world.code_loss({**read, per_cell(ROTATION_6D): of_cells}, true))
+
+    least = loss(true[ROTATION_6D][:, None])
+    assert (loss(turned(world, true, turn)[ROTATION_6D][:, None]) > least + 0.1) == (degrees > 10)
+
+
+def test_all_cells_learn_one_of_the_rotations_that_look_alike(folder: Path) -> None:
+    """Slots are filled with means over cells: if each learned the rotation nearest to its own, these would be none."""
+    world = world_of(folder, "rod.stl", lying=True)
+    true = world.sample(1, (0,))
+    network = world.network(NetworkConfig(reading="cells"))
+    with torch.no_grad():
+        read = network(world.render(true))
+    rotation, name = world.orientation.rotation(true)[0, 0], per_cell(ROTATION_6D)
+    both = [rotation_6d_from_matrix(rotation @ turn).expand_as(read[name]) for turn in (about(UP, 0), about(UP, 180))]
+    mixed = both[0].clone()
+    mixed[:, :, ::2] = both[1][:, :, ::2]  # every other column of cells
+    losses = [float(world.code_loss({**read, name: of_cells}, true)) for of_cells in (*both, mixed)]
+    assert losses[1] == pytest.approx(losses[0], abs=0.01)
+    assert losses[2] > losses[0] + 0.1
 
 
 @pytest.mark.parametrize(("mesh", "order"), [("nut.stl", 6), ("triangle.stl", 3)])

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from curio_train.data.bop import ModelInfo
 from curio_train.geometry import (
     direction_from_hemisphere,
     matrix_from_rotation_6d,
@@ -20,6 +21,7 @@ from curio_train.geometry import (
     rotation_6d_from_matrix,
     rotation_angle_deg,
 )
+from curio_train.metrics.symmetric_rotations import nearest_symmetric
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW, Layout, SceneCode
 
 Groups = Sequence[Sequence[int]]
@@ -72,6 +74,30 @@ def assign(layout: Layout, predicted: SceneCode, true: SceneCode, groups: Groups
     surplus[images, slots] = False
     missing[images, object_slots] = False
     return Assignment(images, slots, object_slots, surplus, missing)
+
+
+def nearest_alike(
+    layout: Layout,
+    predicted: SceneCode,
+    true: SceneCode,
+    slot_infos: Sequence[ModelInfo],
+    groups: Groups | None = None,
+) -> dict[str, Tensor]:
+    """The true code with the rotation of each paired object replaced by the nearest to its prediction that looks alike.
+
+    Args:
+        layout: Of both codes.
+        predicted: As in :func:`assign`.
+        true: As in :func:`assign`.
+        slot_infos: Symmetries of each slot's object, in the frame that rotations in the codes are from.
+        groups: As in :func:`assign`.
+    """
+    if ROTATION_6D not in layout or not any(info.is_symmetric for info in slot_infos):
+        return dict(true)
+    pairs = assign(layout, predicted, true, groups)
+    found = true[ROTATION_6D].clone()
+    found[pairs.image, pairs.true] = predicted[ROTATION_6D].detach()[pairs.image, pairs.predicted]
+    return {**true, ROTATION_6D: nearest_symmetric(found, true[ROTATION_6D], slot_infos)}
 
 
 def scene_error(

@@ -5,7 +5,9 @@ empty scene. Here:
 
 * a scene code is in the world frame of ``--plane``: y up, the plane at y = 0. A part that stands has a position on the
   plane and a yaw, one that lies any way a free rotation and a height, too;
-* a yaw is folded by the shape's rotational symmetry (:class:`~curio_train.worlds.generated.orientation.FoldedYaw`);
+* a yaw is folded by the shape's rotational symmetry (:class:`~curio_train.worlds.generated.orientation.FoldedYaw`); of
+  free rotations that look alike, the one nearest to the prediction is the true one. Paint tells the sides of a shape
+  apart: a painted part has no symmetry;
 * the code has the colour of meshes without colours, and the direction of the light (the paper's text names it), 30° to
   80° high. It shades parts and throws their shadows on the background image; its strength is that of ``ground.py``;
 * if the numbers of parts vary each slot has a confidence;
@@ -27,6 +29,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.color import linear_from_srgb, srgb_from_linear
+from curio_train.data.bop import ModelInfo
 from curio_train.errors import UsageError
 from curio_train.geometry import Pose, random_rotations, rotation_6d_from_matrix
 from curio_train.meshes.meshes import Mesh
@@ -67,6 +70,8 @@ class Part:
     """With y up; its lowest point at y = 0 if it stands, its middle at the origin if it lies."""
     file_from_own: Pose[np.ndarray]
     """From that frame to the file's."""
+    info: ModelInfo
+    """Symmetries in that frame; none of a painted part."""
     radius_m: float
     """Of a vertical cylinder round it if it stands, of a sphere if it lies."""
     min_count: int
@@ -148,6 +153,11 @@ class TabletopWorld(MeshWorld):
             "parts": [(part.min_count, part.fold, part.unpainted) for part in self.parts],
             "lying": self._lying,
         }
+
+    @property
+    def slot_infos(self) -> list[ModelInfo]:
+        """Symmetries of each slot's part, in the frame of :attr:`Part.mesh`."""
+        return [part.info for part in self._part_of_slot]
 
     @property
     def model_name(self) -> str:
