@@ -12,7 +12,7 @@ from curio_train.config import NetworkConfig
 from curio_train.evaluation.scores import accuracy, scene_errors, scene_scores
 from curio_train.geometry import camera_looking_at, rotation_6d_from_matrix
 from curio_train.networks.grid import per_cell
-from curio_train.scene_code import ROTATION_6D, YAW, SceneCode
+from curio_train.scene_code import ROTATION_6D, TRANSLATION, YAW, SceneCode
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions
 from curio_train.worlds.tabletop.world import TabletopWorld
@@ -160,3 +160,27 @@ def test_the_yaw_of_a_round_part_is_no_error(folder: Path) -> None:
     scores = scene_scores(world, predicted, true)
     assert scores["rotation_deg"] == pytest.approx(0, abs=1e-3)
     assert accuracy(world, predicted, true) == 1
+
+
+@pytest.mark.parametrize(("mesh", "lying"), [("triangle.stl", False), ("triangle.stl", True), ("nut.stl", True)])
+def test_codes_have_the_position_of_a_point_that_symmetries_leave(folder: Path, mesh: str, lying: bool) -> None:
+    """The middle of a triangle's box is none."""
+    world = world_of(folder, mesh, lying=lying)
+    (part,) = world.parts
+    motions = [motion for motion in part.info.symmetries if lying or motion[1, 1] > 0.99]
+    assert motions
+    for motion in motions:
+        assert np.linalg.norm(motion[:3, 3]) < 0.01 * part.info.diameter_m
+    of_box = world_of(folder, mesh, lying=lying, centered=False).parts[0].file_from_own.translation_m
+    off = np.linalg.norm(of_box - part.file_from_own.translation_m)
+    assert (off > 5e-3) == (mesh == "triangle.stl")
+
+
+def test_both_ends_of_a_folded_yaw_are_one_image(folder: Path) -> None:
+    world = world_of(folder, "triangle.stl")
+    code = world.sample(4, (0,))
+    angle = np.radians(179.9)
+    yaws = (torch.tensor([np.cos(angle), sign * np.sin(angle)]).float() for sign in (1, -1))
+    ends = [world.render({**code, YAW: yaw.expand_as(code[YAW])}) for yaw in yaws]
+    beside = world.render({**code, TRANSLATION: code[TRANSLATION] + torch.tensor([0.005, 0.0, 0.0])})
+    assert (ends[0] - ends[1]).abs().mean() < 0.2 * (beside - world.render(code)).abs().mean()

@@ -26,6 +26,7 @@ from curio_train.worlds.single_object.world import resized
 from curio_train.worlds.tabletop.world import Part, TabletopPhotographs, TabletopWorld
 
 SIDE_PX = 128
+_OFF_AXIS = 0.01  # of the diameter; symmetries are not found exactly enough to correct the box's middle by less
 _PARALLEL, _LEVEL = 0.999, 0.04  # cosine of the angle between an axis and the vertical: the same, and across it
 
 # Rotations from the mesh file's frame, with the named axis up, to one with y up; right-handed.
@@ -79,6 +80,8 @@ def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_co
     found, unpainted = find_symmetries(mesh), is_unpainted(mesh)
     alike = found.in_frame(Pose(rotation, np.zeros(3))) if unpainted else Symmetries((), ())
     origin = (low + high) / 2
+    if options.centered:
+        origin = _left_in_place(alike, origin, mesh.diameter_m)
     if not options.lying:
         origin[1] = low[1]
     own = dataclasses.replace(mesh, vertices_m=rotated - origin)
@@ -91,6 +94,15 @@ def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_co
     in_own = alike.in_frame(Pose(np.eye(3), -origin))
     info = ModelInfo(mesh.diameter_m, in_own.discrete, in_own.continuous)
     return Part(kind, own, file_from_own, info, radius_m, min_count, max_count, fold, unpainted)
+
+
+def _left_in_place(alike: Symmetries, middle_m: np.ndarray, diameter_m: float) -> np.ndarray:
+    """The middle of the box [3], or the nearest point that symmetries leave in its place if they move the middle.
+
+    Those of a triangular part do.
+    """
+    left_m = alike.point_left(middle_m)
+    return left_m if np.linalg.norm(left_m - middle_m) > _OFF_AXIS * diameter_m else middle_m
 
 
 def yaw_fold(found: Symmetries, up: np.ndarray) -> int:

@@ -67,7 +67,8 @@ class Part:
     kind: ObjectKind
     """As its file has it, without slots."""
     mesh: Mesh
-    """With y up; its lowest point at y = 0 if it stands, its middle at the origin if it lies."""
+    """With y up; its middle at the origin, or if it stands its lowest point below the middle. Symmetries leave the
+    middle in its place."""
     file_from_own: Pose[np.ndarray]
     """From that frame to the file's."""
     info: ModelInfo
@@ -148,11 +149,14 @@ class TabletopWorld(MeshWorld):
     def _drawn_from(self, photographs: TabletopPhotographs) -> dict[str, Any]:
         """Values that the draws depend on besides fields, meshes and setup."""
         arrays = (photographs.own.background_image.numpy(), photographs.occupied)
-        return {
+        constants = {
             "plate": [hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest() for array in arrays],
             "parts": [(part.min_count, part.fold, part.unpainted) for part in self.parts],
             "lying": self._lying,
         }
+        if any(part.info.is_symmetric for part in self.parts):  # whose middle is not always that of the box
+            constants["origins"] = [part.file_from_own.translation_m.tolist() for part in self.parts]
+        return constants
 
     @property
     def slot_infos(self) -> list[ModelInfo]:
