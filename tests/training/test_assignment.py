@@ -2,9 +2,18 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
-from curio_train.metrics.assignment import assign, canonical, parameter_errors, scene_error
+from curio_train.data.bop import ModelInfo
+from curio_train.metrics.assignment import (
+    assign,
+    canonical,
+    each_parameter_error,
+    nearest_alike,
+    parameter_errors,
+    scene_error,
+)
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW, Field, Layout
 
 POSITION = Field(TRANSLATION, 3, unit="m", lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 1.0))
@@ -120,6 +129,34 @@ def test_rotations_count_as_rotations() -> None:
     assert scene_error(full, skewed, true).item() == pytest.approx(0, abs=1e-6)
     assert parameter_errors(full, half, true)["rotation_deg"] == pytest.approx(180)
     assert canonical(skewed)[ROTATION_6D].flatten().tolist() == pytest.approx([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+
+
+def test_yaws_that_are_multiples_of_angles() -> None:
+    """Codes that are off by 60 degrees: of a part without symmetry, of a hexagonal one, and of a round one."""
+    layout = Layout((POSITION, Field(YAW, 2)), num_slots=3)
+    places = positions([0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.0, 0.0, 0.0])
+    true = {**places, YAW: torch.tensor([[[1.0, 0.0]] * 3])}
+    predicted = {**places, YAW: torch.tensor([[[0.5, 0.75**0.5]] * 3])}
+    folds = torch.tensor([1, 6, 0])
+    errors = each_parameter_error(layout, predicted, true, yaw_folds=folds)["rotation_deg"]
+    assert errors.tolist() == pytest.approx([60, 10, 0], abs=1e-4)
+    assert each_parameter_error(layout, predicted, true)["rotation_deg"].tolist() == pytest.approx([60] * 3, abs=1e-4)
+    swapped = {name: value.flip(1) for name, value in predicted.items()}
+    errors = each_parameter_error(layout, swapped, true, yaw_folds=folds)["rotation_deg"]
+    assert sorted(errors.tolist()) == pytest.approx([0, 10, 60], abs=1e-4)
+
+
+def test_a_rotation_that_looks_alike_is_found_for_each_pair() -> None:
+    """Half a turn about z is none of the second object, wherever the prediction has its slot."""
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    infos = [ModelInfo(0.1), ModelInfo(0.1, (half,))]
+    layout = Layout((POSITION, Field(ROTATION_6D, 6)), num_slots=2)
+    true = positions([0.0, 0.0, 0.0], [0.5, 0.0, 0.0]) | {ROTATION_6D: torch.eye(3)[:2].flatten().expand(1, 2, 6)}
+    predicted = {**positions([0.5, 0.0, 0.0], [0.0, 0.0, 0.0]), ROTATION_6D: -true[ROTATION_6D]}
+    alike = nearest_alike(layout, predicted, true, infos)
+    assert torch.allclose(alike[ROTATION_6D], torch.stack([true[ROTATION_6D][:, 0], -true[ROTATION_6D][:, 0]], dim=1))
+    apart = nearest_alike(layout, predicted, true, infos, groups=[(0,), (1,)])
+    assert torch.equal(apart[ROTATION_6D], alike[ROTATION_6D])
 
 
 @pytest.mark.parametrize(

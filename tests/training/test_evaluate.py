@@ -110,6 +110,7 @@ def test_a_pose_that_looks_alike_has_no_scene_error(brick_world: TwoStageWorld) 
     assert errors["rotation_deg"].tolist() == pytest.approx([0, 90, 0], abs=0.1)
     assert errors["scene_error"].tolist() == pytest.approx([0, errors["scene_error"][1].item(), 0], abs=1e-3)
     assert errors["scene_error"][1] > 0.1
+    assert float(brick_world.code_loss(predicted, true)) == pytest.approx(float(errors["scene_error"].mean()))
 
 
 def test_renderings_that_show_nothing_are_too_few(brick: Object) -> None:

@@ -155,7 +155,7 @@ def test_dense_loss_is_least_at_the_truth(worlds: dict[str, MeshWorld]) -> None:
     grid, kinds = grid_of(world), kinds_of(world)
 
     def error(read: SceneCode) -> Tensor:
-        return dense_loss(world.layout, kinds, grid, read, code)
+        return dense_loss(world.layout, kinds, grid, read, code, world.slot_infos)
 
     true = prediction(world, code)
     least = error(true)
@@ -169,7 +169,7 @@ def test_absent_objects_teach_no_cell_anything(worlds: dict[str, MeshWorld]) -> 
     moved = dict(code) | {COLOR: torch.where(code[CONFIDENCE] > 0, code[COLOR], 1 - code[COLOR])}
     assert not torch.equal(moved[COLOR], code[COLOR])
     read, grid, kinds = prediction(world, code), grid_of(world), kinds_of(world)
-    errors = [dense_loss(world.layout, kinds, grid, read, true) for true in (code, moved)]
+    errors = [dense_loss(world.layout, kinds, grid, read, true, world.slot_infos) for true in (code, moved)]
     assert torch.equal(*errors)
 
 

@@ -60,6 +60,21 @@ def test_motions_are_of_the_object_frame_wherever_its_origin_lies() -> None:
         assert distances.max() < 0.01 * box.diameter_m
 
 
+@pytest.mark.parametrize("mesh", [shapes.box((0.03, 0.05, 0.08)), shapes.cone(0.03, 0.08)], ids=["box", "cone"])
+def test_motions_of_another_frame(mesh: Mesh) -> None:
+    turned = Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix()
+    moved = Pose(turned, np.array([0.2, -0.1, 0.05]))
+    found = find_symmetries(mesh)
+    there, points_m = found.in_frame(moved), mesh.vertices_m
+    assert (len(there.discrete), len(there.continuous)) == (len(found.discrete), len(found.continuous))
+    for own, motion in zip(found.discrete, there.discrete, strict=True):
+        before = moved.apply(Pose.from_matrix(own).apply(points_m))
+        assert np.allclose(Pose.from_matrix(motion).apply(moved.apply(points_m)), before, atol=1e-12)
+    for (own_axis, own_m), (axis, point_m) in zip(found.continuous, there.continuous, strict=True):
+        assert np.allclose(moved.apply(own_m + own_axis), point_m + axis)
+        assert np.allclose(moved.apply(own_m), point_m)
+
+
 def test_bop_fields_are_row_major_millimetres() -> None:
     fields = find_symmetries(shapes.capsule(0.02, 0.09)).as_bop()
     (flip,), (axis,) = fields["symmetries_discrete"], fields["symmetries_continuous"]

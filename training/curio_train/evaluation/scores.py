@@ -8,14 +8,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.data.bop import ModelInfo
-from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
-from curio_train.metrics.assignment import each_parameter_error, scene_error
+from curio_train.geometry import Pose, rotation_angle_deg
+from curio_train.metrics.assignment import each_parameter_error, nearest_alike, scene_error
 from curio_train.metrics.images import dssim
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, recall, symmetry_poses, turned_alike
-from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode, index, poses
+from curio_train.scene_code import TRANSLATION, SceneCode, index, poses
 from curio_train.worlds.base import World, novel_view
-from curio_train.worlds.several_objects.world import SeveralObjectsWorld
-from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _MM = 1000.0
@@ -34,7 +32,8 @@ def scene_scores(
     errors = scene_errors(world, predicted, true) if errors is None else errors
     scores = {name: float(values.double().mean()) for name, values in errors.items()}
     if len(world.objects) > 1:
-        scores["scene_error_any_shape"] = float(scene_error(world.layout, predicted, true).mean())
+        alike = nearest_alike(world.layout, predicted, true, world.slot_infos)
+        scores["scene_error_any_shape"] = float(scene_error(world.layout, predicted, alike).mean())
     if "position_image_widths" in errors:
         scores["position_px"] = scores["position_image_widths"] * world.camera.width
         scores["position_px_median"] = float(errors["position_image_widths"].median()) * world.camera.width
@@ -46,39 +45,21 @@ def scene_errors(world: World, predicted: SceneCode, true: SceneCode) -> dict[st
 
     ``scene_error`` is Eq. 1 of the paper, the table's Para, and ``novel_view_dssim`` is its Img, one value an image.
     The others are errors of single parameters under the same assignment, within a shape where slots carry one. Of
-    symmetric objects in free space the true pose is the one nearest to the prediction of those that look alike.
+    symmetric objects the true pose is the one nearest to the prediction of those that look alike.
     """
-    true = _nearest_alike(world, predicted, true)
     groups = [kind.slots for kind in world.objects]
+    true = nearest_alike(world.layout, predicted, true, world.slot_infos, groups)
     errors = {
         "scene_error": scene_error(world.layout, predicted, true, groups),
         "novel_view_dssim": novel_view_dssim(world, predicted, true),
     }
-    parameters = each_parameter_error(world.layout, predicted, true, groups)
+    parameters = each_parameter_error(world.layout, predicted, true, groups, world.yaw_folds)
     position = parameters.pop("position")
     if world.layout[TRANSLATION].unit == "image_width":
         errors["position_image_widths"] = position
     else:
         errors["position_mm"] = position * _MM
     return errors | parameters
-
-
-def _nearest_alike(world: World, predicted: SceneCode, true: SceneCode) -> SceneCode:
-    """The true codes with each object's rotation replaced by the nearest to the predicted one that looks alike."""
-    if not isinstance(world, SingleObjectWorld | SeveralObjectsWorld):
-        return true
-    rotation = true[ROTATION_6D].clone()
-    for kind in world.objects:
-        (slot,) = kind.slots
-        if kind.info.turns_any_way:
-            rotation[:, slot] = predicted[ROTATION_6D][:, slot]
-            continue
-        alike = torch.from_numpy(np.stack([pose.rotation for pose in symmetry_poses(kind.info, SYMMETRY_STEP)]))
-        found, wanted = (matrix_from_rotation_6d(code[ROTATION_6D][:, slot].double()) for code in (predicted, true))
-        candidates = wanted[:, None] @ alike.to(wanted)
-        nearest = rotation_angle_deg(found[:, None], candidates).argmin(dim=1)
-        rotation[:, slot] = rotation_6d_from_matrix(candidates[torch.arange(len(nearest)), nearest]).to(rotation)
-    return {**true, ROTATION_6D: rotation}
 
 
 @torch.no_grad()
@@ -99,8 +80,9 @@ def accuracy(world: World, predicted: SceneCode, true: SceneCode) -> float:
         kind = world.objects[0]
         errors = add_errors(poses(predicted), poses(true), world.object.mesh.vertices_m, kind.info)
         return recall(errors, ADD_THRESHOLD)
-    true = _nearest_alike(world, predicted, true)
-    found = each_parameter_error(world.layout, predicted, true, [kind.slots for kind in world.objects])
+    groups = [kind.slots for kind in world.objects]
+    true = nearest_alike(world.layout, predicted, true, world.slot_infos, groups)
+    found = each_parameter_error(world.layout, predicted, true, groups, world.yaw_folds)
     right = found["position"] < ADD_THRESHOLD * min(kind.diameter_m for kind in world.objects)
     if "rotation_deg" in found:
         right &= found["rotation_deg"] < _MOST_TURNED_DEG

@@ -15,6 +15,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from curio_train.geometry import Pose
 from curio_train.meshes.meshes import Mesh
 
 TOLERANCE = 0.025
@@ -53,6 +54,15 @@ class Symmetries:
         away_m, *_ = np.linalg.lstsq(np.concatenate(rows), np.concatenate(moved_m), rcond=1e-3)
         result: np.ndarray = near_m + away_m
         return result
+
+    def in_frame(self, new_from_own: Pose[np.ndarray]) -> "Symmetries":
+        """The same motions of another frame."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = new_from_own
+        discrete = tuple(matrix @ motion @ np.linalg.inv(matrix) for motion in self.discrete)
+        return Symmetries(
+            discrete, tuple((new_from_own.rotation @ axis, new_from_own.apply(at)) for axis, at in self.continuous)
+        )
 
     def as_bop(self) -> dict[str, list[object]]:
         """Fields ``symmetries_discrete`` and ``symmetries_continuous`` of BOP, in mm; none that would be empty."""

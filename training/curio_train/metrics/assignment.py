@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from curio_train.data.bop import ModelInfo
 from curio_train.geometry import (
     direction_from_hemisphere,
     matrix_from_rotation_6d,
@@ -20,6 +21,7 @@ from curio_train.geometry import (
     rotation_6d_from_matrix,
     rotation_angle_deg,
 )
+from curio_train.metrics.symmetric_rotations import nearest_symmetric
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, YAW, Layout, SceneCode
 
 Groups = Sequence[Sequence[int]]
@@ -74,6 +76,30 @@ def assign(layout: Layout, predicted: SceneCode, true: SceneCode, groups: Groups
     return Assignment(images, slots, object_slots, surplus, missing)
 
 
+def nearest_alike(
+    layout: Layout,
+    predicted: SceneCode,
+    true: SceneCode,
+    slot_infos: Sequence[ModelInfo],
+    groups: Groups | None = None,
+) -> dict[str, Tensor]:
+    """The true code with the rotation of each paired object replaced by the nearest to its prediction that looks alike.
+
+    Args:
+        layout: Of both codes.
+        predicted: As in :func:`assign`.
+        true: As in :func:`assign`.
+        slot_infos: Symmetries of each slot's object, in the frame that rotations in the codes are from.
+        groups: As in :func:`assign`.
+    """
+    if ROTATION_6D not in layout or not any(info.is_symmetric for info in slot_infos):
+        return dict(true)
+    pairs = assign(layout, predicted, true, groups)
+    found = true[ROTATION_6D].clone()
+    found[pairs.image, pairs.true] = predicted[ROTATION_6D].detach()[pairs.image, pairs.predicted]
+    return {**true, ROTATION_6D: nearest_symmetric(found, true[ROTATION_6D], slot_infos)}
+
+
 def scene_error(
     layout: Layout,
     predicted: SceneCode,
@@ -111,14 +137,27 @@ def parameter_errors(
 
 
 def each_parameter_error(
-    layout: Layout, predicted: SceneCode, true: SceneCode, groups: Groups | None = None
+    layout: Layout,
+    predicted: SceneCode,
+    true: SceneCode,
+    groups: Groups | None = None,
+    yaw_folds: Int[Tensor, " slots"] | None = None,
 ) -> dict[str, Tensor]:
     """Errors of each kind of parameter, for those the layout has; one value a pair unless said otherwise.
 
+    Args:
+        layout: Of both codes.
+        predicted: As in :func:`assign`.
+        true: As in :func:`assign`.
+        groups: As in :func:`assign`.
+        yaw_folds: By what the angle of each slot's object is multiplied to give the yaw in the codes, 0 if its angle
+            cannot be seen; None: by 1.
+
     Returns:
         ``position``: distance, metres (image widths in 2D worlds). ``color_mse``: squared difference, a value a channel
-        [pairs, 3]. ``rotation_deg``: angle. ``confidence_mse``: squared difference from 1 of paired predictions and
-        from 0 of the others, [batch, num_predicted]. ``light_deg``: angle of the light directions, [batch].
+        [pairs, 3]. ``rotation_deg``: angle between the objects' rotations. ``confidence_mse``: squared difference from
+        1 of paired predictions and from 0 of the others, [batch, num_predicted]. ``light_deg``: angle of the light
+        directions, [batch].
     """
     pairs = assign(layout, predicted, true, groups)
 
@@ -134,6 +173,9 @@ def each_parameter_error(
         if name in layout:
             found, objects = paired(name)
             errors["rotation_deg"] = rotation_angle_deg(matrix(found), matrix(objects))
+    if YAW in layout and yaw_folds is not None:
+        fold = yaw_folds.to(pairs.true)[pairs.true]
+        errors["rotation_deg"] = torch.where(fold > 0, errors["rotation_deg"] / fold.clamp(min=1), 0.0)
     if CONFIDENCE in layout:
         errors["confidence_mse"] = (predicted[CONFIDENCE][..., 0] - (~pairs.surplus).float()).square()
     if LIGHT in layout:

@@ -12,11 +12,13 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from curio_train.data.bop import ModelInfo
 from curio_train.metrics.assignment import canonical
+from curio_train.metrics.symmetric_rotations import nearest_symmetric
 from curio_train.networks.base import StageNetwork
 from curio_train.networks.grid import STRIDE, CellGrid, SplatWeights, gather_cells, heat_map_loss, per_cell
 from curio_train.networks.layers import convolution
-from curio_train.scene_code import CONFIDENCE, TRANSLATION, Layout, SceneCode
+from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Layout, SceneCode
 
 HEAT_MAP = "heat_map_logits"
 """Key of the centre heat map's logits [batch, kinds, cells] beside the code that :meth:`SetDetector.decode` returns.
@@ -133,13 +135,19 @@ def fill_slots(
 
 
 def dense_loss(
-    layout: Layout, kinds: Sequence[Sequence[int]], grid: CellGrid, predicted: SceneCode, true: SceneCode
+    layout: Layout,
+    kinds: Sequence[Sequence[int]],
+    grid: CellGrid,
+    predicted: SceneCode,
+    true: SceneCode,
+    slot_infos: Sequence[ModelInfo],
 ) -> Float[Tensor, " batch"]:
     """Loss of all cells: cross entropy of the heat map, and Eq. 1's distances of the other fields.
 
     The four cells around each object are trained to predict all of its fields, so no slot has to be assigned. Rotation
     numbers are compared as they are, not as rotations: while nothing is known no rotation is better than another, but
-    numbers near zero have a smaller error than others.
+    numbers near zero have a smaller error than others. Of rotations that look alike, the four cells learn the one that
+    is nearest to their mean, so that they agree.
 
     Args:
         layout: Of both codes.
@@ -147,6 +155,7 @@ def dense_loss(
         grid: The cells.
         predicted: From :meth:`SetDetector.decode`.
         true: The scene's own code. Where it has a confidence, objects of confidence 0 teach nothing.
+        slot_infos: Symmetries of each slot's object, in the frame that rotations in the codes are from.
     """
     of_slot = torch.cat([torch.full((len(slots),), kind) for kind, slots in enumerate(kinds)])
     splat = grid.splat_weights(grid.project(true[TRANSLATION]))
@@ -158,6 +167,8 @@ def dense_loss(
     for name in names:
         field = layout[name]
         gathered = gather_cells(predicted[per_cell(name)].flatten(1, 2), splat)
+        if name == ROTATION_6D:
+            truth[name] = nearest_symmetric((gathered * splat.weight[..., None]).sum(dim=2), truth[name], slot_infos)
         distance = (field.relative(gathered) - field.relative(truth[name])[:, :, None]).norm(dim=-1)
         error = error + (distance * splat.weight).sum(dim=(1, 2))
     for field in layout.fields:

@@ -19,7 +19,7 @@ from curio_train.config import DecoderKind, NetworkConfig
 from curio_train.data.bop import ModelInfo
 from curio_train.errors import UsageError
 from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix
-from curio_train.metrics.assignment import scene_error
+from curio_train.metrics.assignment import nearest_alike, scene_error
 from curio_train.networks.base import StageNetwork
 from curio_train.networks.paper.network import PoseNetwork
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
@@ -199,6 +199,8 @@ class World(ABC):
     """Whether a scene with exchanged colour channels is as likely, and looks like its image with exchanged channels."""
     comparison_blur_px: int = 1
     """Image loss and critic compare images behind a Gaussian filter of this side; 1 compares them as they are."""
+    yaw_folds: Tensor | None = None
+    """[slots] int: by what the angle of each slot's object is multiplied to give the yaw in scene codes; None: by 1."""
 
     @property
     def model_name(self) -> str:
@@ -213,6 +215,11 @@ class World(ABC):
             centers_m[list(kind.slots)] = kind.center_m
         return CameraFrameOutputs(self.layout, torch.from_numpy(centers_m) if centers_m.any() else None)
 
+    @property
+    def slot_infos(self) -> Sequence[ModelInfo]:
+        """Symmetries of each slot's object, in the frame that rotations in scene codes are from."""
+        return [kind.info for kind in self.objects for _ in kind.slots]
+
     def network(self, config: NetworkConfig) -> StageNetwork:
         """A new network that predicts scene codes of this world's images.
 
@@ -224,9 +231,11 @@ class World(ABC):
     def code_loss(self, predicted: SceneCode, true: SceneCode) -> Float[Tensor, ""]:
         """The loss of sleep and of full supervision: the paper's Eq. 1, mean over the batch.
 
-        Codes are scored by the same number. The assignment of slots has no gradient.
+        Codes are scored by the same number: of rotations that look alike, the one nearest to the prediction is the true
+        one. The assignment of slots has no gradient.
         """
         groups = tuple(kind.slots for kind in self.objects)
+        true = nearest_alike(self.layout, predicted, true, self.slot_infos, groups)
         return scene_error(self.layout, predicted, true, groups).mean()
 
     @abstractmethod

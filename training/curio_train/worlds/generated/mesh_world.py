@@ -145,7 +145,7 @@ class MeshWorld(World):
         if HEAT_MAP not in predicted:
             return super().code_loss(predicted, true)
         grid = self.grid.to(true[TRANSLATION].device)
-        return dense_loss(self.layout, self._slots_of_kinds, grid, predicted, true).mean()
+        return dense_loss(self.layout, self._slots_of_kinds, grid, predicted, true, self.slot_infos).mean()
 
     @property
     def _slots_of_kinds(self) -> tuple[tuple[int, ...], ...]:

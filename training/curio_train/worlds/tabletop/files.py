@@ -10,6 +10,7 @@ from torch import Tensor
 
 from curio_train.camera import Intrinsics, load_intrinsics
 from curio_train.capture.plane import CameraPoseFile, changed_pixels, points_on_plane
+from curio_train.data.bop import ModelInfo
 from curio_train.data.part_color import is_unpainted
 from curio_train.data.photographs import Photographs, read_frames
 from curio_train.errors import DataError
@@ -25,6 +26,7 @@ from curio_train.worlds.single_object.world import resized
 from curio_train.worlds.tabletop.world import Part, TabletopPhotographs, TabletopWorld
 
 SIDE_PX = 128
+_OFF_AXIS = 0.01  # of the diameter; symmetries are not found exactly enough to correct the box's middle by less
 _PARALLEL, _LEVEL = 0.999, 0.04  # cosine of the angle between an axis and the vertical: the same, and across it
 
 # Rotations from the mesh file's frame, with the named axis up, to one with y up; right-handed.
@@ -75,19 +77,32 @@ def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_co
     rotation = _Y_UP_FROM[options.up]
     rotated = mesh.vertices_m @ rotation.T
     low, high = rotated.min(axis=0), rotated.max(axis=0)
+    found, unpainted = find_symmetries(mesh), is_unpainted(mesh)
+    alike = found.in_frame(Pose(rotation, np.zeros(3))) if unpainted else Symmetries((), ())
     origin = (low + high) / 2
+    if options.centered:
+        origin = _left_in_place(alike, origin, mesh.diameter_m)
     if not options.lying:
         origin[1] = low[1]
     own = dataclasses.replace(mesh, vertices_m=rotated - origin)
     radius_m = float(np.linalg.norm(own.vertices_m, axis=1).max())
     if not options.lying:
         radius_m = standing_kind(name, own, 1).radius_m
-    found = find_symmetries(mesh)
     kind = ObjectKind(name, (), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous)
-    unpainted = is_unpainted(mesh)
-    fold = yaw_fold(found, rotation[1]) if unpainted else 1
+    fold = yaw_fold(alike, np.array([0.0, 1.0, 0.0]))
     file_from_own = Pose(rotation.T, rotation.T @ origin)
-    return Part(kind, own, file_from_own, radius_m, min_count, max_count, fold, unpainted)
+    in_own = alike.in_frame(Pose(np.eye(3), -origin))
+    info = ModelInfo(mesh.diameter_m, in_own.discrete, in_own.continuous)
+    return Part(kind, own, file_from_own, info, radius_m, min_count, max_count, fold, unpainted)
+
+
+def _left_in_place(alike: Symmetries, middle_m: np.ndarray, diameter_m: float) -> np.ndarray:
+    """The middle of the box [3], or the nearest point that symmetries leave in its place if they move the middle.
+
+    Those of a triangular part do.
+    """
+    left_m = alike.point_left(middle_m)
+    return left_m if np.linalg.norm(left_m - middle_m) > _OFF_AXIS * diameter_m else middle_m
 
 
 def yaw_fold(found: Symmetries, up: np.ndarray) -> int:

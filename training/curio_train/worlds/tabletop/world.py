@@ -5,7 +5,9 @@ empty scene. Here:
 
 * a scene code is in the world frame of ``--plane``: y up, the plane at y = 0. A part that stands has a position on the
   plane and a yaw, one that lies any way a free rotation and a height, too;
-* a yaw is folded by the shape's rotational symmetry (:class:`~curio_train.worlds.generated.orientation.FoldedYaw`);
+* a yaw is folded by the shape's rotational symmetry (:class:`~curio_train.worlds.generated.orientation.FoldedYaw`); of
+  free rotations that look alike, the one nearest to the prediction is the true one. Paint tells the sides of a shape
+  apart: a painted part has no symmetry;
 * the code has the colour of meshes without colours, and the direction of the light (the paper's text names it), 30° to
   80° high. It shades parts and throws their shadows on the background image; its strength is that of ``ground.py``;
 * if the numbers of parts vary each slot has a confidence;
@@ -27,6 +29,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.color import linear_from_srgb, srgb_from_linear
+from curio_train.data.bop import ModelInfo
 from curio_train.errors import UsageError
 from curio_train.geometry import Pose, random_rotations, rotation_6d_from_matrix
 from curio_train.meshes.meshes import Mesh
@@ -64,9 +67,12 @@ class Part:
     kind: ObjectKind
     """As its file has it, without slots."""
     mesh: Mesh
-    """With y up; its lowest point at y = 0 if it stands, its middle at the origin if it lies."""
+    """With y up; its middle at the origin, or if it stands its lowest point below the middle. Symmetries leave the
+    middle in its place."""
     file_from_own: Pose[np.ndarray]
     """From that frame to the file's."""
+    info: ModelInfo
+    """Symmetries in that frame; none of a painted part."""
     radius_m: float
     """Of a vertical cylinder round it if it stands, of a sphere if it lies."""
     min_count: int
@@ -102,6 +108,9 @@ class TabletopPhotographs:
 class TabletopWorld(MeshWorld):
     """The world of parts on a plane."""
 
+    yaw_folds: Tensor
+    """[slots] int: the fold of each slot's part."""
+
     def __init__(
         self, parts: Sequence[Part], setup: SceneSetup, photographs: TabletopPhotographs, *, lying: bool, blur_px: int
     ) -> None:
@@ -119,9 +128,9 @@ class TabletopWorld(MeshWorld):
         """
         self.parts, self.photographs, self._lying = tuple(parts), photographs, lying
         self._part_of_slot = [part for part in parts for _ in range(part.max_count)]
-        self._folds = torch.tensor([part.fold for part in self._part_of_slot])
+        self.yaw_folds = torch.tensor([part.fold for part in self._part_of_slot])
         self._unpainted = torch.tensor([part.unpainted for part in self._part_of_slot])
-        orientation: Orientation = FoldedYaw(self._folds) if self._folds.any() else NoRotation()
+        orientation: Orientation = FoldedYaw(self.yaw_folds) if self.yaw_folds.any() else NoRotation()
         if lying:
             orientation = FreeRotation()
         fields = [photographs.position] + ([] if orientation.field is None else [orientation.field])
@@ -140,11 +149,19 @@ class TabletopWorld(MeshWorld):
     def _drawn_from(self, photographs: TabletopPhotographs) -> dict[str, Any]:
         """Values that the draws depend on besides fields, meshes and setup."""
         arrays = (photographs.own.background_image.numpy(), photographs.occupied)
-        return {
+        constants = {
             "plate": [hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest() for array in arrays],
             "parts": [(part.min_count, part.fold, part.unpainted) for part in self.parts],
             "lying": self._lying,
         }
+        if any(part.info.is_symmetric for part in self.parts):  # whose middle is not always that of the box
+            constants["origins"] = [part.file_from_own.translation_m.tolist() for part in self.parts]
+        return constants
+
+    @property
+    def slot_infos(self) -> list[ModelInfo]:
+        """Symmetries of each slot's part, in the frame of :attr:`Part.mesh`."""
+        return [part.info for part in self._part_of_slot]
 
     @property
     def model_name(self) -> str:
@@ -171,7 +188,7 @@ class TabletopWorld(MeshWorld):
             code[TRANSLATION][..., 1] = self._touching_height(rotation)
         elif YAW in self.layout:
             yaws = random_yaws(count, num_slots, random)
-            code[YAW] = torch.where(self._folds[:, None] > 0, yaws, torch.tensor([1.0, 0.0]))
+            code[YAW] = torch.where(self.yaw_folds[:, None] > 0, yaws, torch.tensor([1.0, 0.0]))
         if COLOR in self.layout:
             colors = random_colors(count, num_slots, random, 0.0, MIN_BASE_VALUE)
             code[COLOR] = torch.where(self._unpainted[:, None], colors, 1.0)
