@@ -3,22 +3,24 @@
     curio-serve models/
     python pose_bridge.py --ros-args -p model:=ape -r image:=/camera/image_raw -r camera_info:=/camera/camera_info
 
-It needs rclpy, message_filters, sensor_msgs and vision_msgs of ROS 2, and `pip install curio-pose`. Images that come
-while the server answers another one are dropped.
+It needs rclpy, message_filters, sensor_msgs and vision_msgs of ROS 2, and `pip install curio-pose`. Raw images are
+taken with K and the distortion of their camera_info, rectified ones (image:=/camera/image_rect) with P; which they are
+the name of their topic says. Of images that come while the server answers another one, the newest alone waits.
 """
 
 import rclpy
 from curio_serve.client.client import PoseClient
 from curio_serve.errors import CurioError
-from curio_serve.imaging.camera_files import camera_of_info
+from curio_serve.imaging.camera_files import camera_of_images
 from curio_serve.imaging.image import from_raw
 from message_filters import Subscriber, TimeSynchronizer
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
 from vision_msgs.msg import Detection3D, Detection3DArray, ObjectHypothesisWithPose
 
 FORMATS = {"rgb8": "RGB8", "bgr8": "BGR8", "mono8": "GRAY8"}
+_NUM_INFOS = 10  # that wait for their image
 
 
 class PoseBridge(Node):
@@ -30,18 +32,23 @@ class PoseBridge(Node):
         self._min_confidence = self.declare_parameter("min_confidence", 0.5).value
         self._client = PoseClient(self.declare_parameter("address", "127.0.0.1:8500").value, timeout_s=2.0)
         self._publisher = self.create_publisher(Detection3DArray, "~/detections", 10)
-        topics = ((Image, "image"), (CameraInfo, "camera_info"))
-        inputs = [Subscriber(self, kind, name, qos_profile=qos_profile_sensor_data) for kind, name in topics]
-        self._pairs = TimeSynchronizer(inputs, queue_size=2)
+        self._topic = self.resolve_topic_name("image")
+        # Best effort, as of sensor data, gets what drivers publish, be it best effort or reliable. Where images are
+        # rectified, several camera_info come before the image that they belong to.
+        topics = ((Image, "image", 1), (CameraInfo, "camera_info", _NUM_INFOS))
+        inputs = [
+            Subscriber(self, kind, name, qos_profile=QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT))
+            for kind, name, depth in topics
+        ]
+        self._pairs = TimeSynchronizer(inputs, queue_size=_NUM_INFOS)
         self._pairs.registerCallback(self._answer)
 
     def _answer(self, image: Image, info: CameraInfo) -> None:
         if image.encoding not in FORMATS:
             self.get_logger().error(f"encoding {image.encoding!r}, expected {', '.join(FORMATS)}", once=True)
             return
-        fields = {"k": list(info.k), "d": list(info.d), "distortion_model": info.distortion_model}
         try:
-            camera = camera_of_info({**fields, "width": info.width, "height": info.height}, "k")
+            camera = camera_of_images(info, self._topic)
             frame = from_raw(bytes(image.data), FORMATS[image.encoding], image.width, image.height, image.step)
             answer = self._client.detect(self._model, frame.pixels, camera, min_confidence=self._min_confidence)
         except CurioError as exc:

@@ -3,13 +3,14 @@
 import json
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from curio_serve.errors import CameraError
 from curio_serve.imaging.camera import PinholeCamera, scaling
-from curio_serve.imaging.camera_files import read_camera_file
+from curio_serve.imaging.camera_files import camera_of_images, read_camera_file
 
 K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
 
@@ -227,3 +228,27 @@ def test_files_that_are_none_are_named(tmp_path: Path) -> None:
     ):
         with pytest.raises(CameraError, match=words):
             read_camera_file(tmp_path / f"{name}.json")
+
+
+@pytest.mark.parametrize(
+    ("topic", "is_rectified"),
+    [
+        ("/camera/image_raw", False),
+        ("/camera/image_raw/compressed", False),
+        ("/rect_camera/image", False),
+        ("/camera/image_rect", True),
+        ("/camera/image_rect_color/compressed", True),
+    ],
+)
+def test_rectified_images_of_a_topic_have_p_and_raw_ones_k_and_d(topic: str, is_rectified: bool) -> None:
+    """P of a stereo pair's second camera, whose fourth column is no part of its K."""
+    k, p = [600.0, 0, 320, 0, 601, 240, 0, 0, 1], [500.0, 0, 310, -60, 0, 500, 245, 0, 0, 0, 1, 0]
+    lens = [0.1, 0.01, 0.0, 0.0, 0.0]
+    info = SimpleNamespace(width=640, height=480, k=k, d=lens, p=p, distortion_model="plumb_bob")
+    camera = camera_of_images(info, topic)
+    assert camera.size == (640, 480)
+    expected = [500.0, 0, 310, 0, 500, 245, 0, 0, 1] if is_rectified else k
+    assert camera.matrix.ravel().tolist() == expected
+    assert list(camera.distortion) == ([] if is_rectified else lens)
+    with pytest.raises(CameraError):
+        camera_of_images(SimpleNamespace(**vars(info) | {"k": [0.0] * 9, "p": [0.0] * 12}), topic)

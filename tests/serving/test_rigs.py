@@ -176,7 +176,7 @@ def _write_rig(path: Path, poses: list[np.ndarray], **changes: object) -> Path:
 def test_curio_detect_takes_a_folder_of_each_camera(models_dir: Path, tmp_path: Path, spot_image: Spot) -> None:
     side = np.eye(4)
     side[0, 3] = -0.1
-    poses = [np.eye(4), side]
+    poses = [side, np.eye(4)]
     rig, folders, out = _write_rig(tmp_path / "rig.json", poses), [], tmp_path / "out.jsonl"
     for number, pose in enumerate(poses):
         folders.append(tmp_path / f"cam{number}")
@@ -189,6 +189,7 @@ def test_curio_detect_takes_a_folder_of_each_camera(models_dir: Path, tmp_path: 
     first, broken, last = (json.loads(line) for line in out.read_text().splitlines())
     assert first["views"] == [str(folder / "0.png") for folder in folders]
     np.testing.assert_allclose(first["detections"][0]["translation_m"], POSITION, atol=0.02)
+    assert first["cam_from_rig"] == last["cam_from_rig"] == side.tolist()
     assert first["detections"][0]["views"] == last["detections"][0]["views"] == [0, 1]
     assert str(folders[1] / "1.png") in broken["error"]
     (folders[1] / "2.png").unlink()

@@ -1,6 +1,7 @@
 """A part of one's own: an STL, a camera file, photographs and a background image become a world that can be learned."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -199,6 +200,17 @@ def test_a_model_is_not_judged_by_what_it_learned_from(folder: Path, tmp_path: P
     first, spread = greys(read[0]), greys(torch.cat(read[1:]))
     assert len(first) == len(spread) == 20, "without time for more, one batch is tried and one is labelled"
     assert max(spread) - min(spread) > max(first) - min(first)
+
+
+def test_the_background_image_among_the_photographs_neither_teaches_nor_judges(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "photos", tmp_path / "photos")
+    among = shutil.copy(folder / "plate.png", tmp_path / "photos")
+    for number in range(2 * NUM_JUDGED - 13):
+        shutil.copy(folder / "photos" / "00.png", tmp_path / "photos" / f"copy{number}.png")
+    found = photographs(build(options(folder, photos=tmp_path / "photos", background=Path(among))))
+    assert len(found.paths()) == 2 * NUM_JUDGED - 1
+    assert Path(among) not in found.judged(1000)[0]
+    assert not found.unlabelled_paths(), "one too few to learn from"
 
 
 def test_what_contradicts_itself_is_refused(folder: Path, tmp_path: Path) -> None:

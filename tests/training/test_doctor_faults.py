@@ -205,6 +205,19 @@ def test_too_few_to_learn_from(files: Files) -> None:
     assert len(split.unlabelled().paths) == FEWEST_TO_LEARN_FROM - NUM_JUDGED
 
 
+def test_the_background_image_among_the_photographs_is_none_of_them(files: Files) -> None:
+    among = files.folder / "photos" / "background.png"
+    files.plate.rename(among)
+    subjects = replace(files.subjects(), background=among)
+    assert alarms(subjects) == []
+    (told,) = (found.text for found in examine_files(subjects) if found.subject == "photographs")
+    assert told.endswith(f"84 of {WIDTH}x{HEIGHT}, not counting background.png, the empty scene")
+    for path in files.photos[FEWEST_TO_LEARN_FROM - 1 : NUM_PHOTOS]:
+        path.unlink()
+    (finding,) = alarms(subjects)
+    assert finding.text.startswith(f"only {FEWEST_TO_LEARN_FROM - 1}, not counting background.png, the")
+
+
 def test_mixed_sizes(files: Files) -> None:
     save(files.photos[3], photo(3)[:100])
     assert [finding.fault for finding in alarms(Subjects(photos=files.folder / "photos"))] == ["mixed sizes"]

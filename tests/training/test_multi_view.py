@@ -1,6 +1,7 @@
 """Photographs of a static scene correct each other's readings, and nothing is made up where they do not agree."""
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,16 +10,15 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.data.photographs import CameraPoses
-from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
-from curio_train.meshes.shapes import chair
-from curio_train.metrics.poses import symmetry_poses
+from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matrix, rotation_angle_deg
+from curio_train.meshes.meshes import Mesh
+from curio_train.meshes.shapes import chair, sphere
 from curio_train.refinement.multi_view import Estimates, consensus_poses, estimate_scale
 from curio_train.refinement.pseudo_labels import MIN_CONSENSUS, PseudoLabels
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, SceneCode
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.linemod import LinemodPhotographs
-from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation
@@ -30,10 +30,10 @@ NUM, FLIPPED = 16, (2, 7, 11)
 SCALE = 0.137  # metres a unit of the scene
 
 
-def thing() -> Object:
-    kind = ObjectKind("chair", (0,), MESH.diameter_m, MESH.box_corners_m, MESH.sha256)
+def thing(mesh: Mesh = MESH, axes: Sequence[tuple[np.ndarray, np.ndarray]] = ()) -> Object:
+    kind = ObjectKind("chair", (0,), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, symmetry_axes=axes)
     pool = np.full((2, 480, 640, 3), 128, np.uint8)
-    return Object(kind, MESH, Intrinsics(K, 640, 480), 0.5, 1.0, lambda _: ClutterBackgrounds(pool))
+    return Object(kind, mesh, Intrinsics(K, 640, 480), 0.5, 1.0, lambda _: ClutterBackgrounds(pool))
 
 
 @pytest.fixture(scope="module")
@@ -43,16 +43,24 @@ def world() -> TwoStageWorld:
 
 @pytest.fixture(scope="module")
 def truth(world: TwoStageWorld) -> SceneCode:
+    return scenes(world)
+
+
+@pytest.fixture(scope="module")
+def frames(world: TwoStageWorld, truth: SceneCode) -> Tensor:
+    return photographed(world, truth)
+
+
+def scenes(world: TwoStageWorld) -> SceneCode:
     code = world.sample(NUM, (1,))
     code[TRANSLATION][..., :2] *= 0.5
     code[LIGHT] = torch.tensor([[0.2, -0.5, -0.6]]).expand(NUM, 3)
     return code
 
 
-@pytest.fixture(scope="module")
-def frames(world: TwoStageWorld, truth: SceneCode) -> Tensor:
+def photographed(world: TwoStageWorld, code: SceneCode) -> Tensor:
     behind = world.backgrounds(Path()).draw(NUM, 640, 480, (2,))
-    return (world.render(truth, behind).clamp(0, 1) * 255).round().byte()
+    return (world.render(code, behind).clamp(0, 1) * 255).round().byte()
 
 
 def cameras(code: SceneCode, place_m: tuple[float, float, float] = (0.3, -0.2, 0.5)) -> np.ndarray:
@@ -79,9 +87,8 @@ def roughly(code: SceneCode, turned: tuple[int, ...] = FLIPPED) -> dict[str, Ten
 def agree(
     world: TwoStageWorld, frames: Tensor, matrices: np.ndarray, read: SceneCode
 ) -> tuple[dict[str, Tensor], Tensor]:
-    symmetries = symmetry_poses(world.object.kind.info, SYMMETRY_STEP)
-    estimates = Estimates(read, read, torch.ones(NUM, dtype=torch.bool))
-    return consensus_poses(RenderAndCompare.in_world(world), frames, CameraPoses(matrices), estimates, symmetries)
+    estimates, info = Estimates(read, read, torch.ones(NUM, dtype=torch.bool)), world.object.kind.info
+    return consensus_poses(RenderAndCompare.in_world(world), frames, CameraPoses(matrices), estimates, info)
 
 
 def errors(found: SceneCode, true: SceneCode) -> tuple[Tensor, Tensor]:
@@ -110,10 +117,10 @@ def test_metres_correct_what_an_object_is_read_too_far_by(
     read[TRANSLATION] = read[TRANSLATION] * 1.04
     of_any_scale, metres = cameras(truth), cameras(truth)
     metres[:, :3, 3] *= SCALE
-    estimates = Estimates(read, read, torch.ones(NUM, dtype=torch.bool))
+    estimates, info = Estimates(read, read, torch.ones(NUM, dtype=torch.bool)), world.object.kind.info
     off = []
     for where in (CameraPoses(of_any_scale), CameraPoses(metres, in_metres=True)):
-        code, chosen = consensus_poses(RenderAndCompare.in_world(world), frames, where, estimates, [Pose.identity()])
+        code, chosen = consensus_poses(RenderAndCompare.in_world(world), frames, where, estimates, info)
         assert chosen.sum() >= NUM - 4
         off.append((code[TRANSLATION][chosen, 0, 2] / truth[TRANSLATION][chosen, 0, 2]).log().median())
     assert off[0] == pytest.approx(np.log(1.04), abs=0.01)
@@ -150,6 +157,18 @@ def test_an_object_that_was_moved_has_a_pose_at_each_place(
     assert chosen[: NUM // 2].sum() >= NUM // 2 - 2
     assert chosen[NUM // 2 :].sum() >= NUM // 2 - 2
     assert degrees[chosen].max() < 7
+
+
+def test_a_ball_has_no_rotation_that_photographs_could_disagree_on() -> None:
+    """Nor one that a photograph's own reading could contradict, also where that reading is exact."""
+    ball = TwoStageWorld("linemod", thing(sphere(0.06), [(axis, np.zeros(3)) for axis in np.eye(3)[:2]]))
+    truth = scenes(ball)
+    frames, turns = photographed(ball, truth), Rotation.random(NUM, random_state=3).as_matrix()
+    turned = {ROTATION_6D: rotation_6d_from_matrix(torch.from_numpy(turns).float())[:, None]}
+    for read in (truth, roughly(truth, ())):
+        code, chosen = agree(ball, frames, cameras(truth), dict(read) | turned)
+        assert chosen.all()
+        assert errors(code, truth)[1].median() < 0.1 * ball.object.kind.diameter_m
 
 
 def test_readings_that_do_not_agree_teach_nothing(world: TwoStageWorld, truth: SceneCode, frames: Tensor) -> None:

@@ -1,6 +1,7 @@
 """The colour of an unpainted part: found in photographs over a background image, or not; and what is drawn about it."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,6 +99,8 @@ def prepare(options: CaptureOptions, folder: Path) -> tuple[WorldOptions, str]:
 
 def test_a_run_keeps_the_colour_that_was_found(folder: Path) -> None:
     options = take(folder, [SRGB["teal"]] * 8)
+    among = shutil.copy(folder / "plate.png", options.photos)  # and is none of them
+    options = replace(options, background=Path(among))
     kept, said = prepare(options, folder)
     assert isinstance(kept, CaptureOptions)
     assert kept.paint is not None

@@ -104,6 +104,22 @@ def test_folders(tmp_path: Path) -> None:
     assert [path.name for path in Photographs(tmp_path).paths] == ["a.JPG", "b.png"]
 
 
+def test_the_image_of_the_empty_scene_is_no_photograph(tmp_path: Path) -> None:
+    photos, empty = tmp_path / "photos", tmp_path / "photos" / "empty.png"
+    photos.mkdir()
+    save(empty, PIXELS)
+    with pytest.raises(DataError, match=r"found no images, not counting empty\.png, the empty scene"):
+        Photographs(photos, [empty])
+    save(photos / "a.png", PIXELS)
+    save(tmp_path / "a.png", PIXELS)
+    (tmp_path / "link").symlink_to(photos)
+    by_another_path = tmp_path / "link" / ".." / "photos" / "empty.png"
+    found = Photographs(photos, [tmp_path / "a.png", by_another_path])
+    assert [path.name for path in found.paths] == ["a.png"]
+    assert found.note == ", not counting empty.png, the empty scene"
+    assert Photographs(photos, [tmp_path / "a.png"]).note == ""
+
+
 @pytest.mark.parametrize("size", [(4, 4), (8, 6), (64, 16), (16, 64), (1, 1)])
 def test_crops(tmp_path: Path, size: tuple[int, int]) -> None:
     save(tmp_path / "a.png", PIXELS)

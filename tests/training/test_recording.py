@@ -78,6 +78,31 @@ def test_a_recording_holds_every_frame(tmp_path: Path, mesh: Path) -> None:
     assert curve == [(0, 0.9), (2, 0.7)]
 
 
+@pytest.mark.parametrize(
+    ("name", "encoding", "media_type", "is_own_file"),
+    [
+        ("a.png", ".png", "image/png", True),
+        ("a.JPG", ".jpg", "image/jpeg", True),
+        ("a.jpg", ".png", "image/png", True),
+        ("a.webp", ".webp", "image/jpeg", False),
+        ("a.bmp", ".bmp", "image/jpeg", False),
+    ],
+)
+def test_images_are_what_their_media_type_says(
+    tmp_path: Path, mesh: Path, name: str, encoding: str, media_type: str, is_own_file: bool
+) -> None:
+    """Whatever the file is called; Rerun shows JPEG and PNG alone."""
+    pixels = np.full((480, 640, 3), (40, 120, 200), np.uint8)
+    content = cv2.imencode(encoding, pixels)[1].tobytes()
+    (tmp_path / name).write_bytes(content)
+    (row,) = record([line(tmp_path / name)], mesh, tmp_path)["/camera/image"]
+    blob = bytes(row["EncodedImage:blob"][0])
+    assert row["EncodedImage:media_type"] == [media_type]
+    assert blob.startswith(b"\x89PNG" if media_type == "image/png" else b"\xff\xd8\xff")
+    assert (blob == content) == is_own_file
+    assert np.abs(cv2.imdecode(np.frombuffer(blob, np.uint8), cv2.IMREAD_COLOR).astype(int) - pixels).max() < 8
+
+
 def test_a_photograph_that_is_gone_is_named(tmp_path: Path, mesh: Path) -> None:
     with pytest.raises(DataError, match=r"gone\.png: the photograph cannot be read"):
         record([line(tmp_path / "gone.png")], mesh, tmp_path)

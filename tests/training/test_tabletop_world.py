@@ -60,7 +60,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     views = {}
     for side, azimuth in AZIMUTHS.items():
         grey = cv2.resize(random.integers(120, 150, (9, 12, 3), dtype=np.uint8), (WIDTH, HEIGHT))
-        cv2.imwrite(str(root / f"plate-{side}.png"), grey)
+        (root / side).mkdir()
+        cv2.imwrite(str(root / side / f"plate-{side}.png"), grey)  # among the photographs, as people keep it
         views[f"plate-{side}.png"] = {"cam_from_world": pose(azimuth).tolist()}
         plate = torch.from_numpy(cv2.cvtColor(grey, cv2.COLOR_BGR2RGB)).permute(2, 0, 1).float() / 255
         cam_from_world = Pose.from_matrix(torch.from_numpy(pose(azimuth)).float())
@@ -75,7 +76,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             light=(cam_from_world.rotation @ torch.tensor([0.0, 0.7, 0.0])).expand(NUM, 3),
             color=torch.tensor(RED).expand(NUM, 2, 3),
         )
-        (root / side).mkdir()
         for number, image in enumerate((images.permute(0, 2, 3, 1).numpy() * 255).round().astype(np.uint8)):
             cv2.imwrite(str(root / side / f"{number:02}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     (root / "views.json").write_text(json.dumps(views))
@@ -89,11 +89,11 @@ def options(folder: Path, **changes: object) -> CaptureOptions:
         "camera": folder / "camera.json",
         "photos": folder / "a",
         "mesh_unit": "mm",
-        "background": folder / "plate-a.png",
+        "background": folder / "a" / "plate-a.png",
         "plane": folder / "views.json",
         "counts": ("2",),
         "second": folder / "b",
-        "second_background": folder / "plate-b.png",
+        "second_background": folder / "b" / "plate-b.png",
     }
     return CaptureOptions(**{**usual, **changes})  # type: ignore[arg-type]
 
@@ -256,8 +256,7 @@ def test_a_model_answers_in_the_camera_frame_and_the_files(folder: Path, lying: 
 
 def test_a_camera_that_moves_has_a_plate_for_each_photograph(folder: Path, tmp_path: Path) -> None:
     views = json.loads((folder / "views.json").read_text())
-    views |= {str(folder / name): views[name] for name in ("plate-a.png", "plate-b.png")}
-    turned = {"plate": str(folder / "plate-b.png"), "cam_from_world": pose(90).tolist()}
+    turned = {"plate": str(folder / "b" / "plate-b.png"), "cam_from_world": pose(90).tolist()}
     (tmp_path / "views.json").write_text(json.dumps(views | {"03.png": turned}))
     moving = build(options(folder, plane=tmp_path / "views.json"))
     source = moving.source("train", 0, with_code=False, cache=tmp_path)
@@ -265,7 +264,7 @@ def test_a_camera_that_moves_has_a_plate_for_each_photograph(folder: Path, tmp_p
     assert batch.backgrounds is not None
     differing = (batch.backgrounds - batch.backgrounds[0]).abs().amax(dim=(1, 2, 3)) > 0.02
     assert differing.sum() in (1, NUM - 1)
-    higher = {"plate": str(folder / "plate-b.png"), "cam_from_world": pose(90, height=0.7).tolist()}
+    higher = {"plate": str(folder / "b" / "plate-b.png"), "cam_from_world": pose(90, height=0.7).tolist()}
     (tmp_path / "views.json").write_text(json.dumps(views | {"03.png": higher}))
     with pytest.raises(CameraError, match=r"03\.png was taken 0\.7 m above"):
         build(options(folder, plane=tmp_path / "views.json"))
@@ -298,12 +297,12 @@ def test_flags_that_contradict_each_other(folder: Path, changes: dict[str, objec
 
 
 def test_pictures_that_do_not_belong_together(folder: Path, tmp_path: Path) -> None:
-    small = cv2.resize(cv2.imread(str(folder / "plate-a.png")), (48, 36))
+    small = cv2.resize(cv2.imread(str(folder / "a" / "plate-a.png")), (48, 36))
     cv2.imwrite(str(tmp_path / "plate-b.png"), small)
     with pytest.raises(DataError, match="found 48x36 pixels"):
         build(options(folder, second_background=tmp_path / "plate-b.png"))
     (tmp_path / "other").mkdir()
-    cv2.imwrite(str(tmp_path / "other" / "x.png"), cv2.imread(str(folder / "plate-b.png")))
+    cv2.imwrite(str(tmp_path / "other" / "x.png"), cv2.imread(str(folder / "b" / "plate-b.png")))
     with pytest.raises(DataError, match="named like one in"):
         build(options(folder, second=tmp_path / "other"))
     assert not any("background" in doubt for doubt in refuse_unfit(options(folder)))
@@ -325,8 +324,8 @@ def test_from_files_to_a_model_by_a_project_file(folder: Path, tmp_path: Path, m
     monkeypatch.setattr("curio_train.worlds.image_sets.NUM_IMAGES", {"train": 4, "validation": 4, "test": 4})
     project = folder / "table.toml"
     project.write_text(
-        'mesh = ["wedge.stl"]\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "a"\nbackground = "plate-a.png"\n'
-        'plane = "views.json"\ncounts = [2]\nsecond = "b"\nsecond-background = "plate-b.png"\nmethod = "our"\n'
+        'mesh = ["wedge.stl"]\nmesh-unit = "mm"\ncamera = "camera.json"\nphotos = "a"\nbackground = "a/plate-a.png"\n'
+        'plane = "views.json"\ncounts = [2]\nsecond = "b"\nsecond-background = "b/plate-b.png"\nmethod = "our"\n'
         "batch-size = 4\nmicro-batch-size = 4\n"
     )
     run = tmp_path / "run"

@@ -12,6 +12,7 @@ import torch
 import trimesh
 from curio_train.commands import render as render_command
 from curio_train.drawing.scenes import mesh_world
+from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT = 64, 48
 MATRIX = [[70.0, 0.0, 30.0], [0.0, 66.0, 25.0], [0.0, 0.0, 1.0]]
@@ -114,6 +115,26 @@ def test_objects_lie_over_their_photograph(capsys, egg: Path, tmp_path: Path) ->
         assert np.abs(image[20:30, 30:36] - content[20:30, 30:36, ::-1]).mean() > 20
 
 
+def test_poses_of_a_rig_are_drawn_as_its_first_camera_sees_them(capsys, egg: Path, tmp_path: Path) -> None:
+    """The same object in the frame of the camera and in that of a rig, which lies elsewhere, is the same picture."""
+    turn = Rotation.from_euler("xyz", [160, 35, 10], degrees=True).as_matrix()
+    cam_from_rig = np.eye(4)
+    cam_from_rig[:3, :3], cam_from_rig[:3, 3] = turn, [0.3, -0.2, 0.5]
+    line = detection_line(views=["frames/one.jpg", "other/one.jpg"], cam_from_rig=cam_from_rig.tolist())
+    line["detections"][0] |= {
+        "translation_m": (turn.T @ (PLACE - cam_from_rig[:3, 3])).tolist(),
+        "rotation": turn.T.tolist(),
+    }
+    seen = []
+    for name, content in (("camera", detection_line()), ("rig", line)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+        status, out, err = run(capsys, tmp_path / f"{name}.json", "--mesh", egg, "--out", tmp_path / name)
+        assert status == 0, err
+        seen.append(pixels(Path(out.strip())))
+    assert (seen[0].sum(-1) > 0.1).sum() > 50
+    assert seen[1] == pytest.approx(seen[0], abs=2 / 255)
+
+
 def test_the_camera_is_carried_round_the_middles_of_objects(capsys, egg: Path, tmp_path: Path) -> None:
     """A mesh whose origin is far from its middle, placed at the same spot, is seen the same from the side."""
     away = np.array([0.3, -0.1, 0.2])
@@ -160,6 +181,8 @@ def test_codes_look_as_in_their_world(capsys, tmp_path: Path, name: str) -> None
         (detection_line(detections=[{"object": "egg"}]), [], 1, "line 1: not a scene"),
         (detection_line(light=[0, 1]), [], 1, "light is .* expected finite numbers of shape"),
         (detection_line(camera_matrix=None), [], 1, "it is flat"),
+        (detection_line(views=["a.jpg", "b.jpg"]), [], 1, "line 1: its poses are in the frame of a rig"),
+        (detection_line(cam_from_rig=[1, 0]), [], 1, "cam_from_rig is .* expected finite numbers of shape"),
         (detection_line(camera_matrix=[[1, 2], [3, 4]]), [], 1, "camera_matrix"),
         (detection_line(), ["--over-photograph"], 1, "one.jpg: the photograph cannot be read"),
         (detection_line(), ["--over-photograph", "--turn-deg", "5"], 2, "exclude each other"),

@@ -77,6 +77,7 @@ class RigEstimator:
             1e3 * (decoded - begun),
             1e3 * (time.perf_counter() - decoded),
             views=names,
+            cam_from_rig=views[0].cam_from_rig.ravel().tolist(),
             distortion=views[0].camera.distortion,
         )
 

@@ -135,6 +135,27 @@ def camera_of_info(content: Mapping[str, Any], name: str) -> PinholeCamera:
     return PinholeCamera(_matrix(content[name]), _distortion(distortion), size)
 
 
+def camera_of_images(info: Any, topic: str) -> PinholeCamera:
+    """The camera of the images of a ROS 2 topic.
+
+    K and D of a CameraInfo message are of raw images. Rectified ones, whose topics are called ``image_rect…``, have the
+    left three columns of P as their K, and no distortion.
+
+    Args:
+        info: The ``sensor_msgs/msg/CameraInfo`` of an image.
+        topic: Name of the images' topic; that of compressed images ends in ``/compressed``.
+
+    Raises:
+        CameraError: It has the lenses of another model than plumb_bob or rational_polynomial, or is not calibrated.
+    """
+    content: dict[str, Any] = {"width": info.width, "height": info.height}
+    if "rect" in topic.removesuffix("/compressed").rpartition("/")[2]:
+        content["k"] = [info.p[i] for i in (0, 1, 2, 4, 5, 6, 8, 9, 10)]
+    else:
+        content |= {"k": list(info.k), "d": list(info.d), "distortion_model": info.distortion_model}
+    return camera_of_info(content, "k")
+
+
 def _refuse_other_lens(model: object, distortion: Iterable[float]) -> None:
     if model not in _ROS_MODELS and any(distortion):
         raise CameraError(f"distortion_model is {model!r}; expected one of {', '.join(filter(None, _ROS_MODELS))}")

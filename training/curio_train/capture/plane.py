@@ -105,6 +105,12 @@ class CameraPoseFile:
         name = self._entry(photograph).get("plate")
         return None if name is None else self.file.parent / str(name)
 
+    @property
+    def background_images(self) -> list[Path]:
+        """All images of the empty scene that photographs name as their own."""
+        names = (entry.get("plate") for entry in self.entries.values())
+        return [self.file.parent / str(name) for name in names if name is not None]
+
     def check_same_viewpoint(self, photograph: Path, background: Path) -> None:
         """Refuse a photograph taken from another height or tilt than the background image; the azimuth may differ.
 

@@ -52,13 +52,13 @@ def find_color(photos: Path, background_image: Path, camera: Intrinsics) -> Foun
 
     Args:
         photos: Folder; up to 64 photographs spread over it are read.
-        background_image: The empty scene.
+        background_image: The empty scene; it may lie among them.
         camera: That took both.
 
     Raises:
         DataError: One cannot be read, or is not of the camera's size.
     """
-    paths = Photographs(photos).paths
+    paths = Photographs(photos, (background_image,)).paths
     chosen = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, _MOST_COMPARED).astype(int))]
     height = max(1, round(_WIDTH_PX * camera.height / camera.width))
     empty = cv2.resize(read_frame(background_image, camera), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)

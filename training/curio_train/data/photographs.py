@@ -5,6 +5,7 @@ Damaged files are refused here, with their name, instead of entering training as
 
 import copy
 import functools
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -156,15 +157,22 @@ def _read_shrunk(path: Path) -> np.ndarray:
     return cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
-def image_files(folder: Path) -> list[Path]:
-    """The images in a folder, by name; hidden files and sub-folders are passed over.
+def image_files(folder: Path, without: Sequence[Path] = ()) -> tuple[list[Path], list[Path]]:
+    """The images in a folder, and those left out, by name; hidden files and sub-folders are passed over.
+
+    Args:
+        folder: Where they lie.
+        without: Files that are no photographs even where they lie there, such as the image of the empty scene.
 
     Raises:
         OSError: It cannot be listed.
     """
     # macOS leaves a file ._IMG.jpg beside each IMG.jpg, which is no image.
     visible = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return sorted(path for path in visible if path.suffix.lower() in SUFFIXES)
+    found = sorted(path for path in visible if path.suffix.lower() in SUFFIXES)
+    others = {os.path.realpath(path) for path in without}
+    left_out = [path for path in found if os.path.realpath(path) in others]
+    return [path for path in found if path not in left_out], left_out
 
 
 class Photographs:
@@ -172,20 +180,24 @@ class Photographs:
 
     Args:
         folder: Where they lie.
+        without: Images of the empty scene, which are no photographs even where they lie there.
 
     Raises:
-        DataError: There is no such folder, it cannot be listed, or it has no image in it.
+        DataError: There is no such folder, it cannot be listed, or it has no photograph in it.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, without: Sequence[Path] = ()) -> None:
         try:
-            self.paths = image_files(folder)
+            self.paths, left_out = image_files(folder, without)
         except (FileNotFoundError, NotADirectoryError, ValueError) as exc:  # the last: a null byte in its name
             raise DataError(f"{folder}: there is no such folder; expected one with photographs") from exc
         except OSError as exc:
             raise DataError(f"{folder}: cannot be listed ({exc.strerror}); expected a folder of photographs") from exc
+        names = " and ".join(path.name for path in left_out)
+        self.note = f", not counting {names}, the empty scene" if left_out else ""
+        """For texts that say how many there are: what was left out."""
         if not self.paths:
-            raise DataError(f"{folder}: found no images, expected files ending in {' '.join(SUFFIXES)}")
+            raise DataError(f"{folder}: found no images{self.note}, expected files ending in {' '.join(SUFFIXES)}")
         # Decoding costs more than rendering the object in front: a few hundred photographs stay in memory, shrunk.
         self._read = functools.lru_cache(maxsize=300)(_read_shrunk)
 

@@ -1,6 +1,5 @@
 """Chooses photographs among the frames of a camera: sharp, well exposed, unlike those already kept."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,14 +56,13 @@ class Assistant:
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            there = image_files(folder)
+            there, _ = image_files(folder, () if background is None else (background,))
         except OSError as exc:
             raise DataError(f"--out {folder}: cannot be made or read: {exc.strerror}") from exc
         self._folder, self._board, self._background = folder, board, background
         self._first: tuple[str, int, int] | None = None
         self._empty: torch.Tensor | None = None
         if background is not None:
-            there = [path for path in there if os.path.realpath(path) != os.path.realpath(background)]
             self._look_at_background(background)
         self._kept = [thumbnail(self._read(path)) for path in there]
         self.num_kept = len(self._kept)

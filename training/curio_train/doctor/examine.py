@@ -65,7 +65,7 @@ def examine_files(subjects: Subjects) -> Iterator[Finding]:
         camera, findings = examine_camera(subjects.camera)
         yield from findings
     if subjects.photos is not None:
-        photographs, findings = examine_photographs(subjects.photos, camera)
+        photographs, findings = examine_photographs(subjects.photos, camera, subjects.background)
         yield from findings
     else:
         photographs = []

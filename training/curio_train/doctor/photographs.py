@@ -19,24 +19,27 @@ _SAME_FOCAL = 0.15  # focal lengths in EXIF are nominal, and rounded to whole mi
 _FULL_FRAME_WIDTH_MM = 36.0
 
 
-def examine_photographs(folder: Path, camera: Intrinsics | None) -> tuple[list[Photograph], list[Finding]]:
+def examine_photographs(
+    folder: Path, camera: Intrinsics | None, background: Path | None = None
+) -> tuple[list[Photograph], list[Finding]]:
     """The readable photographs, and what was found about them.
 
     Args:
         folder: Where they lie.
         camera: What they were taken with, where known.
+        background: The image of the empty scene, which may lie among them.
     """
     try:
-        paths = Photographs(folder).paths
+        there = Photographs(folder, () if background is None else (background,))
     except CurioError as exc:
         return [], [Finding("photographs", "bad", str(exc), fault="photographs unreadable")]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0)), "measure") as threads:
-        measured = list(threads.map(_measured, paths))
+        measured = list(threads.map(_measured, there.paths))
     photographs = [found for found in measured if isinstance(found, Photograph)]
     broken = [found for found in measured if isinstance(found, str)]
-    findings = [*_unreadable(broken, len(paths))]
+    findings = [*_unreadable(broken, len(there))]
     if photographs:
-        findings += [_sizes(folder, photographs), *_count(photographs), *_turned(photographs)]
+        findings += [_sizes(folder, photographs, there.note), *_count(photographs, there.note), *_turned(photographs)]
         findings += [*_other_camera(photographs, camera), *examine_content(photographs)]
     return photographs, findings
 
@@ -61,22 +64,22 @@ def _unreadable(broken: list[str], count: int) -> Iterator[Finding]:
         yield Finding("photographs", "bad", text, "Copy them again or remove them", fault="photographs unreadable")
 
 
-def _sizes(folder: Path, photographs: Sequence[Photograph]) -> Finding:
+def _sizes(folder: Path, photographs: Sequence[Photograph], note: str) -> Finding:
     sizes = Counter((photo.width, photo.height) for photo in photographs)
     found = ", ".join(f"{count} of {width}x{height}" for (width, height), count in sizes.most_common(3))
     if len(sizes) == 1:
-        return Finding("photographs", "good", f"{folder}: {found}")
-    text = f"{folder}: they differ in size: {found}"
+        return Finding("photographs", "good", f"{folder}: {found}{note}")
+    text = f"{folder}: they differ in size: {found}{note}"
     remedy = "One camera file is for one size: keep the photographs of one camera and orientation"
     return Finding("photograph sizes", "bad", text, remedy, fault="mixed sizes")
 
 
-def _count(photographs: Sequence[Photograph]) -> Iterator[Finding]:
+def _count(photographs: Sequence[Photograph], note: str) -> Iterator[Finding]:
     count = len(photographs)
     if count < FEWEST_TO_LEARN_FROM:
         text = (
-            f"only {count}; below {FEWEST_TO_LEARN_FROM} a part's model does not learn from them (self-training is "
-            "off), they only judge it"
+            f"only {count}{note}; below {FEWEST_TO_LEARN_FROM} a part's model does not learn from them "
+            "(self-training is off), they only judge it"
         )
         remedy = f"Take {FEWEST_TO_LEARN_FROM} or more, from all sides and in the light of later use"
         yield Finding("photograph count", "warning", text, remedy, fault=TOO_FEW)

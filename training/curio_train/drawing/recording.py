@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import rerun
+from curio_serve.imaging.png import MAGIC
 from scipy.spatial.transform import Rotation
 
 from curio_train.drawing.photograph import is_stored_as_drawn, photograph_of
@@ -16,6 +17,8 @@ from curio_train.errors import DataError
 
 TIMELINE = "image"
 """Scenes are numbered along it, beginning with 0."""
+
+_MEDIA_TYPES = {b"\xff\xd8\xff": "image/jpeg", MAGIC: "image/png"}  # of files that begin so: all that Rerun decodes
 
 
 def write_recording(path: Path, scenes: Iterable[tuple[Scene, SceneContext]]) -> None:
@@ -48,18 +51,16 @@ def _log_camera(recording: rerun.RecordingStream, scene: Scene) -> None:
 
 
 def _image(scene: Scene, photograph: Path) -> Any:
-    """The photograph's own file where that shows what a pinhole camera sees; else what it sees, as JPEG."""
-    if not is_stored_as_drawn(scene):
-        return rerun.Image(photograph_of(scene)).compress()
-    try:
-        content = photograph.read_bytes()
-    except OSError as exc:
-        raise DataError(f"{photograph}: the photograph cannot be read ({exc.strerror})") from exc
-    return rerun.EncodedImage(contents=content, media_type=_media_type(photograph))
-
-
-def _media_type(path: Path) -> str:
-    return "image/png" if path.suffix.lower() == ".png" else "image/jpeg"
+    """The photograph's own file where Rerun can show it and it shows what a pinhole camera sees; else that, as JPEG."""
+    if is_stored_as_drawn(scene):
+        try:
+            content = photograph.read_bytes()
+        except OSError as exc:
+            raise DataError(f"{photograph}: the photograph cannot be read ({exc.strerror})") from exc
+        for beginning, media_type in _MEDIA_TYPES.items():
+            if content.startswith(beginning):
+                return rerun.EncodedImage(contents=content, media_type=media_type)
+    return rerun.Image(photograph_of(scene)).compress()
 
 
 def _log_objects(recording: rerun.RecordingStream, scene: Scene, context: SceneContext) -> None:

@@ -142,13 +142,13 @@ def _from_detections(record: Mapping[str, Any], number: int, path: Path) -> Scen
     if record["camera_matrix"] is None:
         raise DataError(f"{where}: it has no camera_matrix, so it is flat; expected poses in three dimensions")
     width, height = int(record["width"]), int(record["height"])
-    light, world = record.get("light"), record.get("world")
+    light, world, cam_from_rig = record.get("light"), record.get("world"), _cam_from_rig(record, where)
     return Scene(
         f"{number:06d}-{Path(record['image']).stem}",
         width,
         height,
         check_matrix(record["camera_matrix"], width, height, f"{where}, camera_matrix"),
-        tuple(_placed(detection) for detection in record["detections"]),
+        tuple(_placed(detection, cam_from_rig) for detection in record["detections"]),
         None if light is None else _numbers(light, (3,), "light"),
         located(Path(record["image"]), path.parent) if world is None else None,
         None if world is None else mesh_world(str(world)).name,
@@ -157,11 +157,28 @@ def _from_detections(record: Mapping[str, Any], number: int, path: Path) -> Scen
     )
 
 
-def _placed(detection: Mapping[str, Any]) -> Placed:
+def _cam_from_rig(record: Mapping[str, Any], where: str) -> Pose:
+    """The pose of the camera that took the image, where detections are in the frame of a rig; else the identity.
+
+    Raises:
+        DataError: The line is of a rig and does not say the pose.
+    """
+    if "cam_from_rig" in record:
+        return Pose.from_matrix(_numbers(record["cam_from_rig"], (4, 4), "cam_from_rig"))
+    if "views" in record:
+        raise DataError(
+            f"{where}: its poses are in the frame of a rig, and it has no cam_from_rig of the image's camera; run "
+            "curio-detect --rig again, which writes it"
+        )
+    return Pose.identity()
+
+
+def _placed(detection: Mapping[str, Any], cam_from_rig: Pose) -> Placed:
     rotation, color = detection["rotation"], detection["color"]
     return Placed(
         str(detection["object"]),
-        Pose(
+        cam_from_rig
+        @ Pose(
             np.eye(3) if rotation is None else _numbers(rotation, (3, 3), "rotation"),
             _numbers(detection["translation_m"], (3,), "translation_m"),
         ),

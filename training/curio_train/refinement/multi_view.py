@@ -11,7 +11,6 @@ The predictions of one object err in depth all to one side, by some per cent, an
 one scene err independently (decision 68). Therefore camera poses may also be given in metres.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,10 +20,13 @@ from curio_serve.consensus.poses import Consensus, Predictions, angles_deg, cons
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from curio_train.data.bop import ModelInfo
 from curio_train.data.photographs import CameraPoses
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
+from curio_train.metrics.poses import symmetry_poses
 from curio_train.refinement.render_and_compare import MIN_INLIER_RATIO, RenderAndCompare
 from curio_train.scene_code import ROTATION_6D, TRANSLATION, SceneCode, index
+from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
 
 _MIN_PHOTOGRAPHS = 3  # in a consensus
 _MIN_PREDICTIONS = 4  # in a consensus; a photograph has up to two, predicted and refined
@@ -73,7 +75,7 @@ def consensus_poses(
     frames: Tensor,
     cameras: CameraPoses,
     estimates: Estimates,
-    symmetries: Sequence[Pose[np.ndarray]],
+    info: ModelInfo,
 ) -> tuple[dict[str, Tensor], Bool[Tensor, " num"]]:
     """Poses on which photographs agree.
 
@@ -82,16 +84,15 @@ def consensus_poses(
         frames: uint8 sRGB [num, 3, height, width].
         cameras: Their camera poses.
         estimates: The poses in each.
-        symmetries: Of the object.
+        info: Diameter and symmetries of the object.
 
     Returns:
         The predicted code with consensus positions and rotations, and which photographs show the object so.
     """
     known, accepted = cameras.known, estimates.accepted
     sources = _predictions(estimates.predicted, known), _predictions(estimates.refined, known & accepted.numpy())
-    symmetry_rotations = np.stack([pose.rotation for pose in symmetries])
     scales = [
-        estimate_scale(cameras, code, accepted, refiner.diameter_m) for code in (estimates.predicted, estimates.refined)
+        estimate_scale(cameras, code, accepted, info.diameter_m) for code in (estimates.predicted, estimates.refined)
     ]
     found = [scale for scale in scales if scale is not None]
     if not found:
@@ -107,11 +108,9 @@ def consensus_poses(
     cam_from_world = _known_or_identity(cameras)
     scene = _StaticScene(Pose(cam_from_world.rotation, scale * cam_from_world.translation_m), known)
     predictions = _Predictions(frame, Pose(rotation, translation_m))
-    agreed = consensus_in_scene(
-        scene.cam_from_world, predictions.frame, predictions.cam_from_obj, refiner.diameter_m, symmetry_rotations
-    )
+    agreed = consensus_in_scene(scene.cam_from_world, predictions.frame, predictions.cam_from_obj, info)
     poses = [Pose(one.rotation, one.translation_m) for one in agreed]
-    return _verified(refiner, frames, scene, poses, estimates, symmetry_rotations)
+    return _verified(refiner, frames, scene, poses, estimates, info)
 
 
 def estimate_scale(
@@ -174,33 +173,40 @@ def consensus_in_scene(
     cam_from_world: Pose[np.ndarray],
     frame: Int[np.ndarray, " n"],
     cam_from_obj: Pose[np.ndarray],
-    diameter_m: float,
-    symmetries: np.ndarray,
+    info: ModelInfo,
     *,
     in_depth: float = _IN_DEPTH,
     moved: float = _MOVED,
 ) -> list[Consensus]:
     """Poses world_from_obj on which predictions of several photographs agree, those of most predictions first.
 
+    Predictions of an object that turns any way need to agree on its position alone; its axes are then the scene's.
+
     Args:
         cam_from_world: Of the photographs, metres.
         frame: Number of the photograph that each prediction is of.
         cam_from_obj: The predictions, [n, …].
-        diameter_m: Of the object.
-        symmetries: Rotations [m, 3, 3] of the object onto itself.
+        info: Diameter and symmetries of the object.
         in_depth: Standard deviation of distances, relative.
         moved: Standard deviation of movements in the scene, diameters.
     """
     world_from_cam = _rows(cam_from_world, frame).inverse()
     poses = world_from_cam @ cam_from_obj
+    rotation = np.tile(np.eye(3), (len(frame), 1, 1)) if info.turns_any_way else poses.rotation
     rays_m = _rotated(world_from_cam.rotation, cam_from_obj.translation_m)
-    covariance = position_covariance_m2(rays_m, _ACROSS * diameter_m, in_depth) + np.eye(3) * (moved * diameter_m) ** 2
+    across_m, moved_m = _ACROSS * info.diameter_m, moved * info.diameter_m
+    covariance = position_covariance_m2(rays_m, across_m, in_depth) + np.eye(3) * moved_m**2
     return consensus(
-        Predictions(frame, poses.rotation, poses.translation_m, covariance),
-        symmetries,
+        Predictions(frame, rotation, poses.translation_m, covariance),
+        _symmetries(info),
         min_predictions=_MIN_PREDICTIONS,
         min_views=_MIN_PHOTOGRAPHS,
     )
+
+
+def _symmetries(info: ModelInfo) -> np.ndarray:
+    """Rotations [n, 3, 3] of the object onto itself."""
+    return np.stack([pose.rotation for pose in symmetry_poses(info, SYMMETRY_STEP)])
 
 
 def _verified(
@@ -209,13 +215,14 @@ def _verified(
     scene: _StaticScene,
     poses: list[Pose[np.ndarray]],
     estimates: Estimates,
-    symmetries: np.ndarray,
+    info: ModelInfo,
 ) -> tuple[dict[str, Tensor], Bool[Tensor, " num"]]:
     """The consensus pose with the most inliers in each photograph, unless the photograph's own estimate contradicts it.
 
     If the own estimate has inliers, a consensus pose must be near its position and have nearly as many; if its rotation
-    differs, more.
+    differs, more. Rotations of an object that turns any way never differ.
     """
+    symmetries = _symmetries(info)
     own_ratio = refiner.inlier_ratio(frames, estimates.refined).numpy()
     own = _predictions(estimates.refined, np.ones(len(frames), dtype=bool)).cam_from_obj
     best, code = np.zeros(len(frames)), {name: value.clone() for name, value in estimates.predicted.items()}
@@ -223,9 +230,10 @@ def _verified(
         cam_from_obj = scene.cam_from_world @ pose
         position_m = cam_from_obj.translation_m
         rotated = angles_deg(cam_from_obj.rotation, own.rotation, symmetries)[0] > 2 * _MAX_ANGLE_DEG
+        rotated &= not info.turns_any_way
         own_at_depth = own.translation_m[:, :2] * (position_m[:, 2:] / own.translation_m[:, 2:])
         offset_m = np.linalg.norm(position_m[:, :2] - own_at_depth, axis=1)
-        elsewhere = (own_ratio > _CREDIBLE) & (offset_m > _CONTRADICTION * refiner.diameter_m)
+        elsewhere = (own_ratio > _CREDIBLE) & (offset_m > _CONTRADICTION * info.diameter_m)
         required = np.maximum(MIN_INLIER_RATIO, np.where(rotated, own_ratio, own_ratio - _TOLERANCE))
         candidates = torch.from_numpy(np.flatnonzero(scene.known & refiner.in_view(position_m) & ~elsewhere))
         if len(candidates) == 0:

@@ -19,14 +19,12 @@ from torch import Tensor
 
 from curio_train.data.photographs import CameraPoses, read_frames
 from curio_train.geometry import matrix_from_rotation_6d
-from curio_train.metrics.poses import symmetry_poses
 from curio_train.networks.crop_camera import cut_crops
 from curio_train.refinement.multi_view import Estimates, consensus_poses
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.refinement.turned_frames import random_rolls
 from curio_train.scene_code import LIGHT, ROTATION_6D, TRANSLATION, SceneCode, index, joined
 from curio_train.worlds.base import World
-from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
 from curio_train.worlds.single_object.crop_pose_stage import CROP_PX, FILL
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
@@ -78,8 +76,7 @@ class PseudoLabels:
         refiner = RenderAndCompare.in_world(world)
         estimates = predict_and_refine(refiner, frames, predict)
         if cameras is not None:
-            symmetries = symmetry_poses(world.object.kind.info, SYMMETRY_STEP)
-            code, found = consensus_poses(refiner, frames, cameras, estimates, symmetries)
+            code, found = consensus_poses(refiner, frames, cameras, estimates, world.object.kind.info)
             if found.sum() >= MIN_CONSENSUS:
                 return cls(world, frames[found], index(code, found))
         twice, accepted_again = refined_poses(refiner, frames, estimates.refined)

@@ -18,11 +18,9 @@ from scipy.stats import trim_mean
 
 from curio_train.data.photographs import CameraPoses
 from curio_train.geometry import Pose, matrix_from_rotation_6d
-from curio_train.metrics.poses import symmetry_poses
 from curio_train.refinement.multi_view import consensus_in_scene, estimate_scale
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, SceneCode, of_slot
 from curio_train.worlds.base import ObjectKind
-from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
 
 _LEAST_CONFIDENCE = 0.1  # of reads that count
 _IN_DEPTH, _MOVED = 0.03, 0.02  # standard deviations: of distances, relative, and of what lies still, diameters
@@ -80,18 +78,9 @@ def _of_object(
     """Its poses in the photographs."""
     photograph = reads.photograph[chosen]
     rotation = matrix_from_rotation_6d(reads.code[ROTATION_6D][:, slot]).double().numpy()[chosen]
-    if kind.info.turns_any_way:  # then every rotation is right, and one that stays in the scene agrees with itself
-        rotation = cam_from_world.rotation[photograph]
     position_m = correction * reads.code[TRANSLATION][:, slot].double().numpy()[chosen]
-    symmetries = np.stack([pose.rotation for pose in symmetry_poses(kind.info, SYMMETRY_STEP)])
     found = consensus_in_scene(
-        cam_from_world,
-        photograph,
-        Pose(rotation, position_m),
-        kind.diameter_m,
-        symmetries,
-        in_depth=_IN_DEPTH,
-        moved=_MOVED,
+        cam_from_world, photograph, Pose(rotation, position_m), kind.info, in_depth=_IN_DEPTH, moved=_MOVED
     )
     number = _where(found, photograph, len(cam_from_world.rotation))
     there = Pose(np.full((len(number), 3, 3), np.nan), np.full((len(number), 3), np.nan))

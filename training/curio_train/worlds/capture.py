@@ -67,12 +67,12 @@ class CapturePhotographs:
         self._folder, self._background, self._intrinsics, self._camera = folder, background, intrinsics, camera
 
     def paths(self) -> Sequence[Path]:
-        """Files of all photographs.
+        """Files of all photographs; the one of the empty scene is none of them.
 
         Raises:
             DataError: The folder cannot be read.
         """
-        return Photographs(self._folder).paths
+        return Photographs(self._folder, () if self._background is None else (self._background,)).paths
 
     def judged(self, count: int) -> tuple[list[Path], Tensor]:
         """At most ``count`` of those that the model never learns from: files, and [num, 3, height, width] in [0, 1].

@@ -140,7 +140,7 @@ class CaptureOptions(WorldOptions):
 
     With --calibrate: find out its camera instead. With --assistant: take its photographs with a camera on this machine.
 
-    With --plane: one or more parts on a table or floor, learned from the photographs.
+    With --plane: parts of one or more kinds, in any number, on a table or floor.
     """
 
     default_method: ClassVar[MethodName] = "sleep"
@@ -153,8 +153,9 @@ class CaptureOptions(WorldOptions):
     """Camera file of the photographs: camera JSON, or BOP's camera.json."""
     photos: Path
     """Folder of unlabelled photographs. They are checked against the camera, show the part's colour, and the report
-    draws the estimated poses over them. Towards the end of training the network learns from them, with the poses that
-    it estimates there itself (--self-training); with --plane from the beginning."""
+    draws the estimated poses over them. Towards the end of training the network of one part learns from them, with the
+    poses that it estimates there itself (--self-training). With --plane, the default method (sleep) takes from them
+    where parts lie, and --method our, noncur, wake_sleep or wake_sleep_critic learns from them from the beginning."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
     """Unit of the mesh file's coordinates; the file's own, or metres, unless given."""
     body: str | None = None

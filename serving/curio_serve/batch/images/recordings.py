@@ -17,7 +17,7 @@ from curio_serve.batch.images.source_image import RecordedAt, SourceImage, Topic
 from curio_serve.errors import CameraError, ImageError, UsageError
 from curio_serve.files import check_regular
 from curio_serve.imaging.camera import PinholeCamera
-from curio_serve.imaging.camera_files import camera_of_info
+from curio_serve.imaging.camera_files import camera_of_images
 from curio_serve.imaging.image import RawFormat, from_raw
 
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -214,13 +214,8 @@ def _stamp_ns(message: Any) -> int:
 
 
 def _camera(info: Any, image_topic: str) -> PinholeCamera | str:
-    """K as camera files with such a message have it; of a rectified image that of P. Text: what is wrong with it."""
-    content = {"width": info.width, "height": info.height, "k": list(info.k)}
-    if "rect" in image_topic.removesuffix("/compressed").rpartition("/")[2]:
-        content["k"] = [info.p[i] for i in (0, 1, 2, 4, 5, 6, 8, 9, 10)]
-    else:
-        content |= {"d": list(info.d), "distortion_model": info.distortion_model}
+    """The camera of the topic's images, or what is wrong with it."""
     try:
-        return camera_of_info(content, "k")
+        return camera_of_images(info, image_topic)
     except CameraError as exc:
         return f"CameraInfo: {exc}"

@@ -50,6 +50,8 @@ class ImageResult:
     """For an image of a robot's recording."""
     views: Sequence[str] = ()
     """Images of all cameras of a rig; poses are then in the rig's frame."""
+    cam_from_rig: Sequence[float] = ()
+    """Of a rig's first camera, which ``image`` is of: 16 values row-major, metres; empty without a rig."""
     distortion: Sequence[float] = ()
     """OpenCV's coefficients that were used with K; empty if none were."""
     exif_rotation: bool = False
@@ -131,8 +133,8 @@ class ResultFormat(ABC):
 class JsonLines(ResultFormat):
     """One JSON object an image, always with the same keys; ``error`` stands in place of ``detections``.
 
-    What does not apply (the rotation of a flat object, the size of what is no image) is null. ``views``, ``distortion``
-    and ``exif_rotation`` are there only where they apply.
+    What does not apply (the rotation of a flat object, the size of what is no image) is null. ``views``,
+    ``cam_from_rig``, ``distortion`` and ``exif_rotation`` are there only where they apply.
     """
 
     opening = b'{"image": '
@@ -146,6 +148,7 @@ class JsonLines(ResultFormat):
             "width": result.width,
             "height": result.height,
             "camera_matrix": rows(result.camera_matrix, 3) or None,
+            **({"cam_from_rig": rows(result.cam_from_rig, 4)} if result.cam_from_rig else {}),
             **({"distortion": list(result.distortion)} if any(result.distortion) else {}),
             **({"exif_rotation": True} if result.exif_rotation else {}),
             **({"error": result.error} if result.error else answer),

@@ -124,7 +124,9 @@ def _photographs(
     setup: SceneSetup,
     highest_m: float,
 ) -> TabletopPhotographs:
-    paths = Photographs(options.photos).paths
+    of_second = () if options.second_background is None else (options.second_background,)
+    empty = (background, *of_second, *cameras.background_images)  # may lie among the photographs
+    paths = Photographs(options.photos, empty).paths
     for path in paths:
         cameras.check_same_viewpoint(path, background)
     own_backgrounds = [cameras.background_image(path) or background for path in paths]
@@ -133,10 +135,10 @@ def _photographs(
     backgrounds = torch.stack([images[path] for path in own_backgrounds])
     occupied = changed_pixels(list(training.numpy()), list(backgrounds.numpy()))
     position = _position_field(setup.camera, cameras.pose_above_plane(background), occupied, highest_m)
-    judged = Photographs(options.held_out).paths if options.held_out is not None else paths
+    judged = Photographs(options.held_out, empty).paths if options.held_out is not None else paths
     second = second_pose = None
     if options.second is not None and options.second_background is not None:
-        judged, others = _pairs(options.second, judged)
+        judged, others = _pairs(options.second, judged, empty)
         second = PhotographSet(_frames(others, intrinsics), _frames([options.second_background], intrinsics)[0])
         second_pose = Pose.from_matrix(cameras.pose_above_plane(options.second_background))
     own = PhotographSet(_frames(judged, intrinsics), images[background], [path.name for path in judged])
@@ -144,9 +146,9 @@ def _photographs(
     return TabletopPhotographs(training, backgrounds if differ else None, own, second, second_pose, occupied, position)
 
 
-def _pairs(folder: Path, paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+def _pairs(folder: Path, paths: Sequence[Path], empty: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """The photographs that have a namesake in the second camera's folder, and those namesakes."""
-    others = {path.name: path for path in Photographs(folder).paths}
+    others = {path.name: path for path in Photographs(folder, empty).paths}
     own = [path for path in paths if path.name in others]
     if not own:
         raise DataError(
