@@ -1,6 +1,7 @@
 """All that changes while a run learns: what a checkpoint holds."""
 
 from dataclasses import astuple, dataclass, replace
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -24,11 +25,9 @@ class Learner(Generic[N]):
 
     network: N
     """What learns."""
-    optimizer: Optimizer
-    """Adam, as in the paper, or Muon."""
 
     def __init__(self, network: N, learning_rate: float, matrix_learning_rate: float = 0.0) -> None:
-        """Set up the optimiser.
+        """Keep what the optimiser will need.
 
         Args:
             network: What is to learn.
@@ -36,11 +35,24 @@ class Learner(Generic[N]):
             matrix_learning_rate: Muon's, for matrices and convolutions; 0: Adam moves them, too.
         """
         self.network = network
-        if matrix_learning_rate:
-            self.optimizer = Muon(network.parameters(), matrix_learning_rate, learning_rate)
+        self._learning_rate, self._matrix_learning_rate = learning_rate, matrix_learning_rate
+
+    @cached_property
+    def optimizer(self) -> Optimizer:
+        """Adam, as in the paper, or Muon.
+
+        It is made when something learns: torch's first optimiser imports its compiler, which takes 2 to 3 seconds that
+        export and evaluation need not wait.
+        """
+        parameters = self.network.parameters()
+        optimizer: Optimizer
+        if self._matrix_learning_rate:
+            optimizer = Muon(parameters, self._matrix_learning_rate, self._learning_rate)
         else:
-            self.optimizer = Adam(network.parameters(), learning_rate, betas=_BETAS)
-        self._learning_rates = [group["lr"] for group in self.optimizer.param_groups]
+            optimizer = Adam(parameters, self._learning_rate, betas=_BETAS)
+        for group in optimizer.param_groups:
+            group["initial_lr"] = group["lr"]
+        return optimizer
 
     def clip_gradient(self, largest: float) -> bool:
         """Clip the accumulated gradient to this L2 norm; returns whether it was finite."""
@@ -48,8 +60,8 @@ class Learner(Generic[N]):
 
     def step(self, rate: float) -> None:
         """Step along the accumulated gradient with ``rate`` times the learning rates."""
-        for group, learning_rate in zip(self.optimizer.param_groups, self._learning_rates, strict=True):
-            group["lr"] = rate * learning_rate
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate * group["initial_lr"]
         self.optimizer.step()
 
     def tensors(self) -> dict[str, Tensor]:
@@ -170,6 +182,15 @@ class TrainState:
         """
         for who, learner in self.learners.items():
             learner.load(under(f"{who}.", tensors))
+        self.progress = progress
+
+    def load_trained(self, tensors: dict[str, Tensor], progress: TrainingProgress) -> None:
+        """Take over weights and progress alone: nothing is trained any more.
+
+        Raises:
+            RuntimeError: The tensors are not those of this network.
+        """
+        self.pose.network.load_state_dict(under("pose.network.", tensors))
         self.progress = progress
 
 

@@ -14,7 +14,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -139,7 +139,7 @@ class RunFolder:
             CheckpointError: The last checkpoint is damaged, or of other networks.
         """
         if self.checkpoints():
-            self._load_last(state)
+            self._load_last(state.load)
 
     def last(self) -> tuple[dict[str, Tensor], TrainingProgress]:
         """All tensors of the last checkpoint's :class:`TrainState` by name, and the run's progress.
@@ -169,14 +169,14 @@ class RunFolder:
             CheckpointError: There is no checkpoint yet, or it cannot be read.
         """
         state = TrainState(self.config, world, torch.device("cpu"))
-        self._load_last(state)
+        self._load_last(state.load_trained)
         state.pose.network.eval()
         return state
 
-    def _load_last(self, state: TrainState) -> None:
+    def _load_last(self, load: Callable[[dict[str, Tensor], TrainingProgress], None]) -> None:
         tensors, progress = self.last()
         try:
-            state.load(tensors, progress)
+            load(tensors, progress)
         except RuntimeError as exc:
             raise CheckpointError(
                 f"checkpoint {self.checkpoints()[-1]} is of another network than this version builds for its "
