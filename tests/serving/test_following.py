@@ -114,6 +114,22 @@ def test_a_symmetric_pose_is_no_movement() -> None:
     np.testing.assert_allclose(track.filter.rotation, np.eye(3), atol=1e-6)
 
 
+def test_a_ball_does_not_turn_whatever_is_read() -> None:
+    axes = [Symmetry(axis=axis, offset_m=[0.0] * 3) for axis in ([0.0, 0.6, 0.8], [1.0, 0.0, 0.0])]
+    kind = ObjectModel(name="ball", diameter_m=0.1, symmetries=axes)
+    assert len(symmetry_rotations(kind)) == 1, "and not all products of turns about both axes"
+    turns = [Rotation.from_euler("xyz", angles, degrees=True).as_matrix() for angles in ((90, 0, 0), (10, 70, -40))]
+    first, *others = (
+        Measurement.of_whole_frame(kind, np.array([0.0, 0.0, 0.8]), turn, 0.9) for turn in (np.eye(3), *turns)
+    )
+    track = Track.begin(1, kind, first, 0.0)
+    for number, measured in enumerate(others, start=1):
+        track.predict(FRAME_S)
+        track.update(measured, number * FRAME_S)
+    np.testing.assert_allclose(track.filter.rotation, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(track.filter.turn_rad_s, 0, atol=1e-6)
+
+
 def test_a_rotation_that_jumps_once_is_not_believed_and_one_that_stays_is() -> None:
     flipped = Rotation.from_euler("x", 120, degrees=True).as_matrix()
     track = Track.begin(1, BALL, _measured(0.0), 0.0)

@@ -119,6 +119,16 @@ def test_symmetric_poses_agree() -> None:
     assert reader(3, wrong)(IMAGE)["confidence"][0, 0] == pytest.approx(0.4**AGREEMENT_POWER)
 
 
+def test_reads_of_a_ball_agree_however_it_is_turned() -> None:
+    turned = [(number, from_rotation_vector(np.array([0.9 * number, 2.0 - number, 0.4])), 0.6) for number in (1, 2)]
+    ball = spec(Symmetry(axis=[0.0, 0.6, 0.8], offset_m=[0.0] * 3), Symmetry(axis=[1.0, 0, 0], offset_m=[0.0] * 3))
+    found = reader(3, *turned, kind=ball)(IMAGE)
+    assert found["confidence"][0, 0] == pytest.approx(0.6**AGREEMENT_POWER)
+    np.testing.assert_allclose(found["translation_m"][0, 0], POSITION_M, atol=1e-6)
+    np.testing.assert_allclose(found["rotation"][0, 0], np.eye(3), atol=1e-6)
+    assert reader(3, *turned)(IMAGE)["confidence"][0, 0] < 0.4
+
+
 @pytest.mark.parametrize(("num_reads", "kind"), [(0, spec()), (10, spec()), (3, spec(slots=(0, 1))), (3, ModelSpec())])
 def test_what_cannot_be_read_again_is_refused(num_reads: int, kind: ModelSpec) -> None:
     with pytest.raises(ArgumentError, match=r"expected 1 to 9|reads an image once"):

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from curio_proto.v1 import detector_pb2 as messages
+from curio_proto.v1.model_spec_pb2 import ObjectModel, Symmetry
 from curio_serve.batch.arguments import DetectArguments
 from curio_serve.batch.detect_cli import run
 from curio_serve.client import PoseClient
@@ -17,7 +18,7 @@ from curio_serve.errors import ArgumentError, CameraError, CameraMissing, UsageE
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
-from curio_serve.rigs.detect_views import RigView, detect_views
+from curio_serve.rigs.detect_views import RigView, _explained, _Seen, detect_views
 from curio_serve.rigs.rig import check_cam_from_rig, read_rig_file
 from scipy.spatial.transform import Rotation
 
@@ -69,6 +70,17 @@ def test_what_one_camera_errs_in_depth_another_sees() -> None:
     assert consensus(turned, np.eye(3)[None], min_predictions=2, min_views=2) == []
     symmetric = np.stack([np.eye(3), np.diag([1.0, -1, -1])])
     assert len(consensus(turned, symmetric, min_predictions=2, min_views=2)) == 1
+
+
+def test_views_of_a_ball_agree_by_its_place_alone() -> None:
+    axes = [Symmetry(axis=axis, offset_m=[0.0] * 3) for axis in ([0.0, 0.6, 0.8], [1.0, 0.0, 0.0])]
+    turned = Rotation.from_euler("xyz", (20, 70, -40), degrees=True).as_matrix()
+    place_m, covariance = np.array([0.0, 0.0, 0.8]), np.eye(3) * 0.01**2
+    seen = [_Seen(view, "ball", turn, place_m, covariance, 0.7) for view, turn in enumerate((np.eye(3), turned))]
+    ((confidence, pose, _),) = _explained(seen, ObjectModel(name="ball", diameter_m=0.1, symmetries=axes))
+    assert (pose.members.tolist(), confidence) == ([0, 1], pytest.approx(1 - 0.3**2))
+    ((confidence, pose, _),) = _explained(seen, ObjectModel(name="brick", diameter_m=0.1))
+    assert (pose.members.tolist(), confidence) == ([0], 0.7)
 
 
 def test_a_shipped_model_sees_one_photograph_twice_and_agrees() -> None:

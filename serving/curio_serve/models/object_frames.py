@@ -15,10 +15,16 @@ from curio_serve.imaging.rotation import from_rotation_vector
 
 Array = np.ndarray
 _SYMMETRY_STEP_RAD = math.radians(5)
+_PARALLEL = 0.999  # cosine of the angle between axes
 
 
 def symmetry_rotations(kind: ObjectModel) -> Array:
-    """Rotations [n, 3, 3] of an object onto itself, about its middle; continuous symmetries in steps."""
+    """Rotations [n, 3, 3] of an object onto itself, about its middle; continuous symmetries in steps.
+
+    Of an object that turns any way the identity alone: see :func:`as_compared`.
+    """
+    if turns_any_way(kind):
+        return np.eye(3)[None]
     discrete = [np.reshape(s.transform, (4, 4))[:3, :3] for s in kind.symmetries if len(s.transform) == 16]
     found = np.stack([np.eye(3), *discrete])
     for symmetry in kind.symmetries:
@@ -27,6 +33,17 @@ def symmetry_rotations(kind: ObjectModel) -> Array:
             rotations = from_rotation_vector(angles[:, None] * np.array(symmetry.axis))
             found = (found[:, None] @ rotations[None]).reshape(-1, 3, 3)
     return found
+
+
+def turns_any_way(kind: ObjectModel) -> bool:
+    """Whether every rotation of an object looks alike, as a ball's do: it has several axes of continuous symmetry."""
+    axes = [np.array(symmetry.axis) for symmetry in kind.symmetries if len(symmetry.axis) == 3]
+    return any(abs(axes[0] @ axis) < _PARALLEL for axis in axes[1:])
+
+
+def as_compared(rotation: Array, kind: ObjectModel) -> Array:
+    """Rotations [..., 3, 3] as they are compared and averaged: the identity where every rotation looks alike."""
+    return np.broadcast_to(np.eye(3), rotation.shape) if turns_any_way(kind) else rotation
 
 
 def center_of(kind: ObjectModel) -> Array:

@@ -14,6 +14,7 @@ from curio_serve.errors import ArgumentError
 from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS, VirtualCamera
 from curio_serve.models.model import Outputs
 from curio_serve.models.object_frames import (
+    as_compared,
     center_of,
     middle_from_origin,
     origin_from_middle,
@@ -57,10 +58,9 @@ class RepeatedReader:
             )
         self._run, self._cameras = run, VIRTUAL_CAMERAS[:num_reads]
         self._matrix = np.reshape(list(spec.camera.camera_matrix), (3, 3))
-        kinds = sorted(spec.objects, key=lambda kind: kind.slots[0])
-        self._symmetries = [symmetry_rotations(kind) for kind in kinds]
-        self._centers_m = [center_of(kind) for kind in kinds]
-        self._diameters_m = [kind.diameter_m for kind in kinds]
+        self._kinds = sorted(spec.objects, key=lambda kind: kind.slots[0])
+        self._symmetries = [symmetry_rotations(kind) for kind in self._kinds]
+        self._centers_m = [center_of(kind) for kind in self._kinds]
 
     def __call__(self, images: Array, before_run: Callable[[], None] = lambda: None) -> Outputs:
         """Outputs of the network's names, float32 [batch, ...].
@@ -84,15 +84,16 @@ class RepeatedReader:
         confidence = np.stack([read.get("confidence", np.ones(len(self._symmetries))) for read in reads])
         rotation, position = (np.stack([read[name] for read in reads]) for name in ("rotation", "translation_m"))
         found = {name: np.mean([read[name] for read in reads], axis=0) for name in reads[0]}
-        for slot, symmetries in enumerate(self._symmetries):
-            angle, turned = angles_deg(rotation[:, None, slot], rotation[:, slot], symmetries)
+        for slot, (kind, symmetries) in enumerate(zip(self._kinds, self._symmetries, strict=True)):
             center_m = self._centers_m[slot]
             middle = middle_from_origin(position[:, slot], rotation[:, slot], center_m)
-            apart = np.linalg.norm(middle[:, None] - middle, axis=-1) / self._diameters_m[slot]
+            compared = as_compared(rotation[:, slot], kind)
+            angle, turned = angles_deg(compared[:, None], compared, symmetries)
+            apart = np.linalg.norm(middle[:, None] - middle, axis=-1) / kind.diameter_m
             agree = (angle < _SAME_ROTATION_DEG) & (apart < _SAME_PLACE) | np.eye(len(reads), dtype=bool)
             best = int((confidence[:, slot] @ agree).argmax())
             members = np.flatnonzero(agree[:, best])
-            alike = rotation[members, slot] @ symmetries[turned[members, best]]
+            alike = compared[members] @ symmetries[turned[members, best]]
             mean = found["rotation"][slot] = mean_rotation(alike)
             found["translation_m"][slot] = origin_from_middle(middle[members].mean(axis=0), mean, center_m)
             if "confidence" in found:

@@ -18,6 +18,7 @@ from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.models.detector import Detector
 from curio_serve.models.object_frames import (
+    as_compared,
     center_of,
     middle_from_origin,
     origin_from_middle,
@@ -183,7 +184,7 @@ def _explained(seen: list[_Seen], kind: ObjectModel) -> list[tuple[float, Consen
         return []
     predictions = Predictions(
         np.array([one.view for one in seen]),
-        np.stack([one.rotation for one in seen]),
+        as_compared(np.stack([one.rotation for one in seen]), kind),
         np.stack([one.translation_m for one in seen]),
         np.stack([one.covariance_m2 for one in seen]),
     )

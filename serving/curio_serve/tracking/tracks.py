@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectModel
 
-from curio_serve.models.object_frames import symmetry_rotations
+from curio_serve.models.object_frames import as_compared, symmetry_rotations
 from curio_serve.models.stages.crop_stage import CropPose
 from curio_serve.tracking.assignment import assigned
 from curio_serve.tracking.pose_filter import PoseFilter
@@ -30,7 +30,7 @@ class Measurement:
     translation_m: Array
     """Of the object's middle, [3]."""
     rotation: Array
-    """cam_from_obj [3, 3]."""
+    """cam_from_obj [3, 3]; the identity where every rotation of the object looks alike."""
     confidence: float
     """0 to 1."""
     covariance_m2: Array
@@ -45,7 +45,9 @@ class Measurement:
         ray = translation_m / max(distance_m, 1e-9)
         across, along = (_ACROSS * kind.diameter_m) ** 2, (_IN_DEPTH * distance_m) ** 2
         covariance = np.eye(3) * across + np.outer(ray, ray) * along
-        return Measurement(kind.name, translation_m, rotation, confidence, covariance, _ROTATION_RAD**2)
+        return Measurement(
+            kind.name, translation_m, as_compared(rotation, kind), confidence, covariance, _ROTATION_RAD**2
+        )
 
     @staticmethod
     def of_crops(kind: ObjectModel, pose: CropPose) -> "Measurement":
@@ -53,7 +55,7 @@ class Measurement:
         return Measurement(
             kind.name,
             pose.translation_m,
-            pose.rotation,
+            as_compared(pose.rotation, kind),
             pose.confidence,
             pose.position_covariance_m2,
             pose.rotation_variance,
