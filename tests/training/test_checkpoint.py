@@ -4,8 +4,6 @@ import json
 import os
 import resource
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -108,20 +106,6 @@ def largest_file(num_bytes: int) -> Iterator[None]:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, before)
-
-
-def test_for_export_and_evaluation_no_optimiser_is_made(tmp_path: Path, cache: Path) -> None:
-    """Torch imports its compiler for the first one, which takes seconds."""
-    train(tmp_path / "run", cache)
-    run = RunFolder.open(tmp_path / "run")
-    (tmp_path / "code.py").write_text(
-        "import sys\nfrom pathlib import Path\nfrom curio_train.learning.runs.checkpoint import RunFolder\n"
-        "from curio_train.worlds.generated.circles import Circles\n"
-        f"state = RunFolder.open(Path({str(run.path)!r})).trained(Circles())\n"
-        "print(state.progress.step, 'torch._dynamo' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, tmp_path / "code.py"], capture_output=True, text=True, check=False)
-    assert done.stdout == "6 False\n", done
 
 
 def test_a_full_disk_costs_no_earlier_checkpoint(tmp_path: Path, cache: Path) -> None:

@@ -2,6 +2,8 @@
 
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -55,6 +57,17 @@ def test_the_method_before_is_that_of_a_run_that_can_be_read(run: Path, model: P
     (damaged / "config.json").write_text("{")
     found = {path: method_before(replace(CONFIG, method="our", init=path)) for path in (run, model, damaged, None)}
     assert found == {run: "noncur", model: None, damaged: None, None: None}
+
+
+def test_to_read_a_trained_network_no_optimiser_is_made(run: Path) -> None:
+    """Torch imports its compiler for the first one, which takes seconds."""
+    code = (
+        "import sys; from pathlib import Path; from curio_train.learning.runs.checkpoint import RunFolder\n"
+        "from curio_train.worlds.generated.circles import Circles\n"
+        f"RunFolder.open(Path({str(run)!r})).trained(Circles()); print('torch._dynamo' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout == "False\n", done
 
 
 def test_a_model_gives_the_network_that_it_was_exported_from(run: Path, model: Path) -> None:
