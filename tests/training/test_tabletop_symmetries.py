@@ -176,6 +176,21 @@ def test_codes_have_the_position_of_a_point_that_symmetries_leave(folder: Path, 
     assert (off > 5e-3) == (mesh == "triangle.stl")
 
 
+def test_earlier_runs_are_gone_on_with_as_they_were(folder: Path) -> None:
+    """Their positions are of the middle of the box, which the symmetries of a triangle move; image sets are kept."""
+    assert not world_of(folder, "triangle.stl", lying=True, centered=False).slot_infos[0].is_symmetric
+    assert world_of(folder, "rod.stl", lying=True, centered=False).slot_infos[0].is_symmetric
+    for mesh, is_drawn_anew in (("triangle.stl", True), ("nut.stl", False), ("rod.stl", False)):
+        recipes = [world_of(folder, mesh, lying=True, centered=centered).recipe for centered in (False, True)]
+        assert (recipes[0] != recipes[1]) == is_drawn_anew, mesh
+
+
+def test_a_painted_part_has_no_symmetry_in_its_model(folder: Path) -> None:
+    (painted,), (rod,) = (world_of(folder, name, lying=True).objects for name in ("painted.ply", "rod.stl"))
+    assert not painted.info.is_symmetric
+    assert rod.info.is_symmetric
+
+
 def test_both_ends_of_a_folded_yaw_are_one_image(folder: Path) -> None:
     world = world_of(folder, "triangle.stl")
     code = world.sample(4, (0,))

@@ -6,6 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 
 Array = np.ndarray
+_PARALLEL = 0.01  # axes of unit length that differ by less are one
+
+
+def are_several_axes(axes: Sequence[Array]) -> bool:
+    """Whether axes, each [3] of length 1, are more than one: others are parallel, up to rounding."""
+    return len(axes) > 1 and bool(np.linalg.matrix_rank(np.stack(axes), tol=_PARALLEL) > 1)
 
 
 def smallest_rotation(source: Array, target: Array) -> Array:

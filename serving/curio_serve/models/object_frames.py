@@ -11,11 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectModel
 
-from curio_serve.imaging.rotation import from_rotation_vector
+from curio_serve.imaging.rotation import are_several_axes, from_rotation_vector
 
 Array = np.ndarray
 _SYMMETRY_STEP_RAD = math.radians(5)
-_PARALLEL = 0.999  # cosine of the angle between axes
 
 
 def symmetry_rotations(kind: ObjectModel) -> Array:
@@ -37,8 +36,7 @@ def symmetry_rotations(kind: ObjectModel) -> Array:
 
 def turns_any_way(kind: ObjectModel) -> bool:
     """Whether every rotation of an object looks alike, as a ball's do: it has several axes of continuous symmetry."""
-    axes = [np.array(symmetry.axis) for symmetry in kind.symmetries if len(symmetry.axis) == 3]
-    return any(abs(axes[0] @ axis) < _PARALLEL for axis in axes[1:])
+    return are_several_axes([np.array(symmetry.axis) for symmetry in kind.symmetries if len(symmetry.axis) == 3])
 
 
 def as_compared(rotation: Array, kind: ObjectModel) -> Array:

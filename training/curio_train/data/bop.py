@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from curio_serve.bop import LINEMOD_IDS
+from curio_serve.imaging.rotation import are_several_axes
 from PIL import Image
 
 from curio_train.camera import Intrinsics, check_matrix, load_intrinsics
@@ -33,7 +34,6 @@ _LINEMOD = "LineMOD (Hinterstoisser et al. 2012)"
 _BOP = "as published by the BOP benchmark, https://bop.felk.cvut.cz"
 
 _MM = METRES["mm"]
-_PARALLEL = 0.01  # axes of unit length that differ by less are one
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _HOW_TO_GET = (
     "download it with: hf download bop-benchmark/{name} --repo-type dataset --local-dir DIR, and unpack the zips"
@@ -103,8 +103,7 @@ class ModelInfo:
     @property
     def turns_any_way(self) -> bool:
         """Whether it looks the same after every turn about its centre, as a ball does: it has two axes or more."""
-        axes = np.array([axis for axis, _ in self.symmetry_axes])
-        return len(axes) > 1 and bool(np.linalg.matrix_rank(axes, tol=_PARALLEL) > 1)
+        return are_several_axes([axis for axis, _ in self.symmetry_axes])
 
 
 class BopDataset:

@@ -1,7 +1,7 @@
 """Examines files before an hour is spent on them, and refuses those that will not work."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -54,8 +54,13 @@ def examine(subjects: Subjects, cache: Path) -> Iterator[Finding]:
     yield from examine_files(subjects)
 
 
-def examine_files(subjects: Subjects) -> Iterator[Finding]:
-    """The files alone, each beside what it has to agree with."""
+def examine_files(subjects: Subjects, empty: Sequence[Path] = ()) -> Iterator[Finding]:
+    """The files alone, each beside what it has to agree with.
+
+    Args:
+        subjects: What to look at.
+        empty: Further images of the empty scene, which are no photographs even where they lie among them.
+    """
     mesh: Mesh | None = None
     camera: Intrinsics | None = None
     if subjects.mesh is not None:
@@ -65,7 +70,9 @@ def examine_files(subjects: Subjects) -> Iterator[Finding]:
         camera, findings = examine_camera(subjects.camera)
         yield from findings
     if subjects.photos is not None:
-        photographs, findings = examine_photographs(subjects.photos, camera, subjects.background)
+        photographs, findings = examine_photographs(
+            subjects.photos, camera, [*filter(None, (subjects.background, *empty))]
+        )
         yield from findings
     else:
         photographs = []
@@ -114,9 +121,10 @@ def refuse_unfit(options: CaptureOptions, *, self_training: bool = True) -> list
     """
     first, *others = options.mesh
     unit, body = options.mesh_unit, options.body
+    empty = _further_empty(options)
     subjects = [Subjects(first, unit, body, options.camera, options.photos, options.background)]
     subjects += [Subjects(mesh, unit, body) for mesh in others]
-    found = [finding for subject in subjects for finding in examine_files(subject)]
+    found = [finding for subject in subjects for finding in examine_files(subject, empty)]
     found = [finding for finding in found if finding.state != "good" and finding.fault != _HARMLESS]
     if not self_training and options.plane is None:
         found = [finding for finding in found if finding.fault != TOO_FEW]
@@ -127,3 +135,17 @@ def refuse_unfit(options: CaptureOptions, *, self_training: bool = True) -> list
     if unfit:
         raise DataError("\n".join(f"{finding.subject}: {finding}" for finding in unfit))
     return [f"{finding.subject}: {finding}" for finding in found]
+
+
+def _further_empty(options: CaptureOptions) -> Sequence[Path]:
+    """Images of the empty scene beside ``--background``: none in free space.
+
+    Raises:
+        CameraError: The file of the plane cannot be used.
+    """
+    if options.plane is None or options.background is None:
+        return ()
+    from curio_train.capture.plane import CameraPoseFile
+    from curio_train.worlds.tabletop.files import empty_scenes
+
+    return empty_scenes(options, options.background, CameraPoseFile.read(options.plane))

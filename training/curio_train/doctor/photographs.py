@@ -20,17 +20,17 @@ _FULL_FRAME_WIDTH_MM = 36.0
 
 
 def examine_photographs(
-    folder: Path, camera: Intrinsics | None, background: Path | None = None
+    folder: Path, camera: Intrinsics | None, empty: Sequence[Path] = ()
 ) -> tuple[list[Photograph], list[Finding]]:
     """The readable photographs, and what was found about them.
 
     Args:
         folder: Where they lie.
         camera: What they were taken with, where known.
-        background: The image of the empty scene, which may lie among them.
+        empty: Images of the empty scene, which may lie among them and are no photographs.
     """
     try:
-        there = Photographs(folder, () if background is None else (background,))
+        there = Photographs(folder, empty)
     except CurioError as exc:
         return [], [Finding("photographs", "bad", str(exc), fault="photographs unreadable")]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0)), "measure") as threads:

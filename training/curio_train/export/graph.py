@@ -24,6 +24,7 @@ NUM_JITTERED = 8
 
 _NUM_CHECK_IMAGES = 4  # of either kind
 _IMAGES_AT_ONCE = 2  # that torch reads: eight images of eight objects take 13 GB
+_ROUNDS_AT_ONCE = 2  # of jitter, each of one image at a time
 _CHECK_SEED = 20_210
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
@@ -150,7 +151,7 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slot
         jittered = pixels + _PIXEL_JITTER * torch.randn(pixels.shape, generator=generator)
         return graph.unmoved(answers, _with_jittered_layers(graph, generator).in_parts(jittered, 1))
 
-    stable = torch.stack(list(in_threads(unmoved, range(NUM_JITTERED), _IMAGES_AT_ONCE))).all(dim=0)
+    stable = torch.stack(list(in_threads(unmoved, range(NUM_JITTERED), _ROUNDS_AT_ONCE))).all(dim=0)
     if stable.float().mean() < _LEAST_STABLE:
         raise ExportError(
             f"{int((~stable).sum())} of the network's {stable.numel()} answers to check images change with the images' "

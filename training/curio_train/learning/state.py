@@ -42,7 +42,7 @@ class Learner(Generic[N]):
         """Adam, as in the paper, or Muon.
 
         It is made when something learns: torch's first optimiser imports its compiler, which takes 2 to 3 seconds that
-        export and evaluation need not wait.
+        evaluation need not wait.
         """
         parameters = self.network.parameters()
         optimizer: Optimizer

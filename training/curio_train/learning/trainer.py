@@ -90,6 +90,7 @@ class Trainer:
             _check_rendered_stages(config, world)
         self.config, self.world, self.ranks = config, world, ranks
         self.state = TrainState(config, world, ranks.device)
+        self._optimizers = [learner.optimizer for learner in self.state.learners.values()]  # before time is taken
         self._num_micro = config.recipe.batch_size // config.recipe.micro_batch_size
         self._micro_batches = ranks.micro_batches(self._num_micro)
         seen = sources
@@ -119,8 +120,8 @@ class Trainer:
         stage = self._stages[trained_stage(self.config, self.world, self.state.progress.step)]
         world, network = stage.world, stage.network
         sums: Counter[str] = Counter()
-        for learner in self.state.learners.values():
-            learner.optimizer.zero_grad()
+        for optimizer in self._optimizers:
+            optimizer.zero_grad()
 
         for micro in self._micro_batches:
             number = self.state.progress.step * self._num_micro + micro

@@ -28,6 +28,7 @@ _NOISE, _SHARED_NOISE = 0.01, 3.0  # of the diameter; a factor
 _EQUAL_MOMENTS = 0.1  # moments of inertia that differ by less may belong to one plane of symmetry axes
 _FIT_STEPS = 25
 _NUM_DIRECTIONS = 700  # of a half sphere: one every 5°
+_PARALLEL = 0.999  # cosine of the angle between two axes
 _SAME_DEG = 12.0  # turns of different symmetries are at least 30° apart, their axes 15°
 _DRIFT_DEG = 5.0  # of the angle, while the axis is fitted
 _PROBE_ANGLES_DEG = (19.0, 47.0, 73.0, 101.0, 137.0, 163.0)  # multiples of no 360°/n up to the largest order
@@ -54,6 +55,20 @@ class Symmetries:
         away_m, *_ = np.linalg.lstsq(np.concatenate(rows), np.concatenate(moved_m), rcond=1e-3)
         result: np.ndarray = near_m + away_m
         return result
+
+    def about(self, axis: np.ndarray) -> "Symmetries":
+        """Those alone that keep the direction of an axis [3] of length 1."""
+        return Symmetries(
+            tuple(matrix for matrix in self.discrete if axis @ matrix[:3, :3] @ axis > _PARALLEL),
+            tuple((own, point) for own, point in self.continuous if abs(own @ axis) > _PARALLEL),
+        )
+
+    def leaving(self, point_m: np.ndarray, largest_m: float) -> "Symmetries":
+        """Those alone that move a point [3] by no more than some distance, metres."""
+        return Symmetries(
+            tuple(m for m in self.discrete if np.linalg.norm(m[:3, :3] @ point_m + m[:3, 3] - point_m) <= largest_m),
+            tuple((a, at) for a, at in self.continuous if np.linalg.norm(np.cross(a, point_m - at)) <= largest_m),
+        )
 
     def in_frame(self, new_from_own: Pose[np.ndarray]) -> "Symmetries":
         """The same motions of another frame."""

@@ -105,7 +105,7 @@ def template_reader(world: TwoStageWorld, cache: Path) -> Callable[[Tensor], Sce
     @lru_cache(maxsize=1)
     def drawn() -> TemplateNetwork:
         network = template_network(world)
-        fill(network, world, cache)
+        fill(network, world, cache, torch.get_num_threads())
         return network
 
     return lambda images: drawn()(images)

@@ -27,6 +27,7 @@ from curio_train.worlds.tabletop.world import Part, TabletopPhotographs, Tableto
 
 SIDE_PX = 128
 _OFF_AXIS = 0.01  # of the diameter; symmetries are not found exactly enough to correct the box's middle by less
+_UP = np.array([0.0, 1.0, 0.0])
 _PARALLEL, _LEVEL = 0.999, 0.04  # cosine of the angle between an axis and the vertical: the same, and across it
 
 # Rotations from the mesh file's frame, with the named axis up, to one with y up; right-handed.
@@ -77,11 +78,12 @@ def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_co
     rotation = _Y_UP_FROM[options.up]
     rotated = mesh.vertices_m @ rotation.T
     low, high = rotated.min(axis=0), rotated.max(axis=0)
-    found, unpainted = find_symmetries(mesh), is_unpainted(mesh)
-    alike = found.in_frame(Pose(rotation, np.zeros(3))) if unpainted else Symmetries((), ())
+    unpainted = is_unpainted(mesh)
+    found = find_symmetries(mesh) if unpainted else Symmetries((), ())
+    alike = found.in_frame(Pose(rotation, np.zeros(3)))
     origin = (low + high) / 2
     if options.centered:
-        origin = _left_in_place(alike, origin, mesh.diameter_m)
+        origin = _left_in_place(alike if options.lying else alike.about(_UP), origin, mesh.diameter_m)
     if not options.lying:
         origin[1] = low[1]
     own = dataclasses.replace(mesh, vertices_m=rotated - origin)
@@ -89,9 +91,9 @@ def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_co
     if not options.lying:
         radius_m = standing_kind(name, own, 1).radius_m
     kind = ObjectKind(name, (), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous)
-    fold = yaw_fold(alike, np.array([0.0, 1.0, 0.0]))
+    fold = yaw_fold(alike, _UP)
     file_from_own = Pose(rotation.T, rotation.T @ origin)
-    in_own = alike.in_frame(Pose(np.eye(3), -origin))
+    in_own = alike.leaving(origin, _OFF_AXIS * mesh.diameter_m).in_frame(Pose(np.eye(3), -origin))
     info = ModelInfo(mesh.diameter_m, in_own.discrete, in_own.continuous)
     return Part(kind, own, file_from_own, info, radius_m, min_count, max_count, fold, unpainted)
 
@@ -124,8 +126,7 @@ def _photographs(
     setup: SceneSetup,
     highest_m: float,
 ) -> TabletopPhotographs:
-    of_second = () if options.second_background is None else (options.second_background,)
-    empty = (background, *of_second, *cameras.background_images)  # may lie among the photographs
+    empty = empty_scenes(options, background, cameras)
     paths = Photographs(options.photos, empty).paths
     for path in paths:
         cameras.check_same_viewpoint(path, background)
@@ -144,6 +145,12 @@ def _photographs(
     own = PhotographSet(_frames(judged, intrinsics), images[background], [path.name for path in judged])
     differ = any(path != background for path in own_backgrounds)
     return TabletopPhotographs(training, backgrounds if differ else None, own, second, second_pose, occupied, position)
+
+
+def empty_scenes(options: CaptureOptions, background: Path, cameras: CameraPoseFile) -> Sequence[Path]:
+    """All images of the empty scene: they may lie among the photographs, and are none of them."""
+    of_second = () if options.second_background is None else (options.second_background,)
+    return (background, *of_second, *cameras.background_images)
 
 
 def _pairs(folder: Path, paths: Sequence[Path], empty: Sequence[Path]) -> tuple[list[Path], list[Path]]:

@@ -57,6 +57,7 @@ from curio_train.worlds.placement import (
 from curio_train.worlds.single_object.base_colors import MIN_BASE_VALUE
 from curio_train.worlds.tabletop.outputs import FileFrameOutputs
 
+_MOVED = 1e-6  # of a diameter; points that are nearer are one
 _GAIN, _TINT, _NOISE = 0.1, 0.03, 0.03  # of sRGB
 
 
@@ -154,7 +155,7 @@ class TabletopWorld(MeshWorld):
             "parts": [(part.min_count, part.fold, part.unpainted) for part in self.parts],
             "lying": self._lying,
         }
-        if any(part.info.is_symmetric for part in self.parts):  # whose middle is not always that of the box
+        if any(_is_off_middle(part, self._lying) for part in self.parts):
             constants["origins"] = [part.file_from_own.translation_m.tolist() for part in self.parts]
         return constants
 
@@ -259,3 +260,9 @@ class TabletopWorld(MeshWorld):
             for slot, part in enumerate(self._part_of_slot)
         ]
         return -torch.stack(lowest, dim=1)
+
+
+def _is_off_middle(part: Part, lying: bool) -> bool:
+    """Whether a part's origin is another point than the middle of its box; of one that stands, as seen from above."""
+    middle_m = (part.mesh.vertices_m.min(axis=0) + part.mesh.vertices_m.max(axis=0)) / 2
+    return bool(np.abs(middle_m if lying else middle_m[[0, 2]]).max() > _MOVED * part.kind.diameter_m)
