@@ -65,7 +65,7 @@ def test_motions_of_another_frame(mesh: Mesh) -> None:
     turned = Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix()
     moved = Pose(turned, np.array([0.2, -0.1, 0.05]))
     found = find_symmetries(mesh)
-    there, points_m = found.in_frame(moved), mesh.vertices_m
+    there, points_m = found.in_frame(*moved), mesh.vertices_m
     assert (len(there.discrete), len(there.continuous)) == (len(found.discrete), len(found.continuous))
     for own, motion in zip(found.discrete, there.discrete, strict=True):
         before = moved.apply(Pose.from_matrix(own).apply(points_m))

@@ -15,7 +15,6 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from curio_train.geometry import Pose
 from curio_train.meshes.meshes import Mesh
 
 TOLERANCE = 0.025
@@ -70,13 +69,13 @@ class Symmetries:
             tuple((a, at) for a, at in self.continuous if np.linalg.norm(np.cross(a, point_m - at)) <= largest_m),
         )
 
-    def in_frame(self, new_from_own: Pose[np.ndarray]) -> "Symmetries":
-        """The same motions of another frame."""
+    def in_frame(self, rotation: np.ndarray, translation_m: np.ndarray) -> "Symmetries":
+        """The same motions of another frame, new_from_own: rotation [3, 3], then translation [3]."""
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = new_from_own
+        matrix[:3, :3], matrix[:3, 3] = rotation, translation_m
         discrete = tuple(matrix @ motion @ np.linalg.inv(matrix) for motion in self.discrete)
         return Symmetries(
-            discrete, tuple((new_from_own.rotation @ axis, new_from_own.apply(at)) for axis, at in self.continuous)
+            discrete, tuple((rotation @ axis, rotation @ at + translation_m) for axis, at in self.continuous)
         )
 
     def as_bop(self) -> dict[str, list[object]]:

@@ -80,7 +80,7 @@ def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_co
     low, high = rotated.min(axis=0), rotated.max(axis=0)
     unpainted = is_unpainted(mesh)
     found = find_symmetries(mesh) if unpainted else Symmetries((), ())
-    alike = found.in_frame(Pose(rotation, np.zeros(3)))
+    alike = found.in_frame(rotation, np.zeros(3))
     origin = (low + high) / 2
     if options.centered:
         origin = _left_in_place(alike if options.lying else alike.about(_UP), origin, mesh.diameter_m)
@@ -93,7 +93,7 @@ def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_co
     kind = ObjectKind(name, (), mesh.diameter_m, mesh.box_corners_m, mesh.sha256, found.discrete, found.continuous)
     fold = yaw_fold(alike, _UP)
     file_from_own = Pose(rotation.T, rotation.T @ origin)
-    in_own = alike.leaving(origin, _OFF_AXIS * mesh.diameter_m).in_frame(Pose(np.eye(3), -origin))
+    in_own = alike.leaving(origin, _OFF_AXIS * mesh.diameter_m).in_frame(np.eye(3), -origin)
     info = ModelInfo(mesh.diameter_m, in_own.discrete, in_own.continuous)
     return Part(kind, own, file_from_own, info, radius_m, min_count, max_count, fold, unpainted)
 
