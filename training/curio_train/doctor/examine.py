@@ -138,7 +138,7 @@ def refuse_unfit(options: CaptureOptions, *, self_training: bool = True) -> list
 
 
 def _further_empty(options: CaptureOptions) -> Sequence[Path]:
-    """Images of the empty scene beside ``--background``: none in free space.
+    """Images of the empty scene of parts on a plane, ``--background`` among them; in free space there is that alone.
 
     Raises:
         CameraError: The file of the plane cannot be used.

@@ -70,7 +70,7 @@ def without_scan_excess(world: TwoStageWorld) -> TwoStageWorld:
 
 
 @torch.no_grad()
-def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, num_threads: int = 1) -> None:
+def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, num_threads: int) -> None:
     """Draw and store all templates.
 
     Args:
@@ -99,7 +99,7 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, num_th
 
 
 @torch.no_grad()
-def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Path, num_threads: int = 1) -> None:
+def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Path, num_threads: int) -> None:
     """Draw and store templates and outlines of several objects, and load the trunk's weights; what is trained stays.
 
     Args:

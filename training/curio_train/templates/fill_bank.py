@@ -25,7 +25,7 @@ _BATCH = 64  # of drawings
 _INSIDE = 0.98  # of the pixels around a surface point show the object
 
 
-def filled_bank(trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, crops: Tensor, num_threads: int = 1) -> Bank:
+def filled_bank(trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, crops: Tensor, num_threads: int) -> Bank:
     """The templates of an object: descriptors averaged over lamps and backgrounds, because what changes counts less.
 
     Args:
