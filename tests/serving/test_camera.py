@@ -75,7 +75,7 @@ def test_a_camera_of_another_size_is_named() -> None:
 
 
 def test_a_frame_that_is_turned_by_a_quarter_is_named_as_such() -> None:
-    with pytest.raises(CameraError, match=r"480x640; one of the two is turned by a quarter.*EXIF.*as stored"):
+    with pytest.raises(CameraError, match=r"480x640; one of the two is rotated by 90 degrees.*EXIF.*as stored"):
         PinholeCamera(K, size=(640, 480)).check_frame(480, 640)
 
 

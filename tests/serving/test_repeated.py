@@ -131,7 +131,7 @@ def test_reads_of_a_ball_agree_however_it_is_turned() -> None:
 
 @pytest.mark.parametrize(("num_reads", "kind"), [(0, spec()), (10, spec()), (3, spec(slots=(0, 1))), (3, ModelSpec())])
 def test_what_cannot_be_read_again_is_refused(num_reads: int, kind: ModelSpec) -> None:
-    with pytest.raises(ArgumentError, match=r"expected 1 to 9|reads an image once"):
+    with pytest.raises(ArgumentError, match=r"expected 1 to 9|can read an image only once"):
         RepeatedReader(kind, lambda images: {}, num_reads)
 
 
@@ -162,7 +162,7 @@ def test_the_command_reads_an_image_as_often_as_it_is_told(spot: Path, models_di
         ("pinhole", {"reads": 0}, "--reads 0: expected 1 to 9"),
         ("pinhole", {"reads": 10}, "--reads 10"),
         ("pinhole", {"reads": 3, "track": True}, "and --reads"),
-        ("flat", {"reads": 3}, "--reads: reads is 3, and model flat reads an image once"),
+        ("flat", {"reads": 3}, "--reads: reads is 3, but model flat can read an image only once"),
     ],
 )
 def test_wrong_calls_say_what_to_leave_out(
@@ -193,7 +193,7 @@ def test_the_server_answers_as_the_command_does(client: PoseClient, models_dir: 
         ("pinhole", {"reads": 0}, "reads is 0; expected 1 to 9"),
         ("pinhole", {"reads": 10}, "reads is 10; expected 1 to 9"),
         ("pinhole", {"reads": 8, "regions": [(0, 0, 96, 64)] * 9}, "times 9 regions times 8 reads are 72 runs"),
-        ("flat", {"reads": 2}, "model flat reads an image once"),
+        ("flat", {"reads": 2}, "model flat can read an image only once"),
     ],
 )
 def test_the_server_refuses(client: PoseClient, model: str, options: dict[str, Any], told: str) -> None:

@@ -55,8 +55,10 @@ def open_output(
     """Open the file or folder that ``--out`` names, or standard output.
 
     Raises:
-        UsageError: It holds something else, or results of another call.
+        UsageError: It is one of the images, a recording that exists, a folder that holds something else, or a URL that
+            cannot be written to.
         OutputError: It cannot be written.
+        Unavailable: The object store does not answer.
     """
     _refuse_images(arguments)
     if isinstance(form, ResultFormat):

@@ -76,8 +76,8 @@ class PinholeCamera:
             advice = "calibrate at the size you use, or scale K with the image"
             if self.size == (height, width):
                 advice = (
-                    "one of the two is turned by a quarter. Viewers turn a picture as its EXIF entry says, K has to be "
-                    "of the pixels as stored: store the pictures turned, or turn K"
+                    "one of the two is rotated by 90 degrees. Viewers rotate images as EXIF says, but K has to belong "
+                    "to the pixels as stored: save the images rotated, or rotate K"
                 )
             raise CameraError(
                 f"K belongs to frames of {self.size[0]}x{self.size[1]}, this one has {width}x{height}; {advice}"

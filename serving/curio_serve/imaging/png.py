@@ -59,8 +59,8 @@ def _check_unfolded(packed: list[memoryview], expected: int) -> None:
                 num_bytes += len(inflater.decompress(content[start : start + _PIECE_BYTES]))
                 if num_bytes > 2 * expected:  # interlacing adds a few bytes a row
                     raise ImageError(
-                        f"the PNG's image data goes on beyond its last row: {num_bytes} bytes and more, where its size "
-                        f"takes {expected}; save it again"
+                        f"the PNG holds more image data than an image of its size has: at least {num_bytes} bytes, "
+                        f"expected {expected}; save it again"
                     )
                 if inflater.eof:
                     return

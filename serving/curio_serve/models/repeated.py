@@ -53,8 +53,8 @@ class RepeatedReader:
         has_rotation = any(field.name in ("rotation", "rotation_6d") for field in spec.fields)
         if not spec.camera.camera_matrix or not has_rotation or any(len(kind.slots) != 1 for kind in spec.objects):
             raise ArgumentError(
-                f"reads is {num_reads}, and model {spec.name} reads an image once: more needs a camera in space, "
-                "rotations, and one answer an object"
+                f"reads is {num_reads}, but model {spec.name} can read an image only once: several reads need a camera "
+                "matrix, rotations, and one slot for each object"
             )
         self._run, self._cameras = run, VIRTUAL_CAMERAS[:num_reads]
         self._matrix = np.reshape(list(spec.camera.camera_matrix), (3, 3))

@@ -106,7 +106,7 @@ class Calibration:
     num_views: int
     """Photographs in which the board was found."""
     unused: tuple[Path, ...]
-    """Photographs in which it was not."""
+    """Photographs in which the board was not found."""
     board: Board
     """As it was found: its counts were given in squares, or in inner corners."""
 

@@ -36,7 +36,7 @@ class AugmentationStrength:
     contrast: tuple[float, float]
     """Least and largest factor on values' difference from their mean."""
     offset: float
-    """Largest that is then added or taken away."""
+    """Largest constant that is added to all values, or subtracted from them, after the contrast."""
     blur: float
     """Largest weight of the image behind a Gaussian of one pixel, beside the sharp one."""
     noise: float

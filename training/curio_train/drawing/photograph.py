@@ -48,7 +48,7 @@ def photograph_of(scene: Scene) -> np.ndarray:
 
 
 def is_stored_as_drawn(scene: Scene) -> bool:
-    """Whether the file of a scene's photograph shows what :func:`photograph_of` gives: it needs no change."""
+    """Whether a scene's photograph is what its file stores: not rotated, not undistorted, and no frame of a video."""
     return os.path.isfile(scene.photograph or "") and not any(scene.distortion) and not scene.exif_rotation
 
 

@@ -16,7 +16,7 @@ from curio_train.drawing.scenes import Scene
 from curio_train.errors import DataError
 
 TIMELINE = "image"
-"""Scenes are numbered along it, beginning with 0."""
+"""Name of the Rerun timeline that numbers the scenes from 0."""
 
 _MEDIA_TYPES = {b"\xff\xd8\xff": "image/jpeg", MAGIC: "image/png"}  # of files that begin so: all that Rerun decodes
 

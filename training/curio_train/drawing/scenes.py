@@ -48,9 +48,9 @@ class Scene:
     name: str
     """For the picture's file."""
     width: int
-    """Of the image that the camera matrix belongs to, pixels."""
+    """Width of the image that the camera matrix belongs to, pixels."""
     height: int
-    """Likewise."""
+    """Height of that image, pixels."""
     camera_matrix: np.ndarray
     """K [3, 3]."""
     objects: tuple[Placed, ...]

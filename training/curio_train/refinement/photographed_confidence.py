@@ -27,7 +27,7 @@ _NUM_READ, _FEWEST_READ = 100, 20  # photographs of one object; each takes a thi
 
 
 class Evidence(NamedTuple):
-    """What was read in photographs."""
+    """Calibration features of the poses that were read in photographs, and whether each pose is correct."""
 
     features: Float[np.ndarray, "photographs objects 3"]
     """Of the pose-correct logit."""

@@ -123,7 +123,7 @@ class PseudoLabels:
     def draw(
         self, count: int, seed: tuple[int, ...], largest_roll_deg: float = 0.0
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Crops of random photographs, as the errors of the localisation stage leave them.
+        """Crops of random photographs, off the labelled positions by errors like those of the localisation stage.
 
         Args:
             count: How many.

@@ -43,7 +43,10 @@ MAX_ROTATION_DEG, MAX_OFFSET, MAX_LOG_DEPTH = 25.0, 0.3, 0.15
 """How far a result may be from the estimate: rotation, diameters across the view, logarithm of the depth."""
 
 MIN_INLIER_RATIO = 0.3
-"""Of the silhouette: most renderings with the object have more (0.5 to 0.9), nine of ten of clutter alone have less."""
+"""Least fraction of the silhouette that fits, of a pose that is accepted.
+
+Most renderings with the object have 0.5 to 0.9; nine of ten renderings of clutter alone have less than this.
+"""
 
 
 class _Round(NamedTuple):

@@ -34,7 +34,7 @@ class RenderSettings:
     height: int
     """Of the images, pixels."""
     num_slots: int
-    """Objects an image."""
+    """Slots of objects in an image, some of which may be empty."""
     samples_per_pixel: int
     """Rays a pixel and slot."""
     outline_samples: int

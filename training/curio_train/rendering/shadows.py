@@ -89,7 +89,7 @@ class GroundShadows(RayQuery):
     def colors(
         self, tracer: LayerTracer, instances: Instances, location: ImageLocation, hit: Any, lit: Any
     ) -> list[Any]:
-        """All of it, whatever was hit."""
+        """The fraction of the light that a hit keeps: 1, whatever was hit."""
         return [1.0]
 
 

@@ -1,16 +1,17 @@
 """Parts of your own in free space: meshes, one camera, six degrees of freedom, no labels.
 
-One part is detected in two stages, several by a locator and templates.
+One part is detected in two stages, or by templates alone; several by a locator and templates.
 
 Images are rendered without end, as for LineMOD. What a data set's authors publish there is given or found out here:
 
 * distances are given (0.3 to 1 m unless said otherwise), the part's middle is anywhere in the frame;
 * the network reads where the middle is, wherever a CAD file has its origin, and the graph answers where the origin is;
-* it is seen from all sides alike, or from above alone;
+* the part is seen from all sides alike, or from above alone;
 * its symmetries are found from its shape; poses that differ by one count as equal, whatever is painted on it;
-* a mesh without colours has another base colour in each image, which the code has, too: near the part's colour in the
-  photographs where they differ from the background image, or any colour without one;
-* light is that of LineMOD: from the camera's half space, over an ambient radiance of 0.4.
+* one part without colours has a random base colour in each image, which the scene code holds: near ``--paint`` or the
+  colour that photographs show where they differ from the background image, else any; several parts have a fixed one;
+* light comes from the camera's half space, as LineMOD's does, over an ambient radiance of 0.4; in a known scene (with a
+  background image) it is no weaker than that of a lamp or a window.
 
 Parts on a plane are the world of ``tabletop``.
 """

@@ -94,9 +94,9 @@ class PoseRecording:
     """
 
     num_images: int
-    """Answered so far."""
+    """Images that were read so far, failed ones among them."""
     num_errors: int
-    """Of these, images without an answer, which have no message."""
+    """Images that failed. The recording has no message for them."""
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         from mcap_ros2.writer import Writer

@@ -48,7 +48,7 @@ class Drawing:
     over_black: Tensor
     """[num, 3, height, width], sRGB in [0, 1]."""
     through: Tensor
-    """Likewise, the fraction of what is behind that is seen."""
+    """Fraction of what is behind that is seen, [num, 3, height, width]."""
 
     @property
     def silhouette(self) -> Bool[Tensor, "num height width"]:

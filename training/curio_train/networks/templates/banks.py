@@ -29,7 +29,7 @@ class Banks(nn.Module):
     weights: Tensor
     """Bytes [objects, templates, RANK]."""
     match_scale: Tensor
-    """Of filters and weights together, [objects, RANK]."""
+    """Product of the scales of the bytes of filters and of weights, [objects, RANK]."""
     points: Tensor
     """Bytes [objects, templates, points, 3]."""
     points_scale: Tensor

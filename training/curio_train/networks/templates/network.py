@@ -17,11 +17,11 @@ class TemplateNetwork(nn.Module):
     """Localise, match, align."""
 
     trunk: Trunk
-    """Frozen features."""
+    """The frozen feature extractor."""
     localiser: Localiser
     """Finds centre proposals in the frame."""
     reader: PoseReader
-    """From places to a pose."""
+    """Finds the pose at the centre proposals."""
     outline: OutlineAlignment | None
     """What its poses are aligned by in the end; None: they stay as the reader answers them."""
     geometry: Geometry

@@ -55,7 +55,7 @@ class Places(NamedTuple):
     """Which objects these are, of all that the network knows."""
 
     def repeated(self, count: int) -> "Places":
-        """Each place that often, one after the other."""
+        """Each centre proposal ``count`` times in a row."""
         position_m, score = (of_all.repeat_interleave(count, dim=2) for of_all in self[:2])
         return Places(position_m, score, self.slots)
 

@@ -82,7 +82,7 @@ class GeneratedWorld(MeshWorld):
         return code
 
     def explainer(self) -> GroundHypotheses:
-        """What finds the scenes of images among rendered hypotheses, see ``hypotheses/``.
+        """A search for the scenes of images among rendered hypotheses, see ``hypotheses/``.
 
         Raises:
             UsageError: Scenes of this world cannot be found so.

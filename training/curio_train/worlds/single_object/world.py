@@ -147,7 +147,7 @@ class SingleObjectWorld(World):
         return MILD_EXPOSURE if self.object.known_scene else ANY_EXPOSURE
 
     def sample_lights(self, count: int, random: np.random.Generator) -> Float[Tensor, "count 3"]:
-        """Light of any strength, or in a known scene of at least that of a lamp or a window."""
+        """Random lights; in a known scene none is weaker than a lamp or a window."""
         return random_lights(count, random, MIN_LIGHT_OF_KNOWN_SCENE if self.object.known_scene else MIN_LIGHT)
 
     def sample_colors(self, count: int, random: np.random.Generator) -> dict[str, Tensor]:
