@@ -63,7 +63,8 @@ def test_impossible_values_name_the_flag(arguments: list[str], words: str) -> No
 @pytest.mark.parametrize(
     ("environment", "words"),
     [
-        ({"CURIO_SERVE_PROT": "1"}, "CURIO_SERVE_PROT is no setting"),
+        ({"CURIO_SERVE_PROT": "1"}, "CURIO_SERVE_PROT is no setting; known are .*CURIO_SERVE_CONFIG, "),
+        ({"CURIO_SERVE_DUMP_CONFIG": "true"}, "CURIO_SERVE_DUMP_CONFIG is no setting"),
         ({"CURIO_SERVE_FULL_DECODE": "maybe"}, "CURIO_SERVE_FULL_DECODE is 'maybe'"),
     ],
 )

@@ -175,13 +175,13 @@ def _file_arguments(path: Path) -> list[str]:
 
 
 def _environment_arguments(environment: Mapping[str, str]) -> list[str]:
-    known = {field.name for field in fields(ServeConfig)}
+    known = {field.name for field in fields(ServeConfig)} - _NOT_STORED
     arguments = []
     for variable, name, text in environment_settings(environment, ENV_PREFIX):
-        if name in _NOT_STORED:
-            continue
+        if name == "config":
+            continue  # the file has been read
         if name not in known:
-            names = ", ".join(sorted(ENV_PREFIX + name.upper() for name in known))
+            names = ", ".join(sorted(ENV_PREFIX + name.upper() for name in (*known, "config")))
             raise UsageError(f"environment variable {variable} is no setting; known are {names}")
         arguments += _arguments(name, _typed(variable, text, getattr(ServeConfig, name)), variable)
     return arguments
