@@ -31,7 +31,7 @@ class DeferredError:
             yield from items
 
     async def each_async(self, items: AsyncIterable[Item]) -> AsyncIterator[Item]:
-        """The same for asyncio."""
+        """What :meth:`each` does, for asyncio."""
         with self:
             async for item in items:
                 yield item

@@ -39,7 +39,7 @@ class Field:
     frame: str = ""
     """"camera", "world", "image", or "" where none applies."""
     activation: Activation = "linear"
-    """From the head's raw output to the physical value, see :meth:`activate`."""
+    """How the head's raw output becomes the physical value, see :meth:`activate`."""
     lower: tuple[float, ...] = ()
     """Smallest value of each component, or empty where unbounded."""
     upper: tuple[float, ...] = ()

@@ -51,7 +51,7 @@ class Settings:
     apply_exif_rotation: bool = False
     """Rotate the pixels as EXIF says, and K with them."""
     overlays: Path | None = None
-    """Where drawings go; None: nowhere."""
+    """Folder that drawings go to; None: nothing is drawn."""
     sources_root: Path = Path("/")
     """Folder that holds all images; drawings repeat the paths below it."""
     track_objects: int | None = None

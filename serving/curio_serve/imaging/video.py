@@ -6,7 +6,7 @@ _MOST_DIGITS = 6  # of a camera's number
 
 
 def open_video(source: str) -> cv2.VideoCapture:
-    """What OpenCV reads frames of; whether it could be opened is asked of it.
+    """Open a video or a camera with OpenCV; ask the result whether it could be opened.
 
     Args:
         source: Number of a camera, a video file, or a URL such as rtsp://….

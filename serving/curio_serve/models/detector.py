@@ -38,7 +38,7 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class _Limits(NamedTuple):
-    """What is left out of an answer."""
+    """Limits beyond which detections are left out of an answer."""
 
     min_confidence: float
     max_detections: int | None

@@ -32,7 +32,7 @@ class Golden:
     image: np.ndarray
     """uint8 RGB [height, width, 3] of the size of the model's camera."""
     outputs: Mapping[str, np.ndarray]
-    """By name, without a batch; at least one."""
+    """Outputs by name, without a batch dimension; at least one."""
 
     def differences(self, model: Model) -> dict[str, float]:
         """Largest absolute difference between each stored output and the model's.

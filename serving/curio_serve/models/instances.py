@@ -27,7 +27,7 @@ _OF_SCENE = "light"
 
 
 class Rows(NamedTuple):
-    """What was found in one image."""
+    """The detections in one image, a row each."""
 
     values: Values
     """Outputs by name; those of objects have a row each."""

@@ -68,7 +68,7 @@ class Model:
     version: int
     """Of the model folder; 0 for a file outside one."""
     spec: ModelSpec
-    """As stored in the file, with the reliability from beside it."""
+    """Specification as the file stores it, with the reliability from the file beside it."""
     camera: CanonicalCamera
     """The canonical camera, of which its input is an image."""
     slots: Sequence[Slot]
@@ -110,7 +110,7 @@ class Model:
         return f"{self.name}/{self.version}" if self.version else self.name
 
     def of(self, objects: Collection[str]) -> "Model":
-        """The same model, which answers these kinds of objects alone, in less time if its graph can leave others out.
+        """A model that answers these kinds of objects alone, in less time if its graph can leave others out.
 
         Args:
             objects: Names; of those that it does not know nothing is answered. None: all.

@@ -50,7 +50,7 @@ def center_of(kind: ObjectModel) -> Array:
 
 
 def middle_from_origin(origin_m: Array, rotation: Array, center_m: Array) -> Array:
-    """Where middles are, [..., 3].
+    """Positions of the middles, [..., 3].
 
     Args:
         origin_m: Where the origins are, [..., 3]: the translation of cam_from_obj.
@@ -62,7 +62,7 @@ def middle_from_origin(origin_m: Array, rotation: Array, center_m: Array) -> Arr
 
 
 def origin_from_middle(middle_m: Array, rotation: Array, center_m: Array) -> Array:
-    """Where origins are, [..., 3]; the inverse of :func:`middle_from_origin`."""
+    """Positions of the origins, [..., 3]; the inverse of :func:`middle_from_origin`."""
     result: Array = middle_m - rotation @ center_m
     return result
 

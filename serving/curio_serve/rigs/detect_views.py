@@ -39,7 +39,7 @@ _EXPECTED = 3  # of what the views say, the surest that are looked for in all of
 
 @dataclass(frozen=True, eq=False)
 class RigView:
-    """What one camera of a rig sees."""
+    """The frame of one camera of a rig, and where the camera stands."""
 
     pixels: Array
     """uint8 RGB [height / reduction, width / reduction, 3]."""

@@ -115,7 +115,7 @@ class Track:
             self._num_flips += 1
 
     def confidence(self, time_s: float, keep_s: float) -> float:
-        """That of the last measurement; while the object is not seen it falls to 0 over ``keep_s``."""
+        """Confidence of the last measurement; while the object is not seen it falls to 0 over ``keep_s``."""
         unseen = 0.0 if self.is_seen else (time_s - self.seen_s) / max(keep_s, 1e-9)
         return self.measured.confidence * max(0.0, 1 - unseen)
 

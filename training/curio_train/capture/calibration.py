@@ -51,7 +51,7 @@ class Board:
 
     @property
     def readings(self) -> "tuple[Board, ...]":
-        """What the counts may mean: inner corners, as OpenCV counts those of a plain chessboard, or squares.
+        """Boards that the counts may mean: of inner corners, as OpenCV counts on a plain chessboard, or of squares.
 
         The larger board comes first: a part of it may be taken for the smaller one, but not the other way round.
         """
@@ -108,7 +108,7 @@ class Calibration:
     unused: tuple[Path, ...]
     """Photographs in which the board was not found."""
     board: Board
-    """As it was found: its counts were given in squares, or in inner corners."""
+    """The board as it was found: its counts were given in squares, or in inner corners."""
 
 
 def calibrate(folder: Path, board: Board) -> Calibration:

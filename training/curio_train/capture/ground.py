@@ -30,7 +30,7 @@ def _plane(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, float, flo
 
 
 def to_world(structure: Structure) -> Structure:
-    """The same in the world's frame, still of arbitrary scale.
+    """A structure moved to the world's frame, still of arbitrary scale.
 
     The plane that most points lie on becomes y = 0, cameras stand above it. The origin is what the first camera's
     optical axis meets there; that camera stands towards +z.
@@ -69,7 +69,7 @@ def _moved(structure: Structure, new_from_old: np.ndarray) -> Structure:
 
 
 def scaled(structure: Structure, factor: float) -> Structure:
-    """The same, larger by a factor about the origin."""
+    """A structure scaled about the origin by a factor."""
     matrices = structure.cam_from_world.copy()
     matrices[:, :3, 3] *= factor
     return replace(structure, points=structure.points * factor, cam_from_world=matrices)

@@ -36,7 +36,7 @@ class CameraPoseFile:
     file: Path
     """Path of the file."""
     entries: Mapping[str, Any]
-    """By photograph."""
+    """What the file says of each photograph, by its name."""
     flag: str = "--plane"
     """The flag that named the file."""
 
@@ -71,7 +71,7 @@ class CameraPoseFile:
         return _rigid(self._entry(photograph)["cam_from_world"], self._where(photograph))
 
     def pose_above_plane(self, photograph: Path) -> np.ndarray:
-        """The same of a camera that has to be above the plane and look down on it, in metres.
+        """The camera pose of a photograph, in metres, whose camera has to look down on the plane from above: [4, 4].
 
         Raises:
             CameraError: The file has no pose, another one, or says that it is not in metres.

@@ -74,7 +74,7 @@ class Page:
             raise UsageError(f"--port {port}: cannot be listened on ({exc}); choose another") from exc
         self._thread = threading.Thread(target=self._server.serve_forever, name="page", daemon=True)
         self.address = f"http://{_HOST}:{self._server.server_address[1]}/"
-        """Where it is."""
+        """The page's URL."""
 
     def __enter__(self) -> Self:
         self._thread.start()

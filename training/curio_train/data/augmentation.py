@@ -69,7 +69,7 @@ WHOLE_FRAME = AugmentationStrength(
     blur=1.0,
     noise=0.05,
 )
-"""The same where an object is a few pixels in clutter: its colour is what tells it from other things."""
+"""Strength for whole frames: an object is a few pixels in clutter, and its colour tells it from other things."""
 
 KNOWN_SCENE = AugmentationStrength(
     occluded=0.25,

@@ -22,9 +22,9 @@ class BackgroundDifference(NamedTuple):
     difference: Float[Tensor, "num height width"]
     """Largest of the three channels', sRGB, exposure allowed for."""
     differs: Bool[Tensor, "num height width"]
-    """Where it is clear."""
+    """Pixels where the difference is clear."""
     shaded: Bool[Tensor, "num height width"]
-    """Where the photograph is the background image made darker."""
+    """Pixels where the photograph is the background image made darker."""
 
 
 def compare(

@@ -42,12 +42,12 @@ _OFFLINE = "or download it elsewhere and name its folder: --data DIR"
 
 
 def linemod_folder(cache: Path) -> Path:
-    """Where a download is kept."""
+    """The folder that a download is kept in."""
     return cache.expanduser() / "bop" / "lm"
 
 
 def missing_archives(cache: Path, archives: Sequence[str] = TRAINING_ARCHIVES) -> list[str]:
-    """Those of the archives that were not downloaded yet."""
+    """Archives that were not downloaded yet."""
     state = linemod_folder(cache) / _STATE
     return [name for name in archives if not (state / f"{name}.done").exists()]
 

@@ -33,7 +33,7 @@ class FoundColor:
     """A part's colour."""
 
     hex: str
-    """As in HTML, sRGB, such as #8a6f4c."""
+    """The colour as HTML writes it, sRGB, such as #8a6f4c."""
     num_used: int
     """Photographs that show it."""
     num_compared: int

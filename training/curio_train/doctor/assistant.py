@@ -27,7 +27,7 @@ class Judgement:
     lost: float
     """Fraction of the pixels that are black or white."""
     difference: float
-    """From the most similar photograph that was kept: largest difference of two places, levels of 255."""
+    """Largest difference between a frame's thumbnail and that of the most similar kept photograph, levels of 255."""
     board: bool | None
     """Whether the board is seen; None: none is looked for."""
     in_sight: float | None

@@ -34,7 +34,7 @@ class SceneContext:
     """Meshes, light and ground: everything needed to draw a scene that its code does not hold."""
 
     meshes: Mapping[str, Mesh]
-    """By the object's name; the one named "" stands for every object without its own."""
+    """Meshes by the object's name; the one named "" stands for every object without its own."""
     ambient: float = AMBIENT
     """Radiance from everywhere."""
     light: np.ndarray | None = None
@@ -44,7 +44,7 @@ class SceneContext:
     up: tuple[float, ...] = (0.0, -1.0, 0.0)
     """Camera frame, the axis that it is carried round."""
     ground: Ground | None = None
-    """What the objects stand on, camera frame, or None."""
+    """Ground that the objects stand on, camera frame, or None."""
 
     @classmethod
     def of_world(cls, world: MeshWorld) -> "SceneContext":

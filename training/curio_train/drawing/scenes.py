@@ -38,7 +38,7 @@ class Placed:
     color_srgb: tuple[float, ...] = (1.0, 1.0, 1.0)
     """Albedo [3] that multiplies the mesh's own."""
     confidence: float = 1.0
-    """Its opacity."""
+    """Opacity that the object is drawn with, 0 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Scene:
     """Objects before a camera."""
 
     name: str
-    """For the picture's file."""
+    """Name of the picture's file, without its suffix."""
     width: int
     """Width of the image that the camera matrix belongs to, pixels."""
     height: int
@@ -58,7 +58,7 @@ class Scene:
     light: np.ndarray | None
     """Camera frame, towards the light [3], or None: not known."""
     photograph: Path | None = None
-    """That the objects were found in, or None; a frame of a video is ``clip.mp4#12``."""
+    """Photograph that the objects were found in, or None; a frame of a video is ``clip.mp4#12``."""
     world: str | None = None
     """Name of the generated world that the scene is a code of, or None."""
     distortion: tuple[float, ...] = ()

@@ -193,7 +193,7 @@ def _confidences(world: World, predicted: SceneCode, true: SceneCode) -> tuple[l
 
 
 class _Scored(NamedTuple):
-    """What a network says of held-out images."""
+    """A network's scene codes for held-out images, and their errors."""
 
     code: SceneCode
     errors: dict[str, Tensor]

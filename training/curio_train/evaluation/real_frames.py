@@ -98,7 +98,7 @@ def estimate_frames(subject: Subject, dataset: BopDataset, targets: Sequence[Ann
 def _read_frames(
     subject: Subject, dataset: BopDataset, wanted: Set[tuple[int, int]]
 ) -> dict[tuple[int, int], list[Estimate]]:
-    """By frame, one estimate an object."""
+    """One estimate for each object, by frame."""
     frames = [
         frame
         for scene_id in sorted({scene for scene, _ in wanted})

@@ -66,11 +66,11 @@ class Graph(nn.Module):
         return self._outputs.from_code(self.network(pixels))
 
     def in_parts(self, pixels: Tensor, num_at_once: int = _IMAGES_AT_ONCE) -> dict[str, Tensor]:
-        """The same, few images at once."""
+        """What :meth:`read` returns, computed for few images at once."""
         return joined([self.read(part) for part in pixels.split(num_at_once)])
 
     def judged(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """What is compared of outputs: positions of the middles. Those of a distant origin move with every rounding."""
+        """Outputs as they are compared: positions are those of middles; a distant origin moves with every rounding."""
         return self._outputs.at_middles(outputs)
 
     def where(self, stable: Bool[Tensor, "batch slots"], outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -15,7 +15,7 @@ from curio_train.worlds.base import Camera
 
 
 def stage_tensors(network: TwoStageNetwork) -> list[str]:
-    """What a graph of the network returns after its outputs while it is traced: names of tensors."""
+    """Names of the tensors that a traced graph of the network returns after its outputs."""
     return [name for note in network.stage_notes().values() for name in note.tensors.values()]
 
 

@@ -32,12 +32,12 @@ _SECONDS = "seconds"
 
 
 class Found(NamedTuple):
-    """What a search found."""
+    """The scenes that a search found."""
 
     sources: Sequence[ImageSource]
     """Images with scenes for each of the world's stages."""
     seconds: float
-    """That the search took, over all sessions."""
+    """Seconds that the search took, over all sessions."""
 
 
 class Images(Protocol):
@@ -50,7 +50,7 @@ class Images(Protocol):
 
 
 def search_of(world: World, reading: DecoderKind | None, seed: int, cache: Path) -> Callable[[Path], Found]:
-    """What finds, given the run folder, the scenes of training images.
+    """A function that finds the scenes of training images, given the run folder.
 
     Args:
         world: That the images are of.
@@ -85,7 +85,7 @@ def search_of(world: World, reading: DecoderKind | None, seed: int, cache: Path)
 
 
 def explainer_of(world: World) -> Explainer:
-    """What finds the scenes of a generated world's images.
+    """A search for the scenes of a generated world's images.
 
     Raises:
         UsageError: The world has no hypotheses, or scenes of this world cannot be found so.

@@ -52,7 +52,7 @@ def _forget_photographs(trainer: Trainer, cache: Path) -> None:
 
 
 def _training_images(config: RunConfig, world: World, cache: Path) -> Callable[[Path], Found]:
-    """What gives the training images of a world's stages, once there is a run folder."""
+    """A function that gives the training images of a world's stages, once there is a run folder."""
     if config.terms.hypotheses:
         return search_of(world, config.network.reading, config.seed, cache)
     # Where predictions are rendered, crops are cut from whole frames around the first stage's answers.

@@ -24,7 +24,7 @@ class Learner(Generic[N]):
     """A network with its optimiser."""
 
     network: N
-    """What learns."""
+    """The network that learns."""
 
     def __init__(self, network: N, learning_rate: float, matrix_learning_rate: float = 0.0) -> None:
         """Keep what the optimiser will need.

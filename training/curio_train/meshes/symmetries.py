@@ -56,21 +56,21 @@ class Symmetries:
         return result
 
     def about(self, axis: np.ndarray) -> "Symmetries":
-        """Those alone that keep the direction of an axis [3] of length 1."""
+        """The symmetries that keep the direction of an axis [3] of length 1."""
         return Symmetries(
             tuple(matrix for matrix in self.discrete if axis @ matrix[:3, :3] @ axis > _PARALLEL),
             tuple((own, point) for own, point in self.continuous if abs(own @ axis) > _PARALLEL),
         )
 
     def leaving(self, point_m: np.ndarray, largest_m: float) -> "Symmetries":
-        """Those alone that move a point [3] by no more than some distance, metres."""
+        """The symmetries that move a point [3] by no more than some distance, metres."""
         return Symmetries(
             tuple(m for m in self.discrete if np.linalg.norm(m[:3, :3] @ point_m + m[:3, 3] - point_m) <= largest_m),
             tuple((a, at) for a, at in self.continuous if np.linalg.norm(np.cross(a, point_m - at)) <= largest_m),
         )
 
     def in_frame(self, rotation: np.ndarray, translation_m: np.ndarray) -> "Symmetries":
-        """The same motions of another frame, new_from_own: rotation [3, 3], then translation [3]."""
+        """The symmetries in another frame, which new_from_own leads to: rotation [3, 3], then translation [3]."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = rotation, translation_m
         discrete = tuple(matrix @ motion @ np.linalg.inv(matrix) for motion in self.discrete)

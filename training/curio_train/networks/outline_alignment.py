@@ -52,7 +52,7 @@ class OutlinePose(NamedTuple):
 
 
 class _Crops(NamedTuple):
-    """What poses are aligned in."""
+    """Crops in which poses are aligned."""
 
     crops: Float[Tensor, "batch 3 side side"]
     """SRGB in [0, 1], around the objects."""
@@ -69,7 +69,7 @@ class _Crops(NamedTuple):
 
 
 class _Edges(NamedTuple):
-    """Where the clearest edge is across each point of an outline."""
+    """The clearest edge across each point of an outline."""
 
     distance_px: Float[Tensor, "batch points"]
     """Outwards."""
@@ -161,7 +161,7 @@ class OutlineAlignment(nn.Module):
         return code | {ROTATION_6D: rotation_6d, TRANSLATION: position * diameter_m[:, None]}
 
     def note(self, tensors: dict[str, str], diameter_m: float) -> OutlineStageNote:
-        """What serving has to know to run the alignment alone.
+        """The numbers that serving needs to run the alignment alone.
 
         Args:
             tensors: Names in the exported graph of what :meth:`of_code` gives beside the code.

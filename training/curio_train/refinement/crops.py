@@ -45,7 +45,7 @@ class PoseAndLight(NamedTuple):
     """Towards the light; its length is the strength."""
 
     def updated(self, update: PoseUpdate, diameter_m: float) -> "PoseAndLight":
-        """After an update."""
+        """Pose and light after an update."""
         scale = update.log_depth.exp()
         across, depth = self.translation_m[:, :2] + update.across * diameter_m, self.translation_m[:, 2:]
         translation_m = torch.cat([across * scale, depth * scale], dim=1)
@@ -60,7 +60,7 @@ class Crops:
     images: Float[Tensor, "batch 3 side side"]
     """The crops."""
     backgrounds: Float[Tensor, "batch 3 side side"]
-    """The same without the object."""
+    """The crops without the object."""
     mask: Float[Tensor, "batch 1 side side"]
     """1 inside and around the silhouette, where crops and renderings are compared; else 0."""
     crop_from_cam: Float[Tensor, "batch 3 3"]
@@ -90,7 +90,7 @@ class Crops:
         }
 
     def blurred(self, times: int) -> "Crops":
-        """The same, blurred."""
+        """These crops, blurred."""
         images, backgrounds = self.images, self.backgrounds
         for _ in range(times):
             images, backgrounds = blurred(images), blurred(backgrounds)

@@ -31,7 +31,7 @@ class NamedMesh(NamedTuple):
     label: str
     """Names it in errors."""
     mesh: Mesh
-    """As in its file."""
+    """The mesh as its file has it."""
 
 
 class DetectionRefiner:
@@ -84,7 +84,7 @@ class DetectionRefiner:
     def _refine(
         self, refiner: RenderAndCompare, crop: PinholeCrop, detections: Sequence[Detection], light: Sequence[float]
     ) -> None:
-        """Those of one object."""
+        """Refine the detections of one object."""
         image = torch.from_numpy(np.ascontiguousarray(crop.image)).permute(2, 0, 1)[None]
         center_m = self._centers_m[detections[0].object]
         code = _code(detections, light, crop.canonical_from_cam, center_m)

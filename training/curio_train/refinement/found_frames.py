@@ -93,7 +93,7 @@ class FrameExplainer:
 
 
 def template_reader(world: TwoStageWorld, cache: Path) -> Callable[[Tensor], SceneCode]:
-    """What compares frames with renderings of the object from all sides; these are drawn when the first frame comes.
+    """A function that compares frames with renderings of the object from all sides, drawn when the first frame comes.
 
     It raises CheckpointError if the weights of the pretrained features are missing.
 
@@ -112,7 +112,7 @@ def template_reader(world: TwoStageWorld, cache: Path) -> Callable[[Tensor], Sce
 
 
 def stage_sources(world: TwoStageWorld, frames: TrainingFrames, code: SceneCode, seed: int) -> list[ImageSource]:
-    """What each stage learns from frames and the codes that were found for them.
+    """The images that each stage learns from: frames, with the codes that were found for them.
 
     Args:
         world: With both stages.

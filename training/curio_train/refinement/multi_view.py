@@ -45,11 +45,11 @@ class Estimates:
     """Poses of one object in photographs."""
 
     predicted: SceneCode
-    """By the network."""
+    """Poses that the network predicted."""
     refined: SceneCode
-    """The same after render-and-compare."""
+    """These poses after render-and-compare."""
     accepted: Bool[Tensor, " num"]
-    """Where render-and-compare accepted its result."""
+    """Whether render-and-compare accepted its result."""
 
 
 class _Predictions(NamedTuple):

@@ -43,7 +43,7 @@ class _Crops(NamedTuple):
 
     images: UInt8[Tensor, "crops 3 side side"]
     backgrounds: UInt8[Tensor, "crops 3 side side"]
-    """The same without the object."""
+    """The crops without the object."""
     assumed_depth_m: Float[Tensor, "crops 1"]
 
 
@@ -91,7 +91,7 @@ class OwnCrops(ImageSource):
 
     @cached_property
     def _crops(self) -> _Crops:
-        """Those of the frames, then those of the photographs."""
+        """Crops of the frames, then of the photographs."""
         localise = copy.deepcopy(self._localise).cpu().eval()  # frames are cut there, and its batch norm stays as it is
         with torch.no_grad():
             parts = []

@@ -76,11 +76,11 @@ class Refined(NamedTuple):
     code: dict[str, Tensor]
     """Refined positions and rotations where the result was accepted, everything else as it was."""
     accepted: Bool[Tensor, " batch"]
-    """Where it was."""
+    """Whether it was accepted."""
     residual: Float[Tensor, " batch"]
     """Mean robust residual of the optimised poses, accepted or not, inside and around their silhouettes, 0 to 1."""
     light: Float[Tensor, "batch 3"]
-    """That the optimised poses are rendered in; the code keeps the estimate's."""
+    """Light that the optimised poses are rendered in; the code keeps the estimate's."""
 
 
 class RenderAndCompare:

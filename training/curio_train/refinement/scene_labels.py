@@ -127,7 +127,7 @@ class SceneLabels:
 def read_often(
     frames: UInt8[Tensor, "num 3 height width"], matrix: np.ndarray, predict: Predict, through: Sequence[VirtualCamera]
 ) -> Reads:
-    """What a network reads in photographs through slightly turned cameras.
+    """Poses that a network reads in photographs through slightly turned cameras.
 
     Args:
         frames: Of the network's camera.

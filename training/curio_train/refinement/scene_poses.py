@@ -75,7 +75,7 @@ def _of_object(
     cam_from_world: Pose[np.ndarray],
     kind: ObjectKind,
 ) -> Pose[np.ndarray]:
-    """Its poses in the photographs."""
+    """The poses of one object in the photographs."""
     photograph = reads.photograph[chosen]
     rotation = matrix_from_rotation_6d(reads.code[ROTATION_6D][:, slot]).double().numpy()[chosen]
     position_m = correction * reads.code[TRANSLATION][:, slot].double().numpy()[chosen]

@@ -9,7 +9,7 @@ from torch import Tensor
 from curio_train.networks.crop_camera import about_axis
 
 LARGEST_ROLL_DEG = 20.0
-"""By which cameras are rolled, to either side."""
+"""Largest angle by which cameras are rolled, to either side."""
 
 _LARGEST_PAN_DEG, _LARGEST_TILT_DEG = 6.0, 5.0
 _LARGEST_LOG_ZOOM = 0.18

@@ -37,11 +37,11 @@ class Pieces:
     instance: Any
     """Number of the instance."""
     edge: Any
-    """Of the table."""
+    """Number of the edge in the table of edges."""
     start: Any
     """Where the piece begins, as a fraction of the edge's projection."""
     span: Any
-    """Its length, likewise."""
+    """Length of the piece, as a fraction of the edge's projection."""
     length: Any
     """In pixels."""
     x: Any

@@ -15,7 +15,7 @@ class Ground:
     """A plane as a camera above it sees it; it fills the whole image, also above the horizon."""
 
     up: np.ndarray
-    """Its unit normal [3], camera frame."""
+    """Unit normal of the ground [3], camera frame."""
     camera_height_m: float
     """Height of the camera above the ground, metres."""
     albedo_srgb: float

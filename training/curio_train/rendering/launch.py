@@ -50,7 +50,7 @@ class View:
     images: tuple[int, int]
     """First and last + 1 image."""
     query: RayQuery
-    """What the rays look for."""
+    """What is asked of the rays."""
     bounds: ImageBounds
     """Of the part's instances."""
     camera: Any
@@ -71,9 +71,9 @@ class Hits:
     """Rays that hit their object."""
 
     lane: Any
-    """Which rays."""
+    """Numbers of the rays."""
     at: LocationsOfRays
-    """Where they pass."""
+    """Locations in the image that the rays pass through."""
     record: Any
     """Faces hit, Mitsuba's preliminary intersections."""
     occlusion: Occlusion

@@ -62,7 +62,7 @@ class _Mean:
         self._sum[where] += weight.view(-1, *[1] * (descriptors.dim() - 1)) * robust * descriptors
 
     def values(self) -> Float[Tensor, "*shape size"]:
-        """As long as the first ones."""
+        """Means of the descriptors, scaled to the lengths of the first ones."""
         return self._length * F.normalize(self._sum, dim=-1)
 
 

@@ -68,7 +68,7 @@ class Batch:
     code: SceneCode | None = None
     """The true scene code, for supervision and scoring alone; None if labels are not used."""
     given: SceneCode = field(default_factory=dict)
-    """What is known of each image beside its code, such as the assumed depth of a crop."""
+    """Values known of each image beside its code, such as the assumed depth of a crop."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ class World(ABC):
     """A family of scenes that can be described, drawn at random, and rendered."""
 
     name: str
-    """As on the command line; of a stage, as in the names of its losses."""
+    """The world's name on the command line; of a stage, the name that its losses have."""
     layout: Layout
     """Of its scene code."""
     camera: Camera
@@ -298,7 +298,7 @@ class HypothesisWorld(Protocol):
     """A world that finds the scenes of its images."""
 
     def explainer(self) -> Explainer:
-        """What finds them.
+        """A search for the scenes of images.
 
         Raises:
             UsageError: Scenes of this world cannot be found so.

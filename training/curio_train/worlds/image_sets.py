@@ -70,7 +70,7 @@ class StoredImages(ImageSource):
         return StoredImages(self.images[:count], code, seed=self._seed, shuffle=self._shuffle, backgrounds=backgrounds)
 
     def with_code(self, code: SceneCode) -> "StoredImages":
-        """The same images with these codes."""
+        """These images with other codes."""
         return StoredImages(self.images, code, seed=self._seed, shuffle=self._shuffle, backgrounds=self._backgrounds)
 
     def batch(self, step: int, size: int) -> Batch:
@@ -147,7 +147,7 @@ def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """What :func:`save_arrays` wrote.
+    """Read what :func:`save_arrays` wrote.
 
     Raises:
         DataError: The file is damaged.

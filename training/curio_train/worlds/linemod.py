@@ -34,7 +34,7 @@ from curio_train.worlds.single_object.world import Object, SingleObjectWorld, po
 SIDE_PX = 128
 NEAR_M, FAR_M = 0.5, 1.5
 SCAN_EXCESS_M = 1e-3
-"""By which the data set's scanned meshes are too thick on every side (docs/experiments/real_photographs.md)."""
+"""How much the data set's scanned meshes are too thick on every side (docs/experiments/real_photographs.md)."""
 
 _log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ Pixels: TypeAlias = np.ndarray
 
 @dataclass(frozen=True)
 class Topics:
-    """What to read of a recording."""
+    """The topics that are read of a recording."""
 
     image: str | None = None
     """Topic of the images; None: the only one there is."""

@@ -85,7 +85,7 @@ class CropPose:
     position_covariance_m2: Array
     """Spread of the network's own cells and crops [3, 3]."""
     rotation_variance: float
-    """The same of the rotation about each axis, rad²."""
+    """Variance of the rotation about each axis, rad²."""
     light: Array
     """[3], towards the light; its length is the strength."""
 

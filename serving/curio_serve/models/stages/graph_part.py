@@ -23,7 +23,7 @@ _FLOAT32 = 1
 
 
 def parse_note(kind: Callable[..., Note], text: str, is_valid: Callable[[Note], bool], where: str) -> Note:
-    """What the exporter notes about a part.
+    """Read what the exporter noted about a part of the graph.
 
     Args:
         kind: Makes it of its fields.

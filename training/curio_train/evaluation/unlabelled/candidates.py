@@ -17,13 +17,13 @@ from curio_train.refinement.template_poses import uses_templates
 from curio_train.worlds.options import ALL_CLASSES, LinemodOptions
 
 SELF_TRAINED = ", self-trained"
-"""What follows the method's name where real frames without labels were learned from."""
+"""Added to the method's name where real frames without labels were learned from."""
 
 TWO_STAGES = ", two stages"
-"""What follows the name of one of the paper's methods where it trained the two-stage detector."""
+"""Added to the name of one of the paper's methods where it trained the two-stage detector."""
 
 BY_TEMPLATES = ", templates"
-"""What follows the name of a method that trained a locator, where templates tell the poses."""
+"""Added to the name of a method that trained a locator, where templates tell the poses."""
 
 ONE_STAGE_METHODS = ("our", "noncur", "super")
 
@@ -37,8 +37,8 @@ class Candidate:
     name: str
     """The class; several as on the command line."""
     method: str
-    """That trained it; ``, two stages`` follows where it is one of the paper's and the network is not, ``, templates``
-    where a locator was trained, ``, self-trained`` where unlabelled real frames took part."""
+    """Method that trained it; ``, two stages`` follows where it is one of the paper's and the network is not,
+    ``, templates`` where a locator was trained, ``, self-trained`` where unlabelled real frames took part."""
     weights_sha256: str
     """Of the last checkpoint's tensors, or of the model file."""
 

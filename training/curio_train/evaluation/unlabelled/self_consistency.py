@@ -152,7 +152,7 @@ def _row(found: Pose, number: int) -> Pose:
 def adjusted(
     found: Reliability, answers: Sequence[Answers], pairs: Sequence[Pairs], num_photographs: int
 ) -> Reliability:
-    """What renderings say, adjusted to photographs.
+    """The reliability that renderings gave, adjusted to photographs.
 
     The confidence is calibrated by which pairs agree. Bounds become wider by what gaps between photographs are larger
     than gaps between renderings would be, relative to the bounds. They never become narrower: errors that all
@@ -179,7 +179,7 @@ def adjusted(
 
 
 def adjustment(found: Reliability) -> str:
-    """What photographs changed, in a line."""
+    """One line that says what photographs changed."""
     weight, offset = found.calibration
     if not found.position_widening:
         wider = f"bounds as on renderings: fewer than {_FEWEST_PAIRS} pairs of answers are sure"

@@ -28,11 +28,11 @@ class ObjectsNetwork(nn.Module):
     locator: LocatorNetwork
     """Finds places; its trunk's features are the reader's, too."""
     reader: PoseReader
-    """From places to poses."""
+    """Finds the poses at the centre proposals."""
     geometries: Sequence[Geometry]
     """One an object."""
     outline: OutlineAlignment | None
-    """What poses are aligned by in the end; None: they stay as the reader answers them."""
+    """Aligns poses with outlines in the end; None: they stay as the reader answers them."""
     _matrix: Tensor
     _diameter_m: Tensor
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from curio_train.networks.templates.trunk import COARSE_STRIDE
 
 MAX_ROLL_DEG = 45.0
-"""By which cameras that look at an upright object are rolled, to either side."""
+"""Largest angle by which cameras that look at an upright object are rolled, to either side."""
 
 NUM_VIEWS, NUM_ROLLS = 220, 7
 """Directions on the upper hemisphere, about 10 degrees apart, and rolls of 15 degrees for each."""
@@ -57,7 +57,7 @@ class Geometry:
 
     @property
     def rotations(self) -> Float[Tensor, "templates 3 3"]:
-        """What templates show; of an object that may be rolled in any way, crops are rolled to where it is upright."""
+        """Rotations that templates show; where an object may be rolled in any way, crops of it are rolled upright."""
         return viewpoints(num_views(self.any_side), NUM_ROLLS, self.any_side)
 
     @property
@@ -67,7 +67,7 @@ class Geometry:
 
     @property
     def localising_rotations(self) -> Float[Tensor, "templates 3 3"]:
-        """What templates of whole frames show."""
+        """Rotations that templates for whole frames show."""
         if not self.any_side:
             return viewpoints(LOCALISING_VIEWS, LOCALISING_ROLLS)
         return viewpoints(2 * LOCALISING_VIEWS, QUARTER_TURNS * LOCALISING_ROLLS, True, QUARTER_TURNS * MAX_ROLL_DEG)

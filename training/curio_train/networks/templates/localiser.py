@@ -41,7 +41,7 @@ class Localiser(nn.Module):
     weights: Tensor
     """Of the filters in each template, divided by the score's standard deviation on background."""
     offsets: Tensor
-    """What is added, so that the mean score on background is 0."""
+    """Added to scores, so that their mean on background is 0."""
     _pixels: Tensor
     _rays: Tensor
     _depths: Tensor

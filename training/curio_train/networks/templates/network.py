@@ -23,7 +23,7 @@ class TemplateNetwork(nn.Module):
     reader: PoseReader
     """Finds the pose at the centre proposals."""
     outline: OutlineAlignment | None
-    """What its poses are aligned by in the end; None: they stay as the reader answers them."""
+    """Aligns poses with outlines in the end; None: they stay as the reader answers them."""
     geometry: Geometry
     """Of frames and object."""
 

@@ -45,7 +45,7 @@ class Effort(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where each object may be."""
+    """Centre proposals: positions where each object may be."""
 
     position_m: Float[Tensor, "batch objects num 3"]
     """Of the object's centre, camera frame."""
@@ -117,7 +117,7 @@ class PoseReader(nn.Module):
     pose_correct: Tensor
     """Weights of the pose-correct logit's features and its offset, [objects, 4]; calibrated on renderings."""
     presence: Tensor
-    """Those of the presence logit, [objects, 3]."""
+    """Weights of the presence logit's features and its offset, [objects, 3]; calibrated on renderings."""
     _matrix: Tensor
     _diameter_m: Tensor
     _nearest_m: Tensor

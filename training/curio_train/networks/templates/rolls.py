@@ -15,7 +15,7 @@ from curio_train.networks.crop_camera import about_axis
 from curio_train.networks.templates.geometry import MAX_ROLL_DEG, NUM_ROLLS
 
 ROLLS_DEG = (-2 * MAX_ROLL_DEG / NUM_ROLLS, 0.0, 2 * MAX_ROLL_DEG / NUM_ROLLS)
-"""From where the object stands upright: there are templates of just these rolls."""
+"""Rolls away from upright; templates show exactly these."""
 
 
 def upright_rolls(

@@ -89,7 +89,7 @@ class TwoStageNetwork(nn.Module):
     second: StageNetwork
     """The crop-pose stage."""
     outline: OutlineAlignment | None
-    """What its poses are aligned by in the end; None: they stay as they are read."""
+    """Aligns poses with outlines in the end; None: they stay as they are read."""
     rightness: Tensor
     """[2], weight and offset from the feature ``pose_correct`` to a calibrated logit; set after training."""
     presence: Tensor
@@ -116,7 +116,7 @@ class TwoStageNetwork(nn.Module):
         return self._calibrated(found), _crop_stage_tensors(found.crops, found.read) | found.outline
 
     def stage_notes(self) -> dict[str, CropStageNote | OutlineStageNote]:
-        """What serving has to know to run the last stages alone, by the metadata's key: refinement and alignment."""
+        """Notes that serving needs to run the last stages alone, refinement and alignment, by the metadata's key."""
         optics = self._optics
         tensors = {name: _CROP_STAGE + name for name in (crop_stage.INPUT, *crop_stage.OUTPUTS)}
         notes: dict[str, CropStageNote | OutlineStageNote] = {

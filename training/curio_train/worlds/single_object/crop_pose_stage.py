@@ -124,7 +124,7 @@ class CropPoseStage(SingleObjectWorld):
 
     @torch.no_grad()
     def _exposure(self, code: SceneCode, images: Tensor) -> Float[Tensor, "batch 1 3"]:
-        """That makes the object, channel by channel, as bright as crops are inside it."""
+        """Exposure that makes the object, channel by channel, as bright as the crops are inside it."""
         black = torch.zeros_like(images)
         over_black, over_white = (self.render(code, background) for background in (black, black + 1))
         inside = (over_white - over_black).mean(1, keepdim=True) < _LEAST_SEEN_THROUGH

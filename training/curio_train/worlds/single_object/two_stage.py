@@ -99,7 +99,7 @@ class TwoStageWorld(SingleObjectWorld):
 
     @property
     def exposure(self) -> Exposure:
-        """That of the localisation stage."""
+        """The localisation stage's range of exposures."""
         return self.stages[0].exposure
 
     def assemble(self, networks: Sequence[StageNetwork]) -> nn.Module:

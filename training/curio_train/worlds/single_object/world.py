@@ -58,7 +58,7 @@ class Object:
     near_m: float
     """Smallest distance along the optical axis."""
     far_m: float
-    """Largest."""
+    """Largest distance along the optical axis."""
     backgrounds: Callable[[Path], Backgrounds]
     """Renders its backgrounds, or finds them in a cache folder."""
     rotations: RotationPrior = field(default=upper_hemisphere_rotations)
@@ -68,9 +68,9 @@ class Object:
     base_colors: BaseColorPrior = field(default=any_base_color)
     """Prior of these base colours."""
     typical_color: tuple[float, float, float] = MIDDLE_GREY
-    """Of them, sRGB: what templates of an unpainted object show."""
+    """The most typical of these base colours, sRGB, which templates of an unpainted object show."""
     known_scene: bool = False
-    """Its background and the light there are known."""
+    """Whether its background, and the light there, are known."""
     scan_excess_m: float = 0.0
     """How far the mesh's surface lies outside the real one: depth fusion makes scanned objects too thick."""
 

@@ -66,14 +66,14 @@ class Part:
     """A kind of part."""
 
     kind: ObjectKind
-    """As its file has it, without slots."""
+    """The kind as its file describes it, without slots."""
     mesh: Mesh
-    """With y up; its middle at the origin, or if it stands its lowest point below the middle. Symmetries leave the
-    middle in its place."""
+    """Its own frame has y up; its middle at the origin, or if it stands its lowest point below the middle. Symmetries
+    leave the middle in its place."""
     file_from_own: Pose[np.ndarray]
-    """From that frame to the file's."""
+    """Rotation and translation from the mesh's own frame to the file's, metres."""
     info: ModelInfo
-    """Symmetries in that frame; none of a painted part."""
+    """Symmetries in the mesh's own frame; none of a painted part."""
     radius_m: float
     """Of a vertical cylinder round it if it stands, of a sphere if it lies."""
     min_count: int
@@ -83,7 +83,7 @@ class Part:
     fold: int
     """Order of its rotational symmetry about the vertical axis; 0: of revolution."""
     unpainted: bool
-    """Its colour is part of the scene code."""
+    """Whether its colour is part of the scene code."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class TabletopPhotographs:
     own: PhotographSet
     """Photographs to judge by, and the empty scene before the world's camera."""
     second: PhotographSet | None
-    """The same scenes before a second camera."""
+    """Photographs of these scenes by a second camera."""
     second_cam_from_world: Pose[np.ndarray] | None
     """Pose of that camera."""
     occupied: np.ndarray
