@@ -26,9 +26,9 @@ class Intrinsics:
     matrix: np.ndarray
     """K, [3, 3] float64, pixels."""
     width: int
-    """Of the stored image, pixels."""
+    """Width of the stored image, pixels."""
     height: int
-    """Of the stored image, pixels."""
+    """Height of the stored image, pixels."""
     distortion: tuple[float, ...] = ()
     """OpenCV's (k1, k2, p1, p2, k3, …): none, 4, 5 or 8 values."""
 

@@ -83,9 +83,9 @@ class Estimator(ABC):
     """Answers images one at a time; safe to share between threads."""
 
     name: str
-    """Of the model."""
+    """Name of the model."""
     version: int
-    """Of the model."""
+    """Version of the model."""
     spec: ModelSpec
     """The model's specification."""
 
@@ -93,7 +93,7 @@ class Estimator(ABC):
         self.name, self.version, self.spec = name, version, spec
         self.settings = settings
         self.surfaces: Mapping[str, Surface] = {}
-        """Of objects by name, where they are known: drawings show their contours."""
+        """Surfaces of objects by name, where they are known: drawings show their contours."""
         self.canonical = canonical_camera(spec, name)
 
     def __call__(self, image: SourceImage) -> ImageResult:

@@ -26,7 +26,7 @@ class LatestFrame:
     num_read: int
     """Frames read so far."""
     num_taken: int
-    """Of these, frames that :meth:`take` returned; the others were dropped."""
+    """Number of these frames that :meth:`take` returned; the others were dropped."""
 
     def __init__(self, source: str) -> None:
         """Open the source.

@@ -36,9 +36,9 @@ class Frame:
     pixels: np.ndarray
     """uint8 RGB [height / reduction, width / reduction, 3]."""
     width: int
-    """Of the image in full size, to which K belongs."""
+    """Width of the image in full size, to which K belongs."""
     height: int
-    """Of the image in full size, to which K belongs."""
+    """Height of the image in full size, to which K belongs."""
     reduction: int = 1
     """1, 2, 4 or 8: how much smaller than the image the pixels were decoded."""
     quarter_turns: int = 0

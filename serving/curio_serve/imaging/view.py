@@ -56,9 +56,9 @@ class CanonicalCamera:
     """The camera that a model was trained for."""
 
     width: int
-    """Of the model's input, pixels."""
+    """Width of the model's input, pixels."""
     height: int
-    """Of the model's input, pixels."""
+    """Height of the model's input, pixels."""
     matrix: Array | None = None
     """K* [3, 3], pixels; None in 2D worlds."""
     is_default: bool = False

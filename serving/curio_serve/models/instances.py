@@ -19,7 +19,7 @@ Values = Mapping[str, Any]
 
 MAX_INSTANCES = 16
 LEAST_CONFIDENCE = 0.2
-"""Of every instance but the first, which is answered whatever its confidence is."""
+"""Least confidence of every instance but the first, which is answered whatever its confidence is."""
 
 _MARGIN = 1.15  # of a box that hides an object
 _NEAREST_M = 1e-3
@@ -32,7 +32,7 @@ class Rows(NamedTuple):
     values: Values
     """Outputs by name; those of objects have a row each."""
     slots: Sequence[Slot]
-    """Of which kind each row is."""
+    """The slot of each row, which says of which kind it is."""
 
     def row(self, number: int) -> "Rows":
         """One row, with what the scene has once."""

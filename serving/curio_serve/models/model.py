@@ -66,7 +66,7 @@ class Model:
     name: str
     """The name that clients use."""
     version: int
-    """Of the model folder; 0 for a file outside one."""
+    """Version of the model folder; 0 for a file outside one."""
     spec: ModelSpec
     """Specification as the file stores it, with the reliability from the file beside it."""
     camera: CanonicalCamera
@@ -74,7 +74,7 @@ class Model:
     slots: Sequence[Slot]
     """One for each row of the per-object outputs."""
     sha256: str
-    """Of the file, hexadecimal."""
+    """SHA-256 of the file, hexadecimal."""
     crop_stage: CropStage | None = None
     """Reads poses from crops alone; None: the model has no such stage."""
     outline_stage: OutlineStage | None = None

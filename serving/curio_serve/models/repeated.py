@@ -26,7 +26,7 @@ MAX_READS = len(VIRTUAL_CAMERAS)
 _SAME_ROTATION_DEG = 25.0
 _SAME_PLACE = 0.5  # diameters
 AGREEMENT_POWER = 0.65
-"""Of the share that reads which agree have in the confidence of all.
+"""Power of the share of the total confidence that the reads which agree have.
 
 That share is lower than the probability that the mean of those is right, because a read that disagrees may be wrong
 alone. Measured on renderings: 0.75 for two reads, 0.7 for three and five, 0.6 for seven and nine

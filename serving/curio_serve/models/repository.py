@@ -26,9 +26,9 @@ class Change:
     """The fate of one version when the folder was scanned."""
 
     name: str
-    """Of the model."""
+    """Name of the model."""
     version: int
-    """Of the model; 0: its folder cannot be read."""
+    """Version of the model; 0: its folder cannot be read."""
     event: str
     """One of "loaded", "unloaded", "refused"."""
     reason: str = ""

@@ -25,7 +25,7 @@ class StreamFrame:
     """A frame, its camera and the model to run on it."""
 
     detector: Detector
-    """Of the model."""
+    """Detector of the model."""
     pixels: Array
     """uint8 RGB [height / reduction, width / reduction, 3]."""
     camera: PinholeCamera | None

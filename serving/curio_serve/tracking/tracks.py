@@ -28,7 +28,7 @@ class Measurement:
     object: str
     """Name of the kind of object."""
     translation_m: Array
-    """Of the object's middle, [3]."""
+    """Position of the object's middle, [3]."""
     rotation: Array
     """cam_from_obj [3, 3]; the identity where every rotation of the object looks alike."""
     confidence: float
@@ -69,7 +69,7 @@ class Track:
     number: int
     """Constant as long as the object is followed; never given twice in a stream."""
     kind: ObjectModel
-    """Of the object."""
+    """Kind of the object."""
     filter: PoseFilter
     """Filter of its pose, the position of which is that of the object's middle."""
     first_s: float

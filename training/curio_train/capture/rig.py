@@ -34,7 +34,7 @@ class RigCalibration:
     """The cameras of a rig, the first of which is its frame."""
 
     names: tuple[str, ...]
-    """Of the folders."""
+    """Names of the folders."""
     cameras: tuple[Calibration, ...]
     """Intrinsics of each."""
     cam_from_rig: tuple[np.ndarray, ...]

@@ -31,7 +31,7 @@ class Structure:
     cam_from_world: np.ndarray
     """[n, 4, 4], rigid."""
     camera: Intrinsics
-    """Of all photographs."""
+    """Camera of all photographs."""
     points: np.ndarray
     """[m, 3], world frame."""
     error_px: float

@@ -24,7 +24,7 @@ class ExportCommand:
     out: Path = Path("models")
     """Folder of models; the model goes to OUT/NAME/VERSION/model.onnx."""
     name: str | None = None
-    """Of the model; the world's name, or LineMOD's class, unless given."""
+    """Name of the model; the world's name, or LineMOD's class, unless given."""
     half: FlagCreatePairsOff[bool] = False
     """Store weights as float16: half the size, computed with in float32."""
     int8: FlagCreatePairsOff[bool] = False

@@ -32,7 +32,7 @@ class RenderCommand:
     world: str | None = None
     """Generated world that detections are of: its meshes, light and ground."""
     height: int | None = None
-    """Of the pictures in pixels; the scene's own unless given."""
+    """Height of the pictures in pixels; the scene's own unless given."""
     turn_deg: float = 0.0
     """Carries the camera round the objects, degrees; 90 is the novel view that worlds are scored from."""
     over_photograph: FlagCreatePairsOff[bool] = False

@@ -18,7 +18,7 @@ from curio_train.data.backgrounds import Backgrounds
 from curio_train.data.photographs import read_frame
 
 BACKGROUND_IMAGE_FRACTION = 0.85
-"""Of backgrounds that are the background image where it is mixed with others, which are the rare case in use."""
+"""Fraction of backgrounds that are the background image, where it is mixed with others, which are rare in use."""
 
 _LARGEST_SHIFT = 0.04  # of the frame's width, and as much of its height
 _SHORTEST_SIDE = 128  # of a background image that is halved once more

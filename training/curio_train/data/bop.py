@@ -53,9 +53,9 @@ class Frame:
     matrix: np.ndarray
     """K [3, 3], pixels, pixel centres at integers."""
     width: int
-    """Of the file, pixels."""
+    """Width of the file, pixels."""
     height: int
-    """Of the file, pixels."""
+    """Height of the file, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Annotation:
     pose: Pose
     """Cam_from_obj, metres."""
     visible_fraction: float | None
-    """Of the object's silhouette, in [0, 1]; None where ``scene_gt_info.json`` is missing."""
+    """Visible fraction of the object's silhouette, in [0, 1]; None where ``scene_gt_info.json`` is missing."""
 
 
 @dataclass(frozen=True)

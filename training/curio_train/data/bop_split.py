@@ -30,7 +30,7 @@ class ScoredFrames:
     split_name: str
     """How they were chosen."""
     targets: Sequence[Annotation]
-    """Of the object, at most one a frame."""
+    """Targets of the object, at most one a frame."""
 
 
 def scored_frames(dataset: BopDataset, name: str) -> ScoredFrames:

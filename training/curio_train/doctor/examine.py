@@ -27,7 +27,7 @@ class Subjects:
     mesh: Path | None = None
     """A mesh file."""
     mesh_unit: Unit | None = None
-    """Of its coordinates; the file's own unless given."""
+    """Unit of its coordinates; the file's own unless given."""
     body: str | None = None
     """The one body of a CAD file to look at; all unless given."""
     camera: Path | None = None

@@ -27,7 +27,7 @@ class MeshFiles:
     files: tuple[str, ...] = ()
     """FILE or NAME=FILE."""
     unit: Unit | None = None
-    """Of their coordinates; the files' own unless given."""
+    """Unit of their coordinates; the files' own unless given."""
     body: str | None = None
     """The one body of a CAD file to take; all unless given."""
 

@@ -26,7 +26,7 @@ from curio_train.worlds.generated.mesh_world import MeshWorld
 
 AMBIENT = 0.4
 LIGHT = (-0.25, -0.45, -0.5)
-"""Of scenes whose light nobody knows: from behind the camera, above its left shoulder."""
+"""Light of scenes whose light nobody knows: from behind the camera, above its left shoulder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class RenderOptions:
     """Settings of a drawing."""
 
     height: int | None = None
-    """Of the picture, pixels; None: the scene's own."""
+    """Height of the picture, pixels; None: the scene's own."""
     turn_deg: float = 0.0
     """How far the camera is carried round the objects; 90 is the novel view of the paper's image error."""
     over_photograph: bool = False

@@ -55,7 +55,7 @@ def _add_object(stage: Usd.Stage, number: int, item: Placed, mesh: Mesh, matrix:
 
 
 def _albedo(mesh: Mesh) -> np.ndarray:
-    """Of each vertex, [num_vertices, 3] in linear light."""
+    """Albedo of each vertex, [num_vertices, 3] in linear light."""
     if mesh.vertex_colors_srgb is not None:
         return linear(mesh.vertex_colors_srgb)
     if mesh.texture is None or mesh.uv is None:

@@ -44,7 +44,7 @@ class HeldOut:
     images: Tensor
     """Uint8 [num_images, 3, height, width]."""
     code: SceneCode
-    """Of all images."""
+    """Scene codes of all images."""
     empty: Tensor | None = None
     """Uint8 [num, 3, height, width], backgrounds without the object, in worlds whose codes have a confidence."""
 

@@ -16,7 +16,7 @@ from curio_train.worlds.base import World
 
 NUM_CALIBRATION, NUM_HELD_OUT = 64, 500
 LARGEST_LOSS = 0.01
-"""Of the accuracy, a fraction of all objects."""
+"""Largest loss of accuracy that is allowed, as a fraction of all objects."""
 
 
 def int8(cache: Path, *, half: bool) -> Reduce:

@@ -117,7 +117,7 @@ def _read_frames(
 
 
 def _estimates(subject: Subject, frames: Sequence[Frame]) -> Iterator[list[Estimate]]:
-    """Of each frame one estimate an object."""
+    """One estimate for each object of each frame."""
     start = time.perf_counter()
     crops = [_whole_frame(frame, subject.world.camera) for frame in frames]
     images = torch.from_numpy(np.stack([crop.image for crop in crops])).permute(0, 3, 1, 2).contiguous()

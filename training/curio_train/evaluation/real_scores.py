@@ -92,7 +92,7 @@ def together(each: Mapping[str, dict[str, Any]], absent: Sequence[float]) -> dic
 
 
 def _confidences(rows: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[bool]]:
-    """Of each target, and whether its ADD(-S) is below a tenth of the diameter."""
+    """Confidence of each target, and whether its ADD(-S) is below a tenth of the diameter."""
     return [row["confidence"] for row in rows], [row["add_diameters"] < ADD_THRESHOLD for row in rows]
 
 

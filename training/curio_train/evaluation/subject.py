@@ -43,7 +43,7 @@ class Subject:
     training_seconds: float
     """Spent, likewise."""
     commit: str
-    """Of the code that trained it."""
+    """Commit of the code that trained it."""
 
     def untrained(self) -> Predict:
         """The network as it was before the first step, from the same seed."""

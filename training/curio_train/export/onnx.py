@@ -34,7 +34,7 @@ class Tracing(NamedTuple):
     """Whether it is traced for one image, to be run on each of a batch, see :mod:`curio_train.export.image_by_image`.
     """
     num_slots: int | None = None
-    """Of a network that takes the numbers of the wanted slots, too, int64 [wanted]; None: it does not."""
+    """Number of slots, of a network that also takes the wanted slots' numbers, int64 [wanted]; None: it does not."""
 
 
 _PLAIN = Tracing()

@@ -67,7 +67,7 @@ class Exported:
     rounding_error: float
     """Largest absolute difference between what was written and the network that was trained; 0 in float32."""
     num_bytes: int
-    """Of model.onnx."""
+    """Size of model.onnx."""
     weights: str
     """How weights are stored, and what that costs."""
 

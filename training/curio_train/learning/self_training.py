@@ -24,7 +24,7 @@ ROUNDS, ROUNDS_OF_PRETRAINED = (0.6, 0.8), (0.2, 0.5, 0.8)
 sooner for networks that began with trained weights (``--init``)."""
 
 LARGEST_SHARE = 0.15
-"""Of a budget of minutes that one round may take."""
+"""Largest share of a budget of minutes that one round may take."""
 
 
 class SelfTraining:

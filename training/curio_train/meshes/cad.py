@@ -46,9 +46,9 @@ class _Body:
     """The triangles of one body with one colour; a body of several colours is several of these."""
 
     number: int
-    """Of the body; an assembly has another one for each place that a part is in."""
+    """Number of the body; an assembly has another one for each place that a part is in."""
     name: str
-    """Of the part that it is."""
+    """Name of the part that it is."""
     vertices_mm: np.ndarray
     """[num_vertices, 3], the body's own frame."""
     faces: np.ndarray

@@ -52,7 +52,7 @@ class Mesh:
     texture: np.ndarray | None = None
     """[height, width, 3] uint8 sRGB, or None."""
     sha256: str = field(default="")
-    """Of the file's bytes; of the arrays' bytes for a generated shape, and of :func:`to_ply`'s for a CAD file."""
+    """SHA-256 of the file's bytes; for a generated shape of the arrays' bytes, for a CAD file of :func:`to_ply`'s."""
     bodies: tuple[str, ...] = ()
     """Names of the bodies of a CAD file that it was merged from."""
 

@@ -27,7 +27,7 @@ class ErrorBounds:
     """Bounds for answers from a confidence on, up to the next bounds' confidence."""
 
     min_confidence: float
-    """Of these answers."""
+    """Least confidence of the answers that these bounds are for."""
     lateral_m: float
     """Across the line of sight; together with ``depth_fraction`` it holds the position."""
     depth_fraction: float

@@ -16,7 +16,7 @@ def nearest_symmetric(
     true_6d: Float[Tensor, "batch slots 6"],
     slot_infos: Sequence[ModelInfo],
 ) -> Float[Tensor, "batch slots 6"]:
-    """Of the rotations that look like the true ones those that are nearest to the predicted ones, without gradient.
+    """The rotations nearest to the predicted ones, of those that look like the true ones; without gradient.
 
     Args:
         predicted_6d: Rotations from the object frame, of any length.
@@ -49,7 +49,7 @@ def _nearest(
 
 
 def _nearest_turns(rotation: Float[Tensor, "*batch 3 3"], axis: Float[Tensor, "3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Of all turns about an axis those nearest to given rotations: they have the largest trace of turnᵀ rotation."""
+    """The turns about an axis that are nearest to given rotations: they have the largest trace of turnᵀ rotation."""
     unit = axis / axis.norm()
     along = torch.outer(unit, unit)
     level = torch.eye(3).to(unit) - along

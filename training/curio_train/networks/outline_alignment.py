@@ -57,7 +57,7 @@ class _Crops(NamedTuple):
     crops: Float[Tensor, "batch 3 side side"]
     """SRGB in [0, 1], around the objects."""
     focal_px: Float[Tensor, " batch"]
-    """Of the crops' cameras, whose principal points are their middles."""
+    """Focal lengths of the crops' cameras, whose principal points are their middles."""
     pose: OutlinePose
     """In these cameras, before the alignment."""
     crop_from_cam: Float[Tensor, "batch 3 3"]

@@ -19,7 +19,7 @@ from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
 from curio_train.worlds.single_object.world import Object
 
 NUM_READS = 5
-"""Of each photograph."""
+"""Reads of each photograph."""
 
 _NEAR = 0.05  # diameters, of ADD(-S) to the mean
 _NUM_POINTS = 500  # vertices that ADD is measured at, about

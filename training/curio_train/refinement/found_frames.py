@@ -33,8 +33,10 @@ from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 NUM_FRAMES = 3000
 LARGEST_RESIDUAL = 0.12
-"""Of poses that are kept. Among 144 frames of the ape, whose codes were opened to see what goes wrong, 48 % had such a
-residual, and 96 % of these poses were right by ADD < 0.1 d (docs/experiments/linemod.md)."""
+"""Largest residual of poses that are kept.
+
+Among 144 frames of the ape, whose codes were opened to see what goes wrong, 48 % had such a residual, and 96 % of these
+poses were right by ADD < 0.1 d (docs/experiments/linemod.md)."""
 
 _BATCH = 20
 _HALVED = 2  # frames are turned at half their size: localisation sees a quarter

@@ -39,7 +39,7 @@ _MARGIN_PX = 1.0
 
 
 class _Crops(NamedTuple):
-    """Of all frames."""
+    """Crops of all frames."""
 
     images: UInt8[Tensor, "crops 3 side side"]
     backgrounds: UInt8[Tensor, "crops 3 side side"]

@@ -30,7 +30,7 @@ class Evidence(NamedTuple):
     """Calibration features of the poses that were read in photographs, and whether each pose is correct."""
 
     features: Float[np.ndarray, "photographs objects 3"]
-    """Of the pose-correct logit."""
+    """Features of the pose-correct logit."""
     correct: Bool[np.ndarray, "photographs objects"]
     """Whether a pose agrees with its pseudo-label. Where there is none it is wrong: what was read agreed with nothing.
     """

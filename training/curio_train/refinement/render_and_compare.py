@@ -87,7 +87,7 @@ class RenderAndCompare:
     """Refines poses of one object in frames of one camera."""
 
     diameter_m: float
-    """Of the object."""
+    """Diameter of the object."""
 
     def __init__(self, mesh: Mesh, camera: Camera, diameter_m: float, *, from_templates: bool = False) -> None:
         """Build the renderer.

@@ -30,9 +30,9 @@ class RenderSettings:
     outlines: OutlineSampler
     """Finds and samples silhouettes."""
     width: int
-    """Of the images, pixels."""
+    """Width of the images, pixels."""
     height: int
-    """Of the images, pixels."""
+    """Height of the images, pixels."""
     num_slots: int
     """Slots of objects in an image, some of which may be empty."""
     samples_per_pixel: int
@@ -52,11 +52,11 @@ class View:
     query: RayQuery
     """What is asked of the rays."""
     bounds: ImageBounds
-    """Of the part's instances."""
+    """Bounds of the part's instances."""
     camera: Any
     """Float, see :class:`Instances`."""
     key: Any
-    """Of all random numbers of the batch, UInt32."""
+    """Key of all random numbers of the batch, UInt32."""
     appearance: Any = None
     """Float, see :class:`Instances`, or None."""
 
@@ -77,7 +77,7 @@ class Hits:
     record: Any
     """Faces hit, Mitsuba's preliminary intersections."""
     occlusion: Occlusion
-    """Of the samples that the rays belong to."""
+    """Occlusion of the samples that the rays belong to."""
     blockers: Blockers | None
     """What keeps the light from the hits, or None."""
 

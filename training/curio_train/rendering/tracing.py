@@ -83,7 +83,7 @@ class RayQuery(ABC):
     """Traces rays through pixels against instances and shades the hits."""
 
     channels: int
-    """Of the image."""
+    """Number of channels of the image."""
     shaded: bool
     """Whether light matters to what is shown."""
     reach_from_m: float

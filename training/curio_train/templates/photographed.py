@@ -36,7 +36,7 @@ class _Seen(NamedTuple):
     views: Int[Tensor, " near"]
     """Directions of the templates from nearly which it was taken."""
     weight: Float[Tensor, " near"]
-    """Of the photograph in them."""
+    """Weights of the photograph in them."""
     points: FeatureMaps
     """Descriptors at stride 4."""
     cells: Float[Tensor, "rolls size cells cells"]
@@ -44,7 +44,7 @@ class _Seen(NamedTuple):
     pose: Pose[Tensor]
     """Crop_from_obj, [rolls, …], diameters."""
     focal_px: Tensor
-    """Of the crops."""
+    """Focal lengths of the crops."""
 
 
 class _Mean:

@@ -60,7 +60,7 @@ class Opening:
     path: str
     """A result file, a photograph or a folder of them, a run folder, or the name of a generated world."""
     meshes: MeshFiles = field(default_factory=MeshFiles)
-    """Of the objects in a result file."""
+    """Meshes of the objects in a result file."""
     model: str | None = None
     """Model folder or server address that reads photographs."""
     camera: Path | None = None

@@ -41,7 +41,7 @@ class ObjectKind:
     box_corners_m: np.ndarray
     """[8, 3], object frame."""
     mesh_sha256: str = ""
-    """Of the mesh file, or empty."""
+    """SHA-256 of the mesh file, or empty."""
     symmetries: Sequence[np.ndarray] = ()
     """Discrete ones, each [4, 4], without the identity."""
     symmetry_axes: Sequence[tuple[np.ndarray, np.ndarray]] = ()
@@ -80,7 +80,7 @@ class PhotographSet:
     background_image: Tensor
     """uint8 [3, height, width]: the empty scene."""
     names: Sequence[str] = ()
-    """Of the photographs' files; empty where they are none."""
+    """Names of the photographs' files; empty where they are none."""
 
 
 class ImageSource(ABC):
@@ -113,9 +113,9 @@ class Camera:
     """The canonical pinhole camera."""
 
     width: int
-    """Of an image, pixels."""
+    """Width of an image, pixels."""
     height: int
-    """Of an image, pixels."""
+    """Height of an image, pixels."""
     matrix: np.ndarray | None = field(default=None)
     """K* [3, 3] in pixels (pixel centres at integers); None in 2D worlds."""
     is_default: bool = False
@@ -188,7 +188,7 @@ class World(ABC):
     name: str
     """The world's name on the command line; of a stage, the name that its losses have."""
     layout: Layout
-    """Of its scene code."""
+    """Layout of its scene code."""
     camera: Camera
     """The camera of its images."""
     objects: tuple[ObjectKind, ...]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 MIN_SATURATION, MIN_VALUE = 0.5, 0.7
-"""Of drawn colours; backgrounds are black or grey."""
+"""Least saturation and value of drawn colours; backgrounds are black or grey."""
 
 _MAX_ROUNDS = 2000
 

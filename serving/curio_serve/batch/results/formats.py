@@ -30,9 +30,9 @@ class ImageResult:
     model: str
     """Name of the model."""
     version: int
-    """Of the model."""
+    """Version of the model."""
     width: int | None = None
-    """Of the decoded frame in pixels; None where it could not be decoded. Likewise ``height``."""
+    """Width of the decoded frame in pixels; None where it could not be decoded. Likewise ``height``."""
     height: int | None = None
     camera_matrix: Sequence[float] = ()
     """The K that was used, 9 values row-major; empty if none was."""
@@ -51,7 +51,7 @@ class ImageResult:
     views: Sequence[str] = ()
     """Images of all cameras of a rig; poses are then in the rig's frame."""
     cam_from_rig: Sequence[float] = ()
-    """Of a rig's first camera, which ``image`` is of: 16 values row-major, metres; empty without a rig."""
+    """Pose of a rig's first camera, which took ``image``: 16 values row-major, metres; empty without a rig."""
     distortion: Sequence[float] = ()
     """OpenCV's coefficients that were used with K; empty if none were."""
     exif_rotation: bool = False

@@ -45,7 +45,7 @@ class ResultFile:
     num_images: int
     """Answered in the file, those of earlier runs included."""
     num_errors: int
-    """Of these, images without an answer, where the format says so."""
+    """Images that failed, where the format says so."""
 
     def __init__(
         self, path: Path | None, form: ResultFormat, models: Sequence[tuple[str, int]], *, overwrite: bool = False

@@ -40,11 +40,11 @@ class CropStageNote:
     tensors: Mapping[str, str]
     """Names in the graph of :data:`INPUT` and :data:`OUTPUTS`."""
     side_px: int
-    """Of a crop."""
+    """Side of a crop."""
     fill: float
     """Fraction of the side that the diameter spans at the expected depth."""
     diameter_m: float
-    """Of the object."""
+    """Diameter of the object."""
     near_m: float
     """Objects nearer than this are taken to be at this distance."""
     pose_correct: Sequence[float]
@@ -77,7 +77,7 @@ class CropPose:
     """A pose read around an expected position, in the frame's camera."""
 
     translation_m: Array
-    """Of the object's middle, [3]."""
+    """Position of the object's middle, [3]."""
     rotation: Array
     """cam_from_obj [3, 3]."""
     confidence: float

@@ -33,11 +33,11 @@ class OutlineStageNote:
     tensors: Mapping[str, str]
     """Names in the graph of :data:`INPUTS` and :data:`OUTPUTS`."""
     side_px: int
-    """Of a crop."""
+    """Side of a crop."""
     fill: float
     """Fraction of the side that the diameter spans."""
     diameter_m: float
-    """Of the object."""
+    """Diameter of the object."""
 
     @staticmethod
     def parse(text: str, where: str) -> "OutlineStageNote":

@@ -40,7 +40,7 @@ class Candidate:
     """Method that trained it; ``, two stages`` follows where it is one of the paper's and the network is not,
     ``, templates`` where a locator was trained, ``, self-trained`` where unlabelled real frames took part."""
     weights_sha256: str
-    """Of the last checkpoint's tensors, or of the model file."""
+    """SHA-256 of the last checkpoint's tensors, or of the model file."""
 
     def is_of_one_class(self) -> bool:
         """Whether it finds one class, as rows of the table do."""

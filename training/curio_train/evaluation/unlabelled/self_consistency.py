@@ -203,7 +203,7 @@ def _adjusted_bounds(of: PoseBounds, calibration: Sequence[float], widening: tup
 
 
 def _widening(found: Reliability, answers: Sequence[Answers], pairs: Sequence[Pairs]) -> tuple[float, float] | None:
-    """Of the bounds of positions and rotations, at least 1; None: too few pairs of sure answers."""
+    """Factors that widen the bounds of positions and rotations, at least 1; None: too few pairs of sure answers."""
     of = {one.object: one for one in found.objects}
     rendered = [_relative(of[one.kind.name], *_of_renderings(of[one.kind.name], one)) for one in answers]
     seen = [_relative(of[one.object], one.confidences, one.gaps) for one in pairs]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 CONFIG_FILE = "config.json"
 MAX_JSON_BYTES = 1 << 20
-"""Of the largest JSON file that a run folder may hold."""
+"""Size of the largest JSON file that a run folder may hold."""
 
 T = TypeVar("T")
 _MAY_CHANGE = ("minutes", "images", "stop_below")  # when to stop is not what to learn

@@ -27,7 +27,7 @@ class RunSession:
     command: str
     """As typed."""
     commit: str
-    """Of the code, with "-dirty" where it had changes; empty where it does not run from a git checkout."""
+    """Commit of the code, with "-dirty" where it had changes; empty where it does not run from a git checkout."""
     machine: str
     """Processor, number of cores this process may use, GPU."""
     started: str

@@ -33,9 +33,9 @@ class Found(NamedTuple):
     """Places of each object, likeliest first."""
 
     position_m: Float[Tensor, "batch objects num 3"]
-    """Of the object's centre."""
+    """Position of the object's centre."""
     logit: Float[Tensor, "batch objects num"]
-    """Of the heat map."""
+    """Logit of the heat map."""
 
 
 class FrameFeatures(nn.Module):

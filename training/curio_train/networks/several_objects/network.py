@@ -17,7 +17,7 @@ from curio_train.networks.templates.geometry import FRAME_STRIDE, Geometry, num_
 from curio_train.networks.templates.reader import CalibrationFeatures, Effort, Places, PoseReader
 
 NUM_PLACES = 3
-"""Of each object that templates are compared with."""
+"""Centre proposals of each object that templates are compared with."""
 
 
 class ObjectsNetwork(nn.Module):

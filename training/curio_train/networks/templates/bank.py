@@ -29,7 +29,7 @@ class Bank:
     filters: Float[Tensor, "rank size cells cells"]
     """Whole templates as weighted sums of few filters."""
     weights: Float[Tensor, "templates rank"]
-    """Of the filters in each template."""
+    """Weights of the filters in each template."""
     points: Float[Tensor, "templates points 3"]
     """On the surface, object frame, diameters."""
     described: Float[Tensor, "templates points channels"]

@@ -12,18 +12,18 @@ from curio_train.networks.templates.quantisation import CODEWORDS, LARGEST_BYTE,
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH
 
 _PARTS = 4
-"""Of a fine descriptor, each stored as the number of a codeword."""
+"""Parts of a fine descriptor, each stored as the number of a codeword."""
 
 
 class Banks(nn.Module):
     """One :class:`Bank` an object, in 1.3 MB; the first axis of every buffer is the object's."""
 
     coarse_mean: Tensor
-    """Of the features at stride 8, [objects, COARSE_WIDTH]."""
+    """Mean of the features at stride 8, [objects, COARSE_WIDTH]."""
     coarse_projection: Tensor
     """[objects, COARSE_SIZE, COARSE_WIDTH]."""
     fine_mean: Tensor
-    """Of the features at stride 4, [objects, FINE_WIDTH]."""
+    """Mean of the features at stride 4, [objects, FINE_WIDTH]."""
     filters: Tensor
     """Bytes [objects, RANK, COARSE_SIZE, cells, cells]."""
     weights: Tensor

@@ -13,7 +13,7 @@ class Descriptors(nn.Module):
     """A linear map of features, then normalisation."""
 
     mean: Tensor
-    """Of the features, [inputs]."""
+    """Mean of the features, [inputs]."""
     projection: Tensor
     """[outputs, inputs]."""
 

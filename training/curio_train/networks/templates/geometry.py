@@ -38,11 +38,11 @@ class Geometry:
     matrix: np.ndarray
     """K of the frames, [3, 3]."""
     width: int
-    """Of the frames, pixels."""
+    """Width of the frames, pixels."""
     height: int
-    """Of the frames, pixels."""
+    """Height of the frames, pixels."""
     diameter_m: float
-    """Of the object."""
+    """Diameter of the object."""
     near_m: float
     """Nearest distance of the object."""
     far_m: float

@@ -26,7 +26,7 @@ class Candidates(NamedTuple):
     """Places."""
 
     position_m: Float[Tensor, "batch num 3"]
-    """Of the object's centre, camera frame."""
+    """Position of the object's centre, camera frame."""
     score: Float[Tensor, "batch num"]
     """Standard deviations above what the same template scores on background."""
 
@@ -39,7 +39,7 @@ class Localiser(nn.Module):
     """
 
     weights: Tensor
-    """Of the filters in each template, divided by the score's standard deviation on background."""
+    """Weights of the filters in each template, divided by the score's standard deviation on background."""
     offsets: Tensor
     """Added to scores, so that their mean on background is 0."""
     _pixels: Tensor

@@ -25,10 +25,10 @@ class TemplateNetwork(nn.Module):
     outline: OutlineAlignment | None
     """Aligns poses with outlines in the end; None: they stay as the reader answers them."""
     geometry: Geometry
-    """Of frames and object."""
+    """Geometry of frames and object."""
 
     color: Tensor
-    """Of an object whose mesh has no colours: what its templates show and codes answer, sRGB [3]; else empty."""
+    """Base colour of an object whose mesh has no colours, in templates and answers, sRGB [3]; else empty."""
 
     _matrix: Tensor
 

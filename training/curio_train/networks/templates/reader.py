@@ -21,7 +21,7 @@ NUM_NEIGHBOURS = 4
 """Templates around the best hypothesis whose answers are averaged, in each crop of its place."""
 
 STEPS = (3, 5, 4)
-"""Of the alignment: of every hypothesis of the first pass and of the second, then of the best with its neighbours."""
+"""Steps of the alignment: in the first pass, in the second, and of the best hypothesis with its neighbours."""
 
 LAMP = (0.0, -0.7, -0.7)
 """The light that templates are drawn under and that is answered: it is not read from images."""
@@ -39,16 +39,16 @@ class Effort(NamedTuple):
     hypotheses: int = 3
     """Poses that each pass aligns."""
     closer: int = 2
-    """Of those of the first pass, around which crops are cut again, at their own distance."""
+    """Number of poses of the first pass around which crops are cut again, at their own distance."""
     rolls_deg: tuple[float, ...] = ROLLS_DEG
-    """Of the crops of the second pass; an odd number around 0."""
+    """Rolls of the crops of the second pass; an odd number around 0."""
 
 
 class Places(NamedTuple):
     """Centre proposals: positions where each object may be."""
 
     position_m: Float[Tensor, "batch objects num 3"]
-    """Of the object's centre, camera frame."""
+    """Position of the object's centre, camera frame."""
     score: Float[Tensor, "batch objects num"]
     """The higher the likelier; its unit is that of what finds places."""
     slots: Int[Tensor, " objects"]
@@ -81,9 +81,9 @@ class _Crops(NamedTuple):
     cam_from_crop: Float[Tensor, "crops 3 3"]
     """Camera frame of the image."""
     distance_m: Float[Tensor, " crops"]
-    """Of the places."""
+    """Distances of the centre proposals."""
     focal_px: Float[Tensor, " crops"]
-    """Of the crops' cameras."""
+    """Focal lengths of the crops' cameras, pixels."""
     slots: Int[Tensor, " objects"]
     """Which objects are looked for."""
 
@@ -100,7 +100,7 @@ class _Hypotheses(NamedTuple):
     crop: Int[Tensor, " rows"]
     """In which the object is seen."""
     place_score: Float[Tensor, " rows"]
-    """Of the place that the crop looks at."""
+    """Score of the centre proposal that the crop looks at."""
 
     def in_frame(self, crops: _Crops) -> Float[Tensor, "rows 3"]:
         """Positions in the camera frame of the image, diameters."""

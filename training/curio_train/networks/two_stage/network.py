@@ -37,7 +37,7 @@ class Optics:
     matrix: np.ndarray
     """K of the frames, [3, 3]."""
     diameter_m: float
-    """Of the object."""
+    """Diameter of the object."""
     near_m: float
     """Proposals nearer than this are taken to be at this distance."""
     localisation_stride: int
@@ -64,7 +64,7 @@ class _Estimate(NamedTuple):
     """With the crop-pose stage's own confidence."""
     features: CalibrationFeatures
     crops: Tensor
-    """Of the refinement pass."""
+    """Crops of the refinement pass."""
     read: dict[str, Tensor]
     """What the crop-pose stage gives for them."""
     outline: dict[str, Tensor]

@@ -37,7 +37,7 @@ class MeshKind:
     num_slots: int
     """Slots of the scene code; kinds take theirs one after the other."""
     radius_m: float
-    """Of a sphere round the object (on the ground, of a vertical cylinder): objects are drawn so far apart."""
+    """Radius of a sphere round the object (on the ground, of a vertical cylinder): objects are drawn so far apart."""
 
 
 class MeshWorld(World):

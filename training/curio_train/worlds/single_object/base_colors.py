@@ -21,7 +21,7 @@ MIN_BASE_VALUE = 0.1
 """HSV value of base colours; their saturation may be anything: black, white, grey or any colour between."""
 
 ANY_COLOR_FRACTION = 0.15
-"""Of images in which the object has any colour, so that a wrong named colour is not fatal."""
+"""Fraction of images in which the object has any colour, so that a wrong named colour is not fatal."""
 
 _MIN_FACTOR, _MAX_FACTOR = 0.6, 1.5  # of the value, because the light's strength is unknown
 _MIN_NEAR_VALUE = 0.05

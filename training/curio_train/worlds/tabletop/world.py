@@ -75,11 +75,11 @@ class Part:
     info: ModelInfo
     """Symmetries in the mesh's own frame; none of a painted part."""
     radius_m: float
-    """Of a vertical cylinder round it if it stands, of a sphere if it lies."""
+    """Radius of a vertical cylinder round it if it stands, of a sphere if it lies."""
     min_count: int
-    """Of such parts in a scene."""
+    """Least number of such parts in a scene."""
     max_count: int
-    """Of such parts in a scene."""
+    """Largest number of such parts in a scene."""
     fold: int
     """Order of its rotational symmetry about the vertical axis; 0: of revolution."""
     unpainted: bool

@@ -20,7 +20,7 @@ YAWS = torch.arange(NUM_YAWS) * (2 * math.pi / NUM_YAWS)
 """Yaws of hypotheses, radians, as seen in the middle of the ground."""
 
 COLOR_RANGE = 0.02, 0.98
-"""Of found colours: sRGB is steep at 0, and the network's sigmoid at both ends."""
+"""Range of found colours: sRGB is steep at 0, and the network's sigmoid at both ends."""
 
 _COVERED = 0.5  # coverage from which a pixel is the object's
 _LEAST_POWER = 1e-2

@@ -81,7 +81,7 @@ def _descended(world: MeshWorld, code: dict[str, Tensor], images: Tensor) -> tup
 def better_of(
     one: SceneCode, one_loss: Tensor, other: SceneCode, other_loss: Tensor
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Of each image the code with the lower loss, and that loss."""
+    """The code with the lower loss, and that loss, of each image."""
     better = one_loss < other_loss
     chosen = {name: _chosen(better, one[name], other[name]) for name in one}
     return chosen, torch.minimum(one_loss, other_loss)

@@ -11,7 +11,7 @@ from curio_train.scene_code import TRANSLATION
 from curio_train.worlds.generated.mesh_world import MeshWorld
 
 SIDE = 24
-"""Of a crop, pixels in the middle of the ground; the worlds' objects are 15 to 20 pixels high and wide."""
+"""Side of a crop, pixels in the middle of the ground; the worlds' objects are 15 to 20 pixels high and wide."""
 
 _STEP_M = 0.06  # between places
 _CLOSENESS = 0.9  # of two objects, in sums of the smallest radius: places are off by half a step

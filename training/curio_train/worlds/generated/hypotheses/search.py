@@ -45,7 +45,7 @@ class _View(NamedTuple):
     unexplained: Float[Tensor, "1 height width"]
     """1 where pixels count."""
     code: SceneCode
-    """Of one scene: its sun, and the objects that are there already."""
+    """Code of one scene: its sun, and the objects that are there already."""
 
 
 class _Crops(NamedTuple):
