@@ -12,12 +12,12 @@ from importlib import import_module
 from typing import Any
 
 READ_FLAGS = os.O_RDONLY
-"""For ``os.open``: the bytes as they are, not inherited by children, and not waiting for a pipe's writer."""
+"""Flags for ``os.open``: the bytes as they are, not inherited by children, and not waiting for a pipe's writer."""
 for _name in ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY"):
     READ_FLAGS |= getattr(os, _name, 0)
 
 APPEND_FLAGS = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0)
-"""For ``os.open``: bytes written go to the end as they are."""
+"""Flags for ``os.open``: bytes written go to the end as they are."""
 
 STOP_SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP", "SIGBREAK") if hasattr(signal, name)

@@ -13,7 +13,7 @@ from torch import Tensor
 from curio_train.errors import ExportError, UsageError
 
 WEIGHTS_FILE = "weights.safetensors"
-"""Beside a version's ONNX file: the network as it was trained, to train it further."""
+"""File beside a version's ONNX file with the network as it was trained, to train it further."""
 
 
 class ExportedModel:

@@ -72,7 +72,7 @@ class _Scan:
 
 @cache
 def _fields(kind: Descriptor) -> dict[int, Descriptor | int]:
-    """For fields that hold messages, the kind; for fields that hold numbers, the fewest bytes of one number."""
+    """Each field's kind of message, or for fields that hold numbers the fewest bytes of one number."""
     return {
         field.number: field.message_type or _WIDTHS.get(field.type, 1)
         for field in kind.fields

@@ -29,7 +29,7 @@ class Header:
     """The properties that the header of an image file declares."""
 
     format: ImageFormat
-    """Container."""
+    """Format of the file."""
     width: int
     """Pixels as stored."""
     height: int

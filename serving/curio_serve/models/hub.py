@@ -76,7 +76,7 @@ def open_hub() -> "HfApi":
 
 
 def timeout_s() -> float:
-    """Until a hub has to answer a first request: 10 s, or what ``HF_HUB_ETAG_TIMEOUT`` says."""
+    """Seconds in which a hub has to answer a first request: 10, or what ``HF_HUB_ETAG_TIMEOUT`` says."""
     from huggingface_hub.constants import HF_HUB_ETAG_TIMEOUT
 
     return float(HF_HUB_ETAG_TIMEOUT)

@@ -239,7 +239,7 @@ class Follower:
 
 
 def _most_of_each(tracks: Sequence[Track], num: int) -> list[Track]:
-    """At most so many tracks of each kind of object, those that are seen first, in their order."""
+    """At most ``num`` tracks of each kind of object, those that are seen first, in their order."""
     kept: list[Track] = []
     for track in sorted(tracks, key=lambda track: not track.is_seen):
         if sum(other.kind.name == track.kind.name for other in kept) < num:

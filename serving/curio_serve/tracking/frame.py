@@ -33,7 +33,7 @@ class StreamFrame:
     reduction: int
     """Factor by which the pixels are smaller than the frame."""
     time_s: float
-    """When it was taken."""
+    """Time at which it was taken, seconds."""
     before_run: Callable[[], None]
     """Called before each run of a network."""
 

@@ -73,11 +73,11 @@ class Track:
     filter: PoseFilter
     """Filter of its pose, the position of which is that of the object's middle."""
     first_s: float
-    """When it was found."""
+    """Time at which it was found, seconds."""
     seen_s: float
-    """When it was last seen."""
+    """Time at which it was last seen, seconds."""
     measured: Measurement
-    """When it was last seen."""
+    """The measurement of when it was last seen."""
     is_seen: bool = True
     """Whether it is seen in the current frame."""
     _symmetries: Array = field(default_factory=lambda: np.eye(3)[None])

@@ -40,7 +40,7 @@ class RigCalibration:
     cam_from_rig: tuple[np.ndarray, ...]
     """Pose of each [4, 4], metres."""
     num_instants: tuple[int, ...]
-    """In which the first and this camera see the board; of the first its own."""
+    """Instants at which this camera and the first one see the board; for the first, at which it does."""
     error_px: float
     """Largest root mean square distance of corners from where a pair of cameras should see them."""
 

@@ -44,7 +44,7 @@ class Page:
     """The newest frame and what is said about it, for browsers on this machine."""
 
     def __init__(self, port: int) -> None:
-        """Listen.
+        """Begin to listen for browsers.
 
         Raises:
             UsageError: The port is taken.

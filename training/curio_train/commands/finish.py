@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from curio_train.export.graph import Graph
 
 MODELS_FOLDER = "models"
-"""In the folder of a run of one's own part: its exported models."""
+"""Folder of the exported models, in the folder of a run of one's own part."""
 
 
 def end(

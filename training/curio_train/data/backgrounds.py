@@ -180,7 +180,7 @@ def _shapes(random: np.random.Generator) -> list[Mesh]:
 
 
 def _subdivided(mesh: Mesh, times: int) -> Mesh:
-    """More vertices for a pattern to live on."""
+    """A mesh with more vertices, so that a pattern of vertex colours is fine enough."""
     vertices, faces = mesh.vertices_m, mesh.faces
     for _ in range(times):
         corners = vertices[faces]

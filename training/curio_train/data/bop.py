@@ -242,7 +242,7 @@ class BopDataset:
                         yield Annotation(int(scene.name), int(key), object_id, _pose(record), visible)
 
     def targets(self) -> list[Target]:
-        """``test_targets_bop19.json``.
+        """The targets of ``test_targets_bop19.json``.
 
         Raises:
             DataError: It is missing or broken.

@@ -59,7 +59,7 @@ class Record:
         return len(value)
 
     def numbers(self, key: str, count: int) -> list[float]:
-        """So many finite numbers: a list, or the bare number where one is wanted.
+        """A given count of finite numbers: a list, or the bare number where one is wanted.
 
         Raises:
             DataError: Something else is there.

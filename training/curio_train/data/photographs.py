@@ -195,7 +195,7 @@ class Photographs:
             raise DataError(f"{folder}: cannot be listed ({exc.strerror}); expected a folder of photographs") from exc
         names = " and ".join(path.name for path in left_out)
         self.note = f", not counting {names}, the empty scene" if left_out else ""
-        """For texts that say how many there are: what was left out."""
+        """What was left out, for texts that say how many photographs there are."""
         if not self.paths:
             raise DataError(f"{folder}: found no images{self.note}, expected files ending in {' '.join(SUFFIXES)}")
         # Decoding costs more than rendering the object in front: a few hundred photographs stay in memory, shrunk.

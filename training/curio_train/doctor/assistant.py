@@ -40,7 +40,7 @@ class Assistant:
     """Keeps good frames as files in a folder."""
 
     num_kept: int
-    """In the folder, those of earlier calls included, without the empty scene."""
+    """Photographs in the folder, those of earlier calls included, without the empty scene."""
 
     def __init__(self, folder: Path, board: Board | None, background: Path | None) -> None:
         """Look at what is there.

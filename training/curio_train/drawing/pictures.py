@@ -94,7 +94,7 @@ class RenderOptions:
     path_traced: bool = False
     """By stock Mitsuba's path tracer, with the light that surfaces give each other."""
     samples: int = 64
-    """A pixel."""
+    """Rays for each pixel."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be drawn."""

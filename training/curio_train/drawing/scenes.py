@@ -54,7 +54,7 @@ class Scene:
     camera_matrix: np.ndarray
     """K [3, 3]."""
     objects: tuple[Placed, ...]
-    """In the camera's frame."""
+    """The objects; their poses are in the camera's frame."""
     light: np.ndarray | None
     """Camera frame, towards the light [3], or None: not known."""
     photograph: Path | None = None

@@ -35,13 +35,13 @@ class Subject:
     config: RunConfig
     """What it was trained with."""
     world: World
-    """In which it was trained."""
+    """World in which it was trained."""
     predict: Predict
     """Reads images."""
     images_seen: int
-    """In training, those of the networks that it began as included."""
+    """Images shown in training, to it and to the networks that it began as."""
     training_seconds: float
-    """Spent, likewise."""
+    """Seconds of training, of it and of the networks that it began as."""
     commit: str
     """Commit of the code that trained it."""
 

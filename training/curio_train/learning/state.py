@@ -139,7 +139,7 @@ class TrainState:
     pose: Learner[nn.Module]
     """All stages as one network."""
     critic: Learner[Critic] | None
-    """Only with the loss term curiosity."""
+    """The critic; None without the loss term curiosity."""
 
     def __init__(self, config: RunConfig, world: World, device: torch.device) -> None:
         """Everything before the first step.

@@ -48,7 +48,7 @@ class OutlinePose(NamedTuple):
     rotation: Float[Tensor, "batch 3 3"]
     """cam_from_obj."""
     position: Float[Tensor, "batch 3"]
-    """Diameters."""
+    """Position of the object, diameters."""
 
 
 class _Crops(NamedTuple):
@@ -59,7 +59,7 @@ class _Crops(NamedTuple):
     focal_px: Float[Tensor, " batch"]
     """Focal lengths of the crops' cameras, whose principal points are their middles."""
     pose: OutlinePose
-    """In these cameras, before the alignment."""
+    """Poses in these cameras, before the alignment."""
     crop_from_cam: Float[Tensor, "batch 3 3"]
     """Rotations from the images' camera."""
 
@@ -72,7 +72,7 @@ class _Edges(NamedTuple):
     """The clearest edge across each point of an outline."""
 
     distance_px: Float[Tensor, "batch points"]
-    """Outwards."""
+    """Distance of the edge from the outline, outwards."""
     weight: Float[Tensor, "batch points"]
     """Inverse of its variance; 0 where no edge is seen."""
 
@@ -83,7 +83,7 @@ class OutlineAlignment(nn.Module):
     directions: Tensor
     """From the camera to the object, object frame, [directions, 3]; those of several [objects, directions, 3]."""
     points: Tensor
-    """On the surface, object frame, diameters, [directions, points, 3]; those of several [objects, …]."""
+    """Points on the surface, object frame, diameters, [directions, points, 3]; those of several [objects, …]."""
     outward: Tensor
     """Unit vectors across the line of sight, object frame, of the same shape."""
     _prior: Tensor

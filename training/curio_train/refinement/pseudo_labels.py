@@ -29,7 +29,7 @@ from curio_train.worlds.single_object.crop_pose_stage import CROP_PX, FILL
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 MIN_CONSENSUS = 10
-"""So many photographs with a multi-view consensus are better than all others with poses of their own."""
+"""With at least so many photographs in a multi-view consensus, the network learns from these alone."""
 
 _BATCH_SIZE = 20
 _PASSES = 2  # of render-and-compare over each photograph
@@ -41,7 +41,7 @@ class PseudoLabels:
     """Photographs with poses, as labelled crops for the crop-pose stage."""
 
     def __init__(self, world: TwoStageWorld, frames: UInt8[Tensor, "num 3 height width"], code: SceneCode) -> None:
-        """Hold them.
+        """Hold photographs and their pseudo-labels.
 
         Args:
             world: With both stages.

@@ -43,7 +43,7 @@ class SceneLabels:
         frames: UInt8[Tensor, "num 3 height width"],
         poses: Sequence[Pose[np.ndarray]],
     ) -> None:
-        """Hold them.
+        """Hold photographs and their pseudo-labels.
 
         Args:
             world: Of the objects.

@@ -43,7 +43,7 @@ class Pieces:
     span: Any
     """Length of the piece, as a fraction of the edge's projection."""
     length: Any
-    """In pixels."""
+    """Length of the piece, pixels."""
     x: Any
     y: Any
     """Position of its middle, pixels, centres at integers."""

@@ -80,7 +80,7 @@ class Instances:
         )
 
     def light(self, instance: Any) -> Any:
-        """Towards the light in the object's frame, its length the strength."""
+        """Vector towards the light in the object's frame; its length is the strength."""
         return self.mi.Vector3f(*self._take(instance, "light"))
 
     def albedo(self, instance: Any) -> list[Any]:

@@ -99,7 +99,7 @@ class Appearance:
     dr: ModuleType
     """Dr.Jit."""
     scene: Any
-    """In which surfaces shade themselves."""
+    """Scene in which surfaces shade themselves."""
     fill: Any
     """Vector of the second light, in the objects' frames."""
     ambient: Any

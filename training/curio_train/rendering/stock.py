@@ -22,7 +22,7 @@ class PosedMesh:
     """An object before the camera."""
 
     mesh: Mesh
-    """In its own frame."""
+    """Mesh in its own frame."""
     rotation: np.ndarray
     """Cam_from_obj, [3, 3]."""
     translation_m: np.ndarray
@@ -30,7 +30,7 @@ class PosedMesh:
     color_srgb: tuple[float, ...] = (1.0, 1.0, 1.0)
     """Albedo [3] that multiplies the mesh's own."""
     opacity: float | None = None
-    """In [0, 1], seen from both sides; None: solid, and its inside is black, as Mitsuba has it by default."""
+    """Opacity in [0, 1], seen from both sides; None: solid, and its inside is black, as Mitsuba has it by default."""
 
 
 def sensor(mitsuba: Any, camera_matrix: np.ndarray, width: int, height: int, samples_per_pixel: int) -> dict[str, Any]:

@@ -33,7 +33,7 @@ class ObjectKind:
     """The properties of a kind of object that an exported model holds."""
 
     name: str
-    """For people and clients."""
+    """Name that people and clients read."""
     slots: tuple[int, ...]
     """Rows of the per-object fields that belong to this kind."""
     diameter_m: float

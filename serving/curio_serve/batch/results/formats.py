@@ -47,7 +47,7 @@ class ImageResult:
     is_turned: bool = False
     """EXIF asks for a rotation that was not applied."""
     recorded: RecordedAt | None = None
-    """For an image of a robot's recording."""
+    """Topic and times of an image of a robot's recording, else None."""
     views: Sequence[str] = ()
     """Images of all cameras of a rig; poses are then in the rig's frame."""
     cam_from_rig: Sequence[float] = ()
@@ -235,7 +235,7 @@ class Bop(ResultFormat):
         return "".join(rows).encode()
 
     def key(self, image: str) -> str:
-        """``scene,image``.
+        """The line's key ``scene,image``.
 
         Raises:
             UsageError: The path has no such numbers in it.

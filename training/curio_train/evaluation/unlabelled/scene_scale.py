@@ -25,7 +25,7 @@ from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 MOST_PHOTOGRAPHS = 100
-"""More tell little more: what one object errs by is the same in all."""
+"""Most photographs that are used: further ones tell little, because an object's error is the same in all."""
 
 _SAME_CAMERA = 0.01  # of the focal length, and of it for the centre
 

@@ -34,7 +34,7 @@ def _registered_name(world: WorldOptions) -> str:
 
 @cache
 def _converter() -> "Converter":
-    """Between dataclasses and JSON values; unknown keys are errors, and a world is stored with its name."""
+    """A converter between dataclasses and JSON values; unknown keys are errors, and a world is stored with its name."""
     from cattrs import Converter  # not at --help
     from cattrs.gen import make_dict_structure_fn, make_dict_unstructure_fn
 

@@ -10,7 +10,7 @@ class Interrupted(KeyboardInterrupt):
     """A signal asked the process to end; a KeyboardInterrupt, so that no handler of errors swallows it."""
 
     signum: int
-    """Which signal."""
+    """Number of the signal."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(signal.Signals(signum).name)

@@ -25,7 +25,7 @@ class RunSession:
     """One call of a command."""
 
     command: str
-    """As typed."""
+    """Command line as it was typed."""
     commit: str
     """Commit of the code, with "-dirty" where it had changes; empty where it does not run from a git checkout."""
     machine: str

@@ -77,7 +77,7 @@ class LocatorNetwork(StageNetwork):
 
     @property
     def trunk(self) -> Trunk:
-        """Frozen features."""
+        """The frozen feature extractor."""
         assert isinstance(self.encoder, FrameFeatures)
         return self.encoder.trunk
 

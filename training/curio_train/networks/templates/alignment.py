@@ -27,7 +27,7 @@ class FeatureMaps(NamedTuple):
     values: Float[Tensor, "crops*side*side 3*size"]
     """Cell after cell, row after row, crop after crop."""
     side: int
-    """Cells."""
+    """Cells along a side of the crop."""
 
     @classmethod
     def of(cls, descriptors: Float[Tensor, "crops size side side"]) -> "FeatureMaps":
@@ -61,7 +61,7 @@ class Aligned(NamedTuple):
     rotation: Float[Tensor, "batch 3 3"]
     """crop_from_obj."""
     position: Float[Tensor, "batch 3"]
-    """Diameters."""
+    """Position of the object, diameters."""
     score: Float[Tensor, " batch"]
     """Mean cosine of template and crop over the points."""
 

@@ -31,7 +31,7 @@ class Bank:
     weights: Float[Tensor, "templates rank"]
     """Weights of the filters in each template."""
     points: Float[Tensor, "templates points 3"]
-    """On the surface, object frame, diameters."""
+    """Points on the surface, object frame, diameters."""
     described: Float[Tensor, "templates points channels"]
     """Fine descriptors of the points."""
     outline: Float[Tensor, "views points 3"]

@@ -46,7 +46,7 @@ class Geometry:
     near_m: float
     """Nearest distance of the object."""
     far_m: float
-    """Farthest."""
+    """Farthest distance of the object."""
     any_side: bool = False
     """Whether the object is seen from all sides and rolled in any way, instead of from above and nearly upright."""
 

@@ -23,7 +23,7 @@ _SUPPRESSED = -1e4
 
 
 class Candidates(NamedTuple):
-    """Places."""
+    """Centre proposals."""
 
     position_m: Float[Tensor, "batch num 3"]
     """Position of the object's centre, camera frame."""

@@ -98,7 +98,7 @@ class _Hypotheses(NamedTuple):
     pose: Aligned
     """Positions in diameters."""
     crop: Int[Tensor, " rows"]
-    """In which the object is seen."""
+    """Crop in which the object is seen."""
     place_score: Float[Tensor, " rows"]
     """Score of the centre proposal that the crop looks at."""
 
@@ -111,7 +111,7 @@ class PoseReader(nn.Module):
     """Matches and aligns the templates of several objects in frames of one camera."""
 
     banks: Banks
-    """All templates."""
+    """Templates of all objects."""
     effort: Effort
     """May be changed at any time; the confidence is calibrated for what it was then."""
     pose_correct: Tensor
@@ -319,7 +319,7 @@ class PoseReader(nn.Module):
         return (turn.flatten(1) @ self.banks.rotations.flatten(1).T).topk(num, dim=1).indices
 
     def _diameter_of(self, places: Places) -> Float[Tensor, " batch*objects"]:
-        """Metres."""
+        """Diameters of the objects, metres."""
         return self._diameter_m[places.slots].expand(places.score.shape[:2]).flatten()
 
 

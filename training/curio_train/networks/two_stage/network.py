@@ -61,7 +61,7 @@ class _Estimate(NamedTuple):
     """A code and what it was made of."""
 
     code: dict[str, Tensor]
-    """With the crop-pose stage's own confidence."""
+    """Scene code with the crop-pose stage's own confidence."""
     features: CalibrationFeatures
     crops: Tensor
     """Crops of the refinement pass."""

@@ -24,7 +24,7 @@ from curio_train.worlds.placement import (
 )
 
 MIN_OBJECTS = 2
-"""In scenes whose number of objects varies; slots that are not used have a position and a colour, too."""
+"""Fewest objects in scenes whose number of objects varies; unused slots have a position and a colour, too."""
 
 
 class GeneratedWorld(MeshWorld):

@@ -31,7 +31,7 @@ class MeshKind:
     """A kind of object."""
 
     name: str
-    """For people."""
+    """Name that people read."""
     mesh: Mesh
     """Its shape; white if the scene code has its colour."""
     num_slots: int

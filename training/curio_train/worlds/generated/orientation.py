@@ -37,7 +37,7 @@ class NoRotation(Orientation):
         return torch.eye(3).to(position).expand(*position.shape[:2], 3, 3)
 
     def entries(self, rotation: Float[Tensor, "batch slots 3 3"]) -> dict[str, Tensor]:
-        """None."""
+        """No entries: there is no rotation."""
         return {}
 
 

@@ -19,7 +19,7 @@ class SceneSetup:
     """Camera, light and ground of a world's scenes."""
 
     camera: Camera
-    """With its matrix."""
+    """Camera with its matrix."""
     cam_from_world: Pose[np.ndarray]
     """Pose of the camera."""
     center_m: tuple[float, float, float]
@@ -49,7 +49,7 @@ class SceneSetup:
         )
 
     def light(self, code: SceneCode) -> Float[Tensor, "batch 3"]:
-        """Towards the sun in each scene, world frame; the length is the strength."""
+        """Vector towards the sun in each scene, world frame; the length is the strength."""
         sun = code[TRANSLATION].new_tensor(self.sun, dtype=torch.float32)
         if LIGHT in code:
             return direction_from_hemisphere(code[LIGHT].float()) * sun.norm()

@@ -32,7 +32,7 @@ class Exposure:
 
 ANY_EXPOSURE = Exposure(0.3, 1.25, 0.2)
 MILD_EXPOSURE = Exposure(0.5, 1.25, 0.08)
-"""If the scene is known, or the object is found by its colour."""
+"""Range where the scene is known, or where the object is found by its colour."""
 
 
 def upper_hemisphere_rotations(count: int, random: np.random.Generator) -> Float[Tensor, "count 3 3"]:

@@ -33,7 +33,7 @@ class Bank:
     """1 where a crop shows the object."""
 
     def __init__(self, world: MeshWorld, places: Places, sun: Float[Tensor, " 2"] | None) -> None:
-        """Render them.
+        """Render the hypotheses.
 
         Args:
             world: With yaws.

@@ -165,7 +165,7 @@ class GroundHypotheses:
         return code
 
     def _crops(self, view: _View, bank: Bank) -> _Crops:
-        """Around the places where one of the bank's hypotheses explains most."""
+        """Crops around the places where one of the bank's hypotheses explains most."""
         layers, places = torch.cat([view.image, view.errors, view.unexplained]), self._places
         best = []
         for some in torch.arange(len(places.positions)).split(_AT_ONCE):

@@ -34,7 +34,7 @@ class Suns:
     """sRGB value of the ground in shadow."""
 
     def __init__(self, world: MeshWorld) -> None:
-        """Choose them.
+        """Choose the suns.
 
         Args:
             world: With a ground.
