@@ -10,7 +10,7 @@ _ENDS_ALL = (GeneratorExit, KeyboardInterrupt, SystemExit, CancelledError)  # wh
 
 
 class DeferredError:
-    """What an iterable raises ends it, and is raised once its items are done with."""
+    """Holds back an error that ends an iterable, until the items before it are done with."""
 
     def __init__(self) -> None:
         self._error: BaseException | None = None

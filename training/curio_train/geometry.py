@@ -68,7 +68,7 @@ class Pose(Generic[Array]):
         return Pose(self.rotation @ other.rotation, moved + self.translation_m)
 
     def to(self, like: Tensor) -> "Pose[Tensor]":
-        """The same pose as tensors with the type and device of ``like``."""
+        """This pose as tensors with the type and device of ``like``."""
         return Pose(torch.as_tensor(self.rotation).to(like), torch.as_tensor(self.translation_m).to(like))
 
 

@@ -138,7 +138,7 @@ class Layout:
 
 
 def detach(code: SceneCode) -> dict[str, Tensor]:
-    """The same values, cut from the graph."""
+    """The values of a scene code, detached from the graph."""
     return {name: value.detach() for name, value in code.items()}
 
 

@@ -122,7 +122,7 @@ class _CanonicalWarp:
     homography: Array | None = None
     """From pixels of the crop to pixels of the frame as averaged down [3, 3]; None: they are equal, or see ``maps``."""
     maps: tuple[Array, Array] | None = None
-    """For a camera that distorts, the same as OpenCV's ``remap`` takes it."""
+    """For a camera that distorts: x and y of the frame's pixels, as OpenCV's ``remap`` takes them."""
 
     def __call__(self, pixels: Array, size: tuple[int, int]) -> Array:
         """The warped image, uint8 RGB of that (width, height)."""

@@ -57,7 +57,7 @@ class Slot:
     box_corners: Sequence[Sequence[float]]
     """8 points (x, y, z), object frame, metres (image widths in 2D worlds); empty if the spec has none."""
     center: Sequence[float] = (0.0, 0.0, 0.0)
-    """The object's middle, likewise."""
+    """The object's middle (x, y, z), object frame, metres (image widths in 2D worlds)."""
 
 
 class Model:

@@ -92,7 +92,7 @@ class RenderOptions:
     over_photograph: bool = False
     """Draw over the photograph that the objects were found in."""
     path_traced: bool = False
-    """By stock Mitsuba's path tracer, with the light that surfaces give each other."""
+    """Whether stock Mitsuba's path tracer draws, with the light that surfaces give each other."""
     samples: int = 64
     """Rays for each pixel."""
 
@@ -217,7 +217,7 @@ def _renderer(
     samples: int,
     shadows: bool,
 ) -> Renderer:
-    """Scenes of one file mostly show the same objects."""
+    """A renderer, kept for the next scene: scenes of one file mostly show the same objects."""
     return Renderer(meshes, slots, width, height, ambient=ambient, samples_per_pixel=samples, object_shadows=shadows)
 
 

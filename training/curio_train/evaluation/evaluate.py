@@ -141,7 +141,7 @@ def _judged(subject: Subject, warn: Callable[[str], None]) -> Judgement | None:
 
 
 def _refining(subject: Subject) -> Subject:
-    """The same network with refined poses."""
+    """A network whose poses are refined."""
     return replace(subject, predict=with_refinement(subject.predict, subject.world, subject.config.method))
 
 

@@ -14,7 +14,7 @@ from curio_train.export.spec import model_spec
 
 
 def reading_repeatedly(subject: Subject, num_reads: int) -> Subject:
-    """The same network with several reads an image.
+    """A network that reads each image several times.
 
     Raises:
         UsageError: Its world allows no more than one, or not that many.

@@ -55,7 +55,7 @@ class Provenance:
 def card(
     version: int, spec: ModelSpec, shapes: Mapping[str, Sequence[int]], objects: Sequence[ObjectKind], made: Provenance
 ) -> str:
-    """A section of Markdown.
+    """One version's section of the card, in Markdown.
 
     Args:
         version: Of the model.

@@ -73,7 +73,7 @@ class Mesh:
         return box_corners(self.vertices_m)
 
     def moved(self, by_m: np.ndarray) -> "Mesh":
-        """The same mesh with every vertex moved [3]; it is named after its file as before."""
+        """This mesh with every vertex moved [3]; it is named after its file as before."""
         return dataclasses.replace(self, vertices_m=self.vertices_m + by_m)
 
 

@@ -184,7 +184,7 @@ def each_parameter_error(
 
 
 def canonical(code: SceneCode) -> dict[str, Tensor]:
-    """The same scene with yaws of length 1 and 6D rotations orthonormal, so that equal rotations are equal numbers."""
+    """A scene with yaws of length 1 and 6D rotations orthonormal, so that equal rotations are equal numbers."""
     same = dict(code)
     if YAW in code:
         matrix = matrix_from_yaw(code[YAW])

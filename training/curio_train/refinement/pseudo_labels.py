@@ -192,7 +192,7 @@ def _affordable(
 def predict_and_refine(
     refiner: RenderAndCompare, frames: UInt8[Tensor, "num 3 height width"], predict: Callable[[Tensor], SceneCode]
 ) -> Estimates:
-    """A network's predictions for photographs, and the same refined."""
+    """A network's predictions for photographs, as they are and refined."""
     predicted = joined([predict(chunk.float() / 255) for chunk in frames.split(_BATCH_SIZE)])
     return Estimates(predicted, *refined_poses(refiner, frames, predicted))
 

@@ -28,7 +28,7 @@ def random_camera(random: np.random.Generator) -> VirtualCamera:
 def random_rolls(
     count: int, random: np.random.Generator, largest_deg: float = LARGEST_ROLL_DEG
 ) -> Float[Tensor, "count 3 3"]:
-    """What cameras of crops turn what they see by."""
+    """Random rotations about the optical axis, by which cameras of crops are rolled."""
     roll = torch.from_numpy(np.radians(random.uniform(-largest_deg, largest_deg, count))).float()
     return about_axis(torch.stack([roll.cos(), roll.sin()], dim=1))
 

@@ -43,7 +43,7 @@ class Instances:
     """Float [instances · APPEARANCE_SIZE]; None: all surfaces are dull and smooth."""
 
     def detached(self) -> Self:
-        """The same values, without gradients."""
+        """These instances without gradients."""
         return replace(self, values=self.dr.detach(self.values))
 
     def origin(self, instance: Any) -> Any:

@@ -72,7 +72,7 @@ def to_json(config: RunConfig) -> dict[str, Any]:
 
 
 def to_portable(config: RunConfig) -> dict[str, Any]:
-    """The same without paths of this machine: the recipe that is stored in an exported model."""
+    """A configuration without paths of this machine: the recipe that is stored in an exported model."""
     folders = [field.name for field in fields(config.world) if _has_paths(getattr(config.world, field.name))]
     plain = to_json(config)
     if config.init is not None:

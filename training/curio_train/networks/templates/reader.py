@@ -324,7 +324,7 @@ class PoseReader(nn.Module):
 
 
 def _seen_along(position: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3 3"]:
-    """What turns an object on the optical axis so that it shows the same side at a position beside it."""
+    """The rotation by which an object on the optical axis shows the same side at a position beside the axis."""
     return rotation_between(position.new_tensor([0.0, 0.0, 1.0]).expand_as(position), position)
 
 

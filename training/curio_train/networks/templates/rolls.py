@@ -21,7 +21,7 @@ ROLLS_DEG = (-2 * MAX_ROLL_DEG / NUM_ROLLS, 0.0, 2 * MAX_ROLL_DEG / NUM_ROLLS)
 def upright_rolls(
     position: Float[Tensor, "places 3"], upward: Float[Tensor, "places 3"], rolls_deg: Sequence[float] = ROLLS_DEG
 ) -> Float[Tensor, "places*rolls 3 3"]:
-    """What cameras that look at objects turn what they see by: ``rolls_deg``, one after the other.
+    """Rotations about the optical axis that show objects rolled by ``rolls_deg``, one roll after the other.
 
     Args:
         position: Of the objects, camera frame of the image, any unit.

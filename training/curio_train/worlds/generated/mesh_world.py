@@ -127,7 +127,7 @@ class MeshWorld(World):
         return self._render(code, self.setup.cam_from_world, backgrounds)
 
     def novel_view(self, code: SceneCode) -> Tensor:
-        """The same scenes from the setup's novel view."""
+        """Images of scenes from the setup's novel view."""
         return self._render(code, self.setup.novel_cam_from_world, None)
 
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> StoredImages:

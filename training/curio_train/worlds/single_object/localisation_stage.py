@@ -38,7 +38,7 @@ class LocalisationStage(SingleObjectWorld):
 
     @property
     def exposure(self) -> Exposure:
-        """Mild, for the same reason."""
+        """Mild, because colours tell the object from other things."""
         return MILD_EXPOSURE
 
     def sample(self, count: int, seed: tuple[int, ...]) -> dict[str, Tensor]:

@@ -229,7 +229,7 @@ def pose_layout(position: Field, *, confidence: bool, color: bool = False, num_s
 
 
 def resized(camera: Intrinsics, width: int, height: int) -> Camera:
-    """The same view in another number of pixels."""
+    """A camera of this view with another number of pixels."""
     return Camera(width, height, scale_matrix(camera.matrix, (camera.width, camera.height), (width, height)))
 
 
