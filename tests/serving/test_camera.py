@@ -236,6 +236,7 @@ def test_files_that_are_none_are_named(tmp_path: Path) -> None:
         ("/camera/image_raw", False),
         ("/camera/image_raw/compressed", False),
         ("/rect_camera/image", False),
+        ("/camera/direct", False),
         ("/camera/image_rect", True),
         ("/camera/image_rect_color/compressed", True),
     ],

@@ -126,6 +126,8 @@ def test_nothing_is_written_over_the_images(models_dir: Path, frames: Path, tmp_
         detect(models_dir / "flat", frames, other, out=tmp_path / "out.jsonl", overlays=tmp_path)
     with pytest.raises(UsageError, match="is one of the images"):
         detect(models_dir / "flat", other / "a.png", out=other / "a.png", overwrite=True)
+    with pytest.raises(UsageError, match="is an image or a video"):
+        detect(models_dir / "flat", other, out=other / "a.png", overwrite=True)
     with pytest.raises(UsageError, match="is one of the images"):
         detect(models_dir / "flat", other / "*.png", out=other / "a.png", overwrite=True)
     assert {path: path.read_bytes() for path in before} == before

@@ -76,6 +76,9 @@ def test_overwrite_starts_again(tmp_path: Path) -> None:
     assert path.read_text() == "a shopping list\n"
     run(path, JsonLines(), overwrite=True)
     assert path.read_bytes().count(b"\n") == 6
+    whole = path.read_bytes()
+    run(path, JsonLines(), [], overwrite=True)
+    assert path.read_bytes() == whole, "without any image there is nothing to overwrite it with"
 
 
 @pytest.mark.parametrize("form", FORMATS)

@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
@@ -153,6 +154,20 @@ def test_a_video_gives_its_frames(clip: Path) -> None:
         assert frame.pixels.shape == (48, 64, 3)
         assert abs(frame.pixels.mean() - 40 * i) < 4
     assert frames[3].relative_name == str(clip / "000003.jpg")
+
+
+def test_after_a_damaged_frame_a_video_goes_on(clip: Path) -> None:
+    content = bytearray(clip.read_bytes())
+    _, _, second, third, *_ = (found.start() for found in re.finditer(rb"00dc", content))  # after one in the header
+    content[second + 8 : third] = bytes(third - second - 8)
+    clip.write_bytes(content)
+    frames = list(images([str(clip)], PassedOver()))
+    assert [frame.name for frame in frames] == [f"{clip}#{i}" for i in range(5)]
+    with pytest.raises(ImageError, match="damaged"):
+        frames[1].read()
+    assert frames[4].pixels is not None
+    assert abs(frames[4].pixels.mean() - 160) < 4
+    assert [frame.time_s for frame in frames] == [0, None, *map(pytest.approx, (0.2, 0.3, 0.4))]
 
 
 def test_a_video_that_is_none_gives_one_error(tmp_path: Path) -> None:

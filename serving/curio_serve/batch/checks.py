@@ -11,7 +11,9 @@ from curio_serve.batch.images.remote_files import is_url
 from curio_serve.batch.images.source_image import Topics
 from curio_serve.batch.images.sources import (
     ANY_TOPICS,
+    IMAGE_SUFFIXES,
     STANDARD_INPUT,
+    VIDEO_SUFFIXES,
     common_folder,
     is_recording,
     matching_paths,
@@ -108,3 +110,19 @@ def check_camera(arguments: DetectArguments, estimator: Estimator, recordings: S
             f"model {estimator.name} needs the intrinsics of the camera that took the images; give --camera FILE "
             "(camera JSON, BOP's camera.json or scene_camera.json, or OpenCV YAML)"
         )
+
+
+def refuse_images(arguments: DetectArguments) -> None:
+    """Refuse to write results over an image, a video or a recording.
+
+    Raises:
+        UsageError: ``--out`` is one.
+    """
+    out = arguments.out
+    if out is None or is_url(out) or not os.path.exists(out):
+        return
+    paths = (path for name in arguments.images if not is_url(name) for path in matching_paths(name))
+    if any(os.path.samefile(path, out) for path in paths):
+        raise UsageError(f"--out {out} is one of the images; choose another file")
+    if os.path.isfile(out) and Path(out).suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES:
+        raise UsageError(f"--out {out} is an image or a video; choose another file")

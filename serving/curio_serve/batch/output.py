@@ -1,14 +1,14 @@
 """Chooses the result file of a call, and its format."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from curio_serve.batch.arguments import DetectArguments
+from curio_serve.batch.checks import refuse_images
 from curio_serve.batch.estimators import Estimator
 from curio_serve.batch.images.remote_files import is_url
-from curio_serve.batch.images.sources import is_recording, matching_paths, names_recordings
+from curio_serve.batch.images.sources import is_recording, names_recordings
 from curio_serve.batch.results.formats import Bop, Csv, JsonLines, ResultFormat, bop_object_ids
 from curio_serve.batch.results.result_file import ResultFile
 from curio_serve.batch.results.result_parts import ResultParts
@@ -60,7 +60,7 @@ def open_output(
         OutputError: It cannot be written.
         Unavailable: The object store does not answer.
     """
-    _refuse_images(arguments)
+    refuse_images(arguments)
     if isinstance(form, ResultFormat):
         names = [(estimator.name, estimator.version) for estimator in estimators]
         if arguments.out is not None and is_url(arguments.out):
@@ -71,13 +71,3 @@ def open_output(
 
     assert arguments.out is not None
     return PoseRecording(Path(arguments.out), overwrite=arguments.overwrite)
-
-
-def _refuse_images(arguments: DetectArguments) -> None:
-    """Refuse to write results over an image or a recording that they are of."""
-    out = arguments.out
-    if out is None or is_url(out) or not os.path.exists(out):
-        return
-    paths = (path for name in arguments.images if not is_url(name) for path in matching_paths(name))
-    if any(os.path.samefile(path, out) for path in paths):
-        raise UsageError(f"--out {out} is one of the images; choose another file")

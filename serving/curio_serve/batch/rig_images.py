@@ -13,7 +13,7 @@ from pathlib import Path
 from curio_proto.v1.detector_pb2 import DetectResponse
 
 from curio_serve.batch.arguments import DetectArguments
-from curio_serve.batch.checks import named_recordings
+from curio_serve.batch.checks import named_recordings, refuse_images
 from curio_serve.batch.images.parallel import in_order
 from curio_serve.batch.images.remote_files import is_url
 from curio_serve.batch.images.source_image import SourceImage, Topics
@@ -167,6 +167,7 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
     """
     cameras = read_rig(arguments, models)
     named_recordings(arguments)
+    refuse_images(arguments)
     for model in models:
         ChildCheck()(Path(model))
     runtime = Runtime(read_providers(arguments.provider))

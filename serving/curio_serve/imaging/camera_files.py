@@ -149,7 +149,7 @@ def camera_of_images(info: Any, topic: str) -> PinholeCamera:
         CameraError: It has the lenses of another model than plumb_bob or rational_polynomial, or is not calibrated.
     """
     content: dict[str, Any] = {"width": info.width, "height": info.height}
-    if "rect" in topic.removesuffix("/compressed").rpartition("/")[2]:
+    if topic.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect"):
         content["k"] = [info.p[i] for i in (0, 1, 2, 4, 5, 6, 8, 9, 10)]
     else:
         content |= {"k": list(info.k), "d": list(info.d), "distortion_model": info.distortion_model}

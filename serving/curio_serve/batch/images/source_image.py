@@ -60,7 +60,7 @@ class SourceImage:
     recorded: RecordedAt | None = None
     """Topic and times, if the image comes from a recording."""
     error: str = ""
-    """Why a video has no frames to give, or a folder no images."""
+    """Why a video has no frames to give, or not this one, or a folder no images."""
     time_s: float | None = None
     """When a video's frame was taken, since its first, where that is known."""
 

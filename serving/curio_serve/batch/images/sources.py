@@ -12,12 +12,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
 from typing import BinaryIO
 
-import cv2
-
 from curio_serve.batch.images.remote_files import files_of, is_store, is_url, path_of
 from curio_serve.batch.images.source_image import SourceImage, Topics
 from curio_serve.errors import UsageError
 from curio_serve.files import check_regular
+from curio_serve.imaging.video import decoded_frames
 from curio_serve.models.model_folder import CONFIG_FILE
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
@@ -273,17 +272,14 @@ def _video_frames(path: str) -> Iterator[SourceImage]:
     except OSError as exc:
         yield SourceImage(path, path, error=f"cannot be read: {exc.strerror}")
         return
-    capture = cv2.VideoCapture(path)
-    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    number, rate = 0, capture.get(cv2.CAP_PROP_FPS)
-    try:
-        while (read := capture.read())[0]:
-            time_s = number / rate if rate > 0 else None
-            pixels = cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB)
-            yield SourceImage(f"{path}#{number}", path, number, pixels, time_s=time_s)
-            number += 1
-    finally:
-        capture.release()
+    number = 0
+    for pixels, at_s in decoded_frames(path):
+        name = f"{path}#{number}"
+        if pixels is None:
+            yield SourceImage(name, path, number, error="the video is damaged here: the frame cannot be decoded")
+        else:
+            yield SourceImage(name, path, number, pixels, time_s=at_s)
+        number += 1
     if number == 0:
         yield SourceImage(
             path, path, error="not a video that can be decoded, or one without frames; convert it to H.264 in MP4"

@@ -10,6 +10,7 @@ import os
 import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, Protocol, TypeVar
 
@@ -57,8 +58,7 @@ class ResultFile:
         self._models = tuple(models)
         self._descriptor = os.dup(1) if path is None else _open_locked(path)
         self._is_regular = path is not None and stat.S_ISREG(os.fstat(self._descriptor).st_mode)
-        if self._is_regular and overwrite:
-            os.ftruncate(self._descriptor, 0)
+        self._overwrites = self._is_regular and overwrite
 
     def __enter__(self) -> "ResultFile":
         return self
@@ -79,6 +79,12 @@ class ResultFile:
         Raises:
             UsageError: The file holds something else: another format, model, or other images.
         """
+        if self._overwrites:
+            first = next(images, None)
+            if first is None:
+                return images  # earlier results are worth more than none
+            os.ftruncate(self._descriptor, 0)
+            images = chain((first,), images)
         if self._is_regular:
             with open(os.dup(self._descriptor), "rb") as lines:
                 lines.seek(0)
