@@ -205,6 +205,11 @@ def test_curio_detect_takes_a_folder_of_each_camera(models_dir: Path, tmp_path: 
     assert first["detections"][0]["views"] == last["detections"][0]["views"] == [0, 1]
     assert str(folders[1] / "1.png") in broken["error"]
     (folders[1] / "2.png").unlink()
+    photograph = folders[0] / "0.png"
+    before = photograph.read_bytes()
+    with pytest.raises(UsageError, match="is an image or a video"):
+        run(DetectArguments(call.model, call.images, rig=rig, out=str(photograph), overwrite=True))
+    assert photograph.read_bytes() == before
     with pytest.raises(UsageError, match="cam1 has 2 images, others have more"):
         run(DetectArguments(call.model, call.images, rig=rig, out=str(tmp_path / "other.jsonl")))
     with pytest.raises(UsageError, match=r"has 2 cameras .cam0, cam1., found 1 IMAGES"):
