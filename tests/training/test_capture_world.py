@@ -16,6 +16,7 @@ from curio_serve.models.model import Model
 from curio_serve.models.model_folder import open_model
 from curio_train.camera import Intrinsics
 from curio_train.commands import train as train_command
+from curio_train.commands.command_line.project_file import with_project
 from curio_train.config import NetworkConfig, RunConfig
 from curio_train.data import backgrounds
 from curio_train.data.background_image import BackgroundImages
@@ -321,6 +322,11 @@ def test_from_files_to_a_model_by_a_project_file(
     assert evaluate(run, num_images=4, cache=cache, warn=warnings.append)["metrics"], "scores need no photographs"
     assert ["gone" in warning for warning in warnings] == [True]
     assert 'class="scores"' in (run / "report.html").read_text()
+
+
+def test_a_project_file_may_follow_an_equals_sign(tmp_path: Path) -> None:
+    (tmp_path / "part.toml").write_text("minutes = 3\n")
+    assert with_project(["capture", f"--project={tmp_path / 'part.toml'}"], ()) == ["capture", "--minutes=3"]
 
 
 def test_project_files_that_cannot_be_used(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

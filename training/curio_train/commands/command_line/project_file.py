@@ -33,6 +33,9 @@ def with_project(arguments: list[str], paths: Collection[str]) -> list[str]:
     Raises:
         UsageError: The file cannot be read, is no TOML, or holds what cannot be a flag.
     """
+    arguments = [
+        word for typed in arguments for word in (typed.split("=", 1) if typed.startswith(f"{FLAG}=") else [typed])
+    ]
     if FLAG not in arguments:
         return arguments
     place = arguments.index(FLAG)
