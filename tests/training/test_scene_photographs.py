@@ -156,6 +156,16 @@ def test_frames_of_a_video_come_in_any_order(clip: Path) -> None:
     assert round(frame(1).mean() / 50) == 1
 
 
+def test_frames_after_a_damaged_one_are_those_that_were_detected_in(clip: Path) -> None:
+    parts = clip.read_bytes().split(b"00dc")  # the header, and from the third on the frames
+    parts[3] = parts[3][:4] + bytes(len(parts[3]) - 4)
+    clip.write_bytes(b"00dc".join(parts))
+    scenes = [Scene("a", WIDTH, HEIGHT, K, (), None, Path(f"{clip}#{number}")) for number in range(4)]
+    assert [round(photograph_of(scenes[number]).mean() / 50) for number in (2, 3)] == [2, 3]
+    with pytest.raises(DataError, match="damaged at frame 1"):
+        photograph_of(scenes[1])
+
+
 @WAYS
 @pytest.mark.parametrize(
     ("image", "told"),

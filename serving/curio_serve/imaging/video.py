@@ -1,5 +1,6 @@
 """Opens cameras and videos by what users type, and reads videos to their end."""
 
+import os
 from collections.abc import Iterator
 
 import cv2
@@ -28,8 +29,9 @@ def decoded_frames(path: str) -> Iterator[tuple[np.ndarray | None, float | None]
 
     Beside each: the seconds since the first frame, by the video's own times or else by its frame rate; None: unknown.
     """
-    capture = open_video(path)
-    number, damaged, times = 0, 0, _Times(capture)
+    capture = open_video(os.path.abspath(path))  # never the number of a camera
+    rate = capture.get(cv2.CAP_PROP_FPS)
+    number, damaged, first_ms = 0, 0, None
     try:
         while damaged <= _MOST_DAMAGED:
             is_read, pixels = capture.read()
@@ -38,26 +40,10 @@ def decoded_frames(path: str) -> Iterator[tuple[np.ndarray | None, float | None]
                 continue
             yield from [(None, None)] * damaged
             number, damaged = number + damaged, 0
-            yield cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), times.of(number)
+            at_ms = capture.get(cv2.CAP_PROP_POS_MSEC)  # 0 of every frame where the video says nothing
+            first_ms = at_ms if first_ms is None else first_ms
+            by_rate_s = number / rate if rate > 0 else None
+            yield cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), (at_ms - first_ms) / 1000 if at_ms > first_ms else by_rate_s
             number += 1
     finally:
         capture.release()
-
-
-class _Times:
-    """When a video's frames were taken."""
-
-    def __init__(self, capture: cv2.VideoCapture) -> None:
-        self._capture, self._rate = capture, capture.get(cv2.CAP_PROP_FPS)
-        self._first_s = self._last_s = 0.0
-
-    def of(self, number: int) -> float | None:
-        """Of the frame that was read last, with this number: seconds since the first."""
-        at_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-        if number == 0:
-            self._first_s = self._last_s = at_s
-            return 0.0
-        if at_s > self._last_s:
-            self._last_s = at_s
-            return at_s - self._first_s
-        return number / self._rate if self._rate > 0 else None

@@ -175,15 +175,14 @@ def _file_arguments(path: Path) -> list[str]:
 
 
 def _environment_arguments(environment: Mapping[str, str]) -> list[str]:
-    known = {field.name for field in fields(ServeConfig)} - _NOT_STORED
+    known = {field.name for field in fields(ServeConfig)} - {"dump_config"}
     arguments = []
     for variable, name, text in environment_settings(environment, ENV_PREFIX):
-        if name == "config":
-            continue  # the file has been read
         if name not in known:
-            names = ", ".join(sorted(ENV_PREFIX + name.upper() for name in (*known, "config")))
+            names = ", ".join(sorted(ENV_PREFIX + name.upper() for name in known))
             raise UsageError(f"environment variable {variable} is no setting; known are {names}")
-        arguments += _arguments(name, _typed(variable, text, getattr(ServeConfig, name)), variable)
+        if name != "config":  # the file has been read
+            arguments += _arguments(name, _typed(variable, text, getattr(ServeConfig, name)), variable)
     return arguments
 
 

@@ -3,14 +3,15 @@
 import functools
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 from curio_serve import errors as serving
 from curio_serve.files import check_regular, read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.image import MAX_FILE_BYTES, decode
+from curio_serve.imaging.video import decoded_frames
 from curio_serve.imaging.view import undistort
 
 from curio_train.camera import scale_matrix
@@ -85,9 +86,9 @@ class _Video:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._capture = cv2.VideoCapture()
+        self._frames: Iterator[tuple[np.ndarray | None, float | None]] = iter(())
         self._num_read = 0
-        self._pixels: np.ndarray = np.empty(0)
+        self._pixels: np.ndarray | None = None
 
     def frame(self, number: int) -> np.ndarray:
         """A frame, uint8 RGB [height, width, 3]. It is reached fast from those shortly before it.
@@ -95,17 +96,16 @@ class _Video:
         Raises:
             DataError: The video cannot be read, or has no such frame.
         """
-        if number < self._num_read - 1 or not self._capture.isOpened():
+        if number < self._num_read - 1 or self._num_read == 0:
             self._open()
         while self._num_read <= number:
-            if not self._capture.grab():
+            found = next(self._frames, None)
+            if found is None:
                 raise self._missing(number)
+            self._pixels, _ = found
             self._num_read += 1
-            if self._num_read > number:
-                found, pixels = self._capture.retrieve()
-                if not found:
-                    raise self._missing(number)
-                self._pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+        if self._pixels is None:
+            raise DataError(f"{self._path}: the video is damaged at frame {number}, which cannot be decoded")
         return self._pixels
 
     def _open(self) -> None:
@@ -113,15 +113,13 @@ class _Video:
             check_regular(os.stat(self._path), str(self._path))
         except OSError as exc:
             raise DataError(f"{self._path}: the video cannot be read ({exc.strerror})") from exc
-        self._capture.open(str(self._path))
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        self._num_read = 0
+        self._frames, self._num_read = decoded_frames(str(self._path)), 0
 
     def _missing(self, number: int) -> DataError:
-        self._capture.release()
+        found, self._num_read = self._num_read, 0
         return DataError(
-            f"{self._path}: found {self._num_read} frames that can be decoded, expected frame {number} (the first is "
-            "0); is it another file by now?"
+            f"{self._path}: found {found} frames that can be decoded, expected frame {number} (the first is 0); is it "
+            "another file by now?"
         )
 
 
