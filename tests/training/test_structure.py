@@ -120,6 +120,12 @@ def test_a_known_camera_is_kept(sequence: tuple[list[Path], np.ndarray]) -> None
     assert np.degrees(Rotation.from_matrix(found.relative(0, 9)[:3, :3] @ turn.T).magnitude()) < 0.5
 
 
+def test_a_camera_file_of_another_size_is_refused(sequence: tuple[list[Path], np.ndarray]) -> None:
+    twice = Intrinsics(np.diag([2.0, 2, 1]) @ MATRIX, 2 * WIDTH, 2 * HEIGHT)
+    with pytest.raises(DataError, match=f"000.png: found {WIDTH}x{HEIGHT} pixels.* {2 * WIDTH}x{2 * HEIGHT}"):
+        recover(every_nth(sequence[0], 4), twice)
+
+
 def test_all_coefficients_of_a_known_lens_count(tmp_path: Path) -> None:
     """Of a rational model they are large, and nearly cancel each other: these are a Kinect's."""
     lens = (0.52, -2.67, 0.0006, -0.0002, 1.52, 0.40, -2.49, 1.45)

@@ -22,13 +22,13 @@ from curio_train.commands import view as view_command
 from curio_train.data.clutter import dead_leaves_texture
 from curio_train.drawing.album import MeshFiles
 from curio_train.drawing.pictures import RenderOptions, SceneContext, picture
-from curio_train.drawing.scenes import Placed, Scene, read_scenes
+from curio_train.drawing.scenes import Placed, Scene
 from curio_train.errors import DataError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import load_mesh
 from curio_train.meshes.shapes import chair
 from curio_train.viewing.fitting import walk
-from curio_train.viewing.pages import Opening, Page, newer_pages, open_pages
+from curio_train.viewing.pages import Opening, Page, open_pages
 from curio_train.viewing.panel import Panel
 from curio_train.viewing.saving import save
 from curio_train.viewing.space import Space
@@ -66,7 +66,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     off = Rotation.from_rotvec([4.0, -5.0, 3.0], degrees=True).as_matrix()
     wrong = Pose(off @ TRUE.rotation, TRUE.translation_m + np.array([0.006, -0.005, 0.005]))
     found = Scene("", WIDTH, HEIGHT, K, (Placed("chair", wrong),), None, folder / "photograph.png")
-    save(found, folder / "found.jsonl")
+    save(Page(found, context, drawn, over_image=True), folder / "found.jsonl")
     return folder
 
 
@@ -199,6 +199,27 @@ def test_scenes_of_a_world(files: Path, view: Callable[..., Command], browser: A
 
 
 @needs_browser
+def test_newer_checkpoints_leave_what_is_not_saved(
+    tmp_path: Path, write_run: Callable[..., Path], view: Callable[..., Command], browser: Any
+) -> None:
+    run = write_run(tmp_path / "run", SpheresOptions())
+    page = opened(browser, view(run, "--out", tmp_path / "edited.jsonl", "--cache", tmp_path).url)
+    (checkpoint,) = (run / "checkpoints").iterdir()
+    across = page.get_by_label("position (mm)")
+    read = across.input_value()
+    across.fill("123.4")
+    page.wait_for_timeout(1000)
+    shutil.copytree(checkpoint, checkpoint.with_name("00000009"))
+    page.get_by_text("There is a newer checkpoint").wait_for(timeout=60_000)
+    assert across.input_value() == "123.4"
+    page.get_by_role("button", name="save the code").click()
+    page.get_by_text("saved to").wait_for()
+    shutil.copytree(checkpoint, checkpoint.with_name("00000010"))
+    until(lambda: across.input_value() == read)
+    page.close()
+
+
+@needs_browser
 def test_a_photograph_with_a_model(files: Path, view: Callable[..., Command], browser: Any) -> None:
     given = ["--model", ROOT / "models" / "ape", "--camera", ROOT / "samples" / "camera.json"]
     out = files / "ape.jsonl"
@@ -221,19 +242,6 @@ def test_without_a_renderer_the_photograph_is_shown(
     page.close()
 
 
-def test_a_run_is_opened_again_with_a_newer_checkpoint(tmp_path: Path, write_run: Callable[..., Path]) -> None:
-    run = write_run(tmp_path / "run", SpheresOptions())
-    opening = Opening(str(run), cache=tmp_path)
-    pages, reload = open_pages(opening), newer_pages(opening)
-    assert reload() is None
-    (checkpoint,) = (run / "checkpoints").iterdir()
-    shutil.copytree(checkpoint, checkpoint.with_name("00000009"))
-    again = reload()
-    assert again is not None
-    assert [page.scene.name for page in again] == [page.scene.name for page in pages]
-    assert reload() is None
-
-
 def with_far_origin(files: Path) -> Page:
     """The result file's page with a mesh whose origin is half a metre from its middle, at the same place."""
     (page,) = open_pages(Opening(str(files / "found.jsonl"), MeshFiles((str(files / "chair.ply"),), "m")))
@@ -247,6 +255,14 @@ def test_an_object_is_fitted_wherever_its_origin_is(files: Path) -> None:
     found = last.pose @ OFF
     assert found.translation_m == pytest.approx(TRUE.translation_m, abs=0.006)
     assert np.degrees(Rotation.from_matrix(found.rotation.T @ TRUE.rotation).magnitude()) < 2
+
+
+def test_what_is_behind_the_camera_is_not_fitted(files: Path) -> None:
+    page = with_far_origin(files)
+    (item,) = page.scene.objects
+    behind = replace(item, pose=Pose(item.pose.rotation, item.pose.translation_m - np.array([0, 0, 2.0])))
+    with pytest.raises(DataError, match="not in front of the camera"):
+        next(walk(replace(page, scene=replace(page.scene, objects=(behind,))), 0))
 
 
 def test_the_camera_reaches_to_the_objects_wherever_their_origins_are(files: Path) -> None:
@@ -300,14 +316,13 @@ def test_bad_input_is_one_message(files: Path, tmp_path: Path, capsys: pytest.Ca
 
 
 def test_a_code_that_cannot_be_saved(files: Path, tmp_path: Path) -> None:
-    (scene,) = read_scenes(files / "found.jsonl")
     with pytest.raises(DataError, match="choose another --out"):
-        save(scene, tmp_path)
+        save(with_far_origin(files), tmp_path)
 
 
 def test_a_scene_of_a_generated_world_is_opened_again(tmp_path: Path) -> None:
     page = next(iter(open_pages(Opening("chairs", cache=tmp_path))))
-    save(page.scene, tmp_path / "edited.jsonl")
+    save(page, tmp_path / "edited.jsonl")
     (again,) = open_pages(Opening(str(tmp_path / "edited.jsonl"), cache=tmp_path))
     assert again.scene.world == "chairs"
     assert again.scene.photograph is None

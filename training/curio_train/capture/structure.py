@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from curio_train.camera import Intrinsics, check_matrix
+from curio_train.data.photographs import check_sizes
 from curio_train.errors import CameraError, DataError
 
 _FEWEST_PHOTOGRAPHS = 3
@@ -69,7 +70,7 @@ def recover(photographs: Sequence[Path], camera: Intrinsics | None = None) -> St
         camera: Its K, where known; found from the photographs where not.
 
     Raises:
-        DataError: Too few photographs, or in several folders.
+        DataError: Too few photographs, in several folders, or not of the known camera's size.
         CameraError: It cannot be done: no texture, no overlap, or a result that does not explain the photographs.
     """
     folders = {path.parent for path in photographs}
@@ -78,6 +79,8 @@ def recover(photographs: Sequence[Path], camera: Intrinsics | None = None) -> St
             f"found {len(photographs)} photographs in {len(folders)} folder(s), expected at least "
             f"{_FEWEST_PHOTOGRAPHS} in one"
         )
+    if camera is not None:
+        check_sizes(photographs, camera)
     with tempfile.TemporaryDirectory() as scratch:
         found = _map(folders.pop(), [path.name for path in photographs], camera, Path(scratch))
     return _checked(photographs, found, camera)

@@ -98,11 +98,7 @@ def read_frame(path: Path, camera: Intrinsics) -> np.ndarray:
     """
     pixels = read_photograph(path)
     height, width = pixels.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise DataError(
-            f"{path}: found {width}x{height} pixels, but the camera file is for {camera.width}x{camera.height}; "
-            "expected photographs as that camera stores them, neither resized nor turned"
-        )
+    _check_size(path, (width, height), camera)
     return undistort(pixels, PinholeCamera(camera.matrix, camera.distortion))
 
 
@@ -115,6 +111,29 @@ def read_frames(paths: Sequence[Path], camera: Intrinsics, width: int, height: i
     frames = (read_frame(path, camera) for path in paths)
     resized = [cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA) for frame in frames]
     return np.ascontiguousarray(np.stack(resized).transpose(0, 3, 1, 2))
+
+
+def check_sizes(paths: Sequence[Path], camera: Intrinsics) -> None:
+    """Refuse photographs that are not of a camera's size, by their headers alone.
+
+    Raises:
+        DataError: One is no image, or of another size; it is named.
+    """
+    for path in paths:
+        try:
+            with Image.open(path) as image:
+                size = image.size
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as exc:
+            raise DataError(f"{path}: not an image ({exc}); expected a PNG, JPEG, WebP, BMP or TIFF file") from exc
+        _check_size(path, size, camera)
+
+
+def _check_size(path: Path, size: tuple[int, int], camera: Intrinsics) -> None:
+    if size != (camera.width, camera.height):
+        raise DataError(
+            f"{path}: found {size[0]}x{size[1]} pixels, but the camera file is for {camera.width}x{camera.height}; "
+            "expected photographs as that camera stores them, neither resized nor turned"
+        )
 
 
 def _check(path: Path) -> None:

@@ -1,6 +1,7 @@
 """Pictures of scenes for people: the training renderer at full resolution, or stock Mitsuba's path tracer."""
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,9 +19,11 @@ from curio_train.drawing.scenes import Placed, Scene
 from curio_train.errors import DataError, UsageError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import Mesh
+from curio_train.rendering.bounds import project_bounds
 from curio_train.rendering.ground import Ground
 from curio_train.rendering.path_tracing import path_traced
-from curio_train.rendering.renderer import Renderer
+from curio_train.rendering.renderer import MAX_RAYS, Renderer
+from curio_train.rendering.shadows import fallen
 from curio_train.rendering.stock import PosedMesh
 from curio_train.worlds.generated.mesh_world import MeshWorld
 
@@ -193,7 +196,9 @@ def _rendered(scene: Scene, around: SceneContext, behind: np.ndarray | None, sam
     kinds = list(dict.fromkeys(item.kind for item in scene.objects))
     meshes, slots = tuple(around.mesh(kind) for kind in kinds), tuple(kinds.index(item.kind) for item in scene.objects)
     shadows = around.ground is not None
-    renderer = _renderer(meshes, slots, scene.width, scene.height, around.ambient, samples, shadows)
+    rounds = min(samples, math.ceil(_pixels_traced(scene, around) * samples / MAX_RAYS) or 1)
+    each = math.ceil(samples / rounds)
+    renderer = _renderer(meshes, slots, scene.width, scene.height, around.ambient, each, shadows)
     seen: dict[str, Any] = {
         "rotation": _stack([item.pose.rotation for item in scene.objects]),
         "translation_m": _stack([item.pose.translation_m for item in scene.objects]),
@@ -201,10 +206,32 @@ def _rendered(scene: Scene, around: SceneContext, behind: np.ndarray | None, sam
         "light": light,
         "confidence": _stack([item.confidence for item in scene.objects]),
     }
+    color = _stack([item.color_srgb for item in scene.objects])
+
+    def one(seed: int) -> Tensor:
+        ground = around.ground
+        under = background
+        if ground is not None:
+            under = ground.image(around.ambient, light, renderer.shadows(**seen, ground=ground, seed=seed))
+        image: Tensor = renderer(**seen, backgrounds=under, color=color, seed=seed)
+        return image[0]
+
+    image = one(0)
+    for seed in range(1, rounds):
+        image += one(seed)
+    return (image / rounds).permute(1, 2, 0).numpy()
+
+
+def _pixels_traced(scene: Scene, around: SceneContext) -> int:
+    """About how many pixels are traced at a time: those of the objects, or those of their shadows."""
+    corners_m = np.array([item.pose.apply(around.mesh(item.kind).box_corners_m) for item in scene.objects])
+    bodies = [corners_m]
     if around.ground is not None:
-        background = around.ground.image(around.ambient, light, renderer.shadows(**seen, ground=around.ground))
-    image: Tensor = renderer(**seen, backgrounds=background, color=_stack([item.color_srgb for item in scene.objects]))
-    return image[0].permute(1, 2, 0).numpy()
+        assert around.light is not None  # settled before
+        bodies.append(fallen(corners_m, np.tile(around.light, (len(corners_m), 1)), around.ground))
+    intrinsics = np.tile(scene.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (len(corners_m), 1))
+    bounds = [project_bounds(body, intrinsics, scene.width, scene.height) for body in bodies]
+    return max(int(bound.num_pixels.sum()) for bound in bounds)
 
 
 @functools.lru_cache(maxsize=4)

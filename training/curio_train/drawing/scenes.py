@@ -74,12 +74,17 @@ def mesh_world(name: str) -> MeshWorld:
     Raises:
         DataError: There is none, or it is not a world of generated meshes.
     """
-    known = [kind for kind, options in WORLDS.items() if not dataclasses.fields(options)]
+    known = _without_files()
     world = build(WORLDS[name]()) if name in known else None
     if not isinstance(world, MeshWorld):
         solid = [kind for kind in known if kind != "circles"]
         raise DataError(f"world {name!r} has no meshes of its own; expected one of {', '.join(solid)}")
     return world
+
+
+def _without_files() -> list[str]:
+    """Names of the worlds that a name alone says: they have no options, and so no files."""
+    return [kind for kind, options in WORLDS.items() if not dataclasses.fields(options)]
 
 
 def read_scenes(path: Path) -> Iterator[Scene]:
@@ -143,14 +148,15 @@ def _from_detections(record: Mapping[str, Any], number: int, path: Path) -> Scen
         raise DataError(f"{where}: it has no camera_matrix, so it is flat; expected poses in three dimensions")
     width, height = int(record["width"]), int(record["height"])
     light, world, cam_from_rig = record.get("light"), record.get("world"), _cam_from_rig(record, where)
+    image = None if record["image"] is None else Path(record["image"])
     return Scene(
-        f"{number:06d}-{Path(record['image']).stem}",
+        f"{number:06d}-{'scene' if image is None else image.stem}",
         width,
         height,
         check_matrix(record["camera_matrix"], width, height, f"{where}, camera_matrix"),
         tuple(_placed(detection, cam_from_rig) for detection in record["detections"]),
         None if light is None else _numbers(light, (3,), "light"),
-        located(Path(record["image"]), path.parent) if world is None else None,
+        located(image, path.parent) if image is not None and world is None else None,
         None if world is None else mesh_world(str(world)).name,
         distortion=tuple(map(float, record.get("distortion") or ())),
         exif_rotation=record.get("exif_rotation") is True,
@@ -215,7 +221,7 @@ def scene_of_code(world: World, code: SceneCode, number: int) -> Scene:
     assert camera.matrix is not None  # only worlds with a pinhole camera come here
     name = f"{number:06d}-{world.name}"
     light = seen.get(LIGHT)
-    named = world.name if isinstance(world, MeshWorld) else None
+    named = world.name if world.name in _without_files() else None
     return Scene(name, camera.width, camera.height, camera.matrix, tuple(objects), light, world=named)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from curio_train.camera import scale_matrix
+from curio_train.errors import DataError
 from curio_train.geometry import Pose, rotation_6d_from_matrix
 from curio_train.refinement.render_and_compare import RenderAndCompare
 from curio_train.scene_code import COLOR, LIGHT, ROTATION_6D, TRANSLATION, poses
@@ -31,14 +32,18 @@ def walk(page: Page, number: int) -> Iterator[Step]:
         number: Of the object in the page's scene.
 
     Raises:
+        DataError: The object is not in front of the camera.
         RendererError: There is no usable libLLVM.
     """
     item, mesh = page.scene.objects[number], page.context.mesh(page.scene.objects[number].kind)
     height, width = page.image.shape[:2]
     matrix = scale_matrix(page.scene.camera_matrix, (page.scene.width, page.scene.height), (width, height))
     middle = Pose(np.eye(3), mesh.box_corners_m.mean(axis=0))  # around which crops are cut
+    position_m = (item.pose @ middle).translation_m
+    if position_m[2] <= 0:
+        raise DataError(f"{item.kind or 'the object'} is not in front of the camera (z {position_m[2]:.3g} m); move it")
     code = {
-        TRANSLATION: _tensor((item.pose @ middle).translation_m)[None],
+        TRANSLATION: _tensor(position_m)[None],
         ROTATION_6D: rotation_6d_from_matrix(_tensor(item.pose.rotation))[None],
         LIGHT: _tensor(page.light),
         COLOR: _tensor(item.color_srgb)[None],

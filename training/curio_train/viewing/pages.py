@@ -26,6 +26,7 @@ from curio_train.worlds.generated.mesh_world import MeshWorld
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.viewpoints import AMBIENT
 from curio_train.worlds.single_object.world import SingleObjectWorld
+from curio_train.worlds.tabletop.world import TabletopWorld
 
 NUM_DRAWN = 8
 """Scenes that a world or a run shows."""
@@ -138,10 +139,12 @@ def _of_run(path: Path, cache: Path) -> Iterator[Page]:
     codes = subject.predict((images * 255).round().byte())
     for number in range(NUM_DRAWN):
         scene = scene_of_code(world, index(codes, slice(number, number + 1)), number)
-        yield Page(scene, context, _uint8(images[number]), over_image=not isinstance(world, MeshWorld))
+        yield Page(scene, context, _uint8(images[number]), over_image=scene.world is None)
 
 
 def _context(path: Path, world: World) -> SceneContext:
+    if isinstance(world, TabletopWorld):
+        return SceneContext({part.kind.name: part.mesh_of_file for part in world.parts}, world.setup.ambient)
     if isinstance(world, MeshWorld):
         return SceneContext.of_world(world)
     if isinstance(world, SingleObjectWorld):

@@ -1,30 +1,50 @@
 """Saves an edited scene as a line that ``curio-render`` and ``curio-view`` read."""
 
+import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
+
+import cv2
+import numpy as np
 
 from curio_train.drawing.scenes import Scene
 from curio_train.errors import DataError
+from curio_train.viewing.pages import Page
 
 
-def save(scene: Scene, file: Path) -> None:
-    """Append a scene to a JSON Lines file, in the layout of ``curio-detect``; the folder is made where it is missing.
+def save(page: Page, file: Path) -> None:
+    """Append a page's scene to a JSON Lines file, in the layout of ``curio-detect``.
+
+    Folders are made where they are missing. Validation images of a run have no file: such an image is written beside
+    the scene, named after its content.
 
     Raises:
-        DataError: The file cannot be written.
+        DataError: The file or the image cannot be written.
     """
-    line = json.dumps(_record(scene))
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
+        line = json.dumps(_record(_with_file(page, file)))
         with file.open("a", encoding="utf-8") as out:
             out.write(line + "\n")
     except OSError as exc:
         raise DataError(f"{file}: the scene code cannot be saved ({exc.strerror}); choose another --out") from exc
 
 
+def _with_file(page: Page, file: Path) -> Scene:
+    """The page's scene; if objects are drawn over its image, the photograph is a file."""
+    if not page.over_image or page.scene.photograph is not None:
+        return page.scene
+    _, png = cv2.imencode(".png", np.ascontiguousarray(page.image[..., ::-1]))
+    content = png.tobytes()
+    image = file.with_name(f"{file.stem}-{hashlib.sha256(content).hexdigest()[:12]}.png")
+    image.write_bytes(content)
+    return replace(page.scene, photograph=image)
+
+
 def _record(scene: Scene) -> dict[str, object]:
     return {
-        "image": scene.name if scene.photograph is None else str(scene.photograph.absolute()),
+        "image": _image(scene),
         "width": scene.width,
         "height": scene.height,
         "camera_matrix": scene.camera_matrix.tolist(),
@@ -43,3 +63,9 @@ def _record(scene: Scene) -> dict[str, object]:
         "light": None if scene.light is None else scene.light.tolist(),
         **({} if scene.world is None else {"world": scene.world}),
     }
+
+
+def _image(scene: Scene) -> str | None:
+    if scene.world is not None:
+        return scene.name
+    return None if scene.photograph is None else str(scene.photograph.absolute())

@@ -50,6 +50,7 @@ class Viewer:
             raise UsageError(fault)
         self._pages, self._out, self._reload = list(pages), out, reload
         self._number, self._selected = 0, 0
+        self._unsaved: set[int] = set()  # pages that were edited since
         self._lock = threading.RLock()
         self._changed, self._fit_asked, self._ended = threading.Event(), threading.Event(), threading.Event()
         self._server = viser.ViserServer(host=host, port=port, label="curio-view", verbose=False)
@@ -123,10 +124,11 @@ class Viewer:
 
     def _save(self) -> None:
         try:
-            save(self.page.scene, self._out)
+            save(self.page, self._out)
         except CurioError as exc:
             self._panel.message(f"**not saved**: {exc}")
         else:
+            self._unsaved.discard(self._number)
             self._panel.message(f"saved to {self._out}")
 
     def _drag(self, number: int, pose: Pose) -> None:
@@ -142,6 +144,7 @@ class Viewer:
 
     def _replace_scene(self, scene: Scene) -> None:
         self._pages[self._number] = replace(self.page, scene=scene)
+        self._unsaved.add(self._number)
         self._changed.set()
 
     # The thread that draws.
@@ -168,10 +171,18 @@ class Viewer:
         self._panel.show_pictures(compare(page))
 
     def _look_for_newer_pages(self) -> None:
+        """Show what a newer checkpoint reads, but on the pages whose edits are not saved."""
         newer = self._reload()
-        if newer:
-            with self._lock:
-                self._pages = list(newer)
+        if not newer:
+            return
+        with self._lock:
+            kept = {number: self._pages[number] for number in self._unsaved if number < len(newer)}
+            self._pages, self._unsaved = list(newer), set(kept)
+            for number, page in kept.items():
+                self._pages[number] = page
+            if self._number in kept:
+                self._panel.message("There is a newer checkpoint. This page keeps your edits until you save them.")
+            else:
                 self._show_page(min(self._number, len(newer) - 1))
 
     def _fit(self) -> None:

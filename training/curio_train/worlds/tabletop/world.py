@@ -85,6 +85,11 @@ class Part:
     unpainted: bool
     """Whether its colour is part of the scene code."""
 
+    @property
+    def mesh_of_file(self) -> Mesh:
+        """The mesh in the frame of its file."""
+        return replace(self.mesh, vertices_m=self.file_from_own.apply(self.mesh.vertices_m))
+
 
 @dataclass(frozen=True, eq=False)
 class TabletopPhotographs:
