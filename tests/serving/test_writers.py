@@ -133,6 +133,12 @@ def test_bop_rows_are_millimetres_row_major_and_the_images_seconds() -> None:
     assert float(seconds) == pytest.approx(0.00375)
 
 
+def test_bop_rows_of_several_models_have_the_time_of_the_whole_image() -> None:
+    answers = [answer("lmo/test/000002/rgb/000017.png", detection(), inference_ms=ms) for ms in (2.5, 10.0)]
+    rows = Bop({"ape": 1}).lines(answers).data.decode().splitlines()
+    assert [float(row.rpartition(",")[2]) for row in rows] == pytest.approx([0.015, 0.015])
+
+
 @pytest.mark.parametrize("image", ["000017.png", "scene/rgb/000017.png", "000002/rgb/left.png"])
 def test_bop_refuses_a_path_without_scene_or_image_number(image: str) -> None:
     with pytest.raises(UsageError, match="<scene>/rgb/<image>"):

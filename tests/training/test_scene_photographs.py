@@ -17,7 +17,7 @@ from curio_train.drawing.scenes import Scene, read_scenes
 from curio_train.errors import DataError
 from curio_train.meshes.meshes import to_ply
 from curio_train.meshes.shapes import box
-from curio_train.viewing.pages import Opening, open_pages
+from curio_train.viewing.pages import Opening, Page, open_pages
 from curio_train.viewing.saving import save
 from PIL import Image
 from rerun.chunk import RrdReader
@@ -116,11 +116,11 @@ def test_lines_without_the_fields_show_the_photograph_as_stored(
 def test_an_edited_scene_keeps_its_photograph(form: str, tmp_path: Path) -> None:
     camera = PinholeCamera(K, DISTORTION)
     (scene,) = read_scenes(written(tmp_path / "a.jsonl", "a.jpg", camera, (WIDTH, HEIGHT), exif_rotation=True))
-    file = tmp_path / f"edited.{form}"
+    file, context = tmp_path / f"edited.{form}", SceneContext({"": box((0.1, 0.2, 0.3))})
     if form == "glb":
-        file.write_bytes(to_glb(scene, SceneContext({"": box((0.1, 0.2, 0.3))})))
+        file.write_bytes(to_glb(scene, context))
     else:
-        save(scene, file)
+        save(Page(scene, context, spots(camera), over_image=True), file)
     back = from_glb(file) if form == "glb" else next(read_scenes(file))
     assert (back.distortion, back.exif_rotation) == (DISTORTION, True)
 

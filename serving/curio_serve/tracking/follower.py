@@ -86,7 +86,7 @@ class Follower:
             camera: Intrinsics of the full-size frame.
             time_s: When it was taken, after the frame before.
             following: How.
-            min_confidence: What the frame shows below it is not answered.
+            min_confidence: Objects last seen with less are not answered; how far a prediction faded is no matter.
             reduction: How much smaller than the frame the pixels were decoded.
             results: The field of a response.
             before_run: Called before each run of a network.

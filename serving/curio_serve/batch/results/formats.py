@@ -10,7 +10,7 @@ import io
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import PurePath
 
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
@@ -222,6 +222,12 @@ class Bop(ResultFormat):
 
     def __init__(self, object_ids: Mapping[str, int]) -> None:
         self._object_ids = dict(object_ids)
+
+    def lines(self, results: Sequence[ImageResult]) -> ImageLines:
+        """Format the lines of an image; its models run one after the other, and its time is the sum of theirs."""
+        decode_ms = sum(result.decode_ms or 0.0 for result in results)
+        inference_ms = sum(result.inference_ms or 0.0 for result in results)
+        return super().lines([replace(result, decode_ms=decode_ms, inference_ms=inference_ms) for result in results])
 
     def encode(self, result: ImageResult) -> bytes:
         key = self.key(result.image)
