@@ -32,6 +32,9 @@ onload = () => { document.body.dataset.sizes = JSON.stringify(
 </script></body>"""
 
 
+pytestmark = pytest.mark.usefixtures("small_image_sets")
+
+
 def pictures(page: str) -> dict[str, np.ndarray]:
     return {
         name: cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
