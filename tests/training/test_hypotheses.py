@@ -112,6 +112,7 @@ def test_other_decoders_are_refused(tmp_path: Path) -> None:
         search_of(world_of("multi"), None, 0, tmp_path)
 
 
+@pytest.mark.usefixtures("small_image_sets")
 def test_the_method_learns_and_the_label_file_is_never_opened(tmp_path: Path) -> None:
     world, cache = world_of("chairs"), tmp_path / "cache"
     world.source("train", 0, with_code=True, cache=cache)

@@ -33,9 +33,9 @@ def models(circles_models: tuple[Exported, Exported], tmp_path: Path) -> Path:
     return Path(shutil.copytree(circles_models[0].path.parents[1], tmp_path / "models"))
 
 
-def test_a_version_in_int8(circles_run: Path, models: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_version_in_int8(circles_run: Path, models: Path, cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
-        export_command.export([str(circles_run), "--out", str(models), "--int8", "--cache", str(tmp_path / "cache")])
+        export_command.export([str(circles_run), "--out", str(models), "--int8", "--cache", str(cache)])
     assert not exit_.value.code
     path = models / "circles" / "3"
     size, float_size = ((models / "circles" / n / "model.onnx").stat().st_size for n in ("3", "1"))
@@ -56,22 +56,21 @@ def test_a_version_in_int8(circles_run: Path, models: Path, tmp_path: Path, caps
 
 
 def test_what_costs_more_than_a_point_is_refused_with_both_figures(
-    circles_run: Path, models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    circles_run: Path, models: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The network has learned nothing, so an accuracy that falls is made by demanding that it rises."""
     monkeypatch.setattr(reduction, "LARGEST_LOSS", -0.01)
     before = sorted(models.rglob("*"))
     words = r"in int8, 0\.0% in float32: int8 costs more than -1 point; nothing was written\. Export without --int8"
     with pytest.raises(ExportError, match=words):
-        export(circles_run, models, reduce=reduction.int8(tmp_path / "cache", half=False))
+        export(circles_run, models, reduce=reduction.int8(cache, half=False))
     assert sorted(models.rglob("*")) == before
 
 
-def test_what_is_not_quantised_can_be_stored_as_half(circles_run: Path, models: Path, tmp_path: Path) -> None:
-    cache = str(tmp_path / "cache")
+def test_what_is_not_quantised_can_be_stored_as_half(circles_run: Path, models: Path, cache: Path) -> None:
     for half in ([], ["--half"]):
         with pytest.raises(SystemExit) as exit_:
-            export_command.export([str(circles_run), "--out", str(models), "--int8", *half, "--cache", cache])
+            export_command.export([str(circles_run), "--out", str(models), "--int8", *half, "--cache", str(cache)])
         assert not exit_.value.code
     graphs = [onnx.load(models / "circles" / number / "model.onnx").graph for number in ("3", "4")]
     assert [any(one.data_type == onnx.TensorProto.FLOAT16 for one in of.initializer) for of in graphs] == [False, True]
@@ -108,10 +107,10 @@ def test_accuracy_is_the_share_within_a_tenth_of_the_diameter(off: float, expect
 
 
 def test_stored_answers_do_not_hang_on_how_float32_is_rounded(
-    circles_run: Path, models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    circles_run: Path, models: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pixels become 0 to 1 in float32 before they are quantised, so their last digits can move whole steps."""
-    reduce = reduction.int8(tmp_path / "cache", half=False)
+    reduce = reduction.int8(cache, half=False)
     path = export(circles_run, models, reduce=reduce).path
     golden = np.load(path / "golden.npz")
     stored = golden[TRANSLATION]
