@@ -171,6 +171,18 @@ def test_a_number_that_is_taken_is_passed_over_and_a_lost_config_is_written_agai
     assert (tmp_path / "one" / "2" / "notes.txt").read_text() == "dear"
 
 
+def test_of_two_exports_at_once_the_first_stays_whole(tmp_path: Path) -> None:
+    folder = ModelFolder(tmp_path / "one")
+    folder.add(folder.next_version(), {"model.onnx": b"graph"}, "config", "first")
+    number = folder.next_version()  # both find it
+    folder.add(number, {"model.onnx": b"faster"}, "config", "second")
+    before = (tmp_path / "one" / "SHA256SUMS").read_text()
+    with pytest.raises(ExportError, match="another export has just written it"):
+        folder.add(number, {"model.onnx": b"slower"}, "config", "third")
+    assert (tmp_path / "one" / "SHA256SUMS").read_text() == before
+    assert (tmp_path / "one" / "2" / "model.onnx").read_bytes() == b"faster"
+
+
 def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Exported, tmp_path: Path) -> None:
     spec = ExportedModel.open(single.path / "model.onnx").spec
     config, progress = RunConfig(CirclesOptions(), method="noncur"), TrainingProgress(step=2, images=64, seconds=1.5)
@@ -190,6 +202,9 @@ def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Expor
         text = card(1, spec, {TRANSLATION: (1, 3)}, Circles.objects, made)
         assert "On 89 targets in real frames of lmo (bop19 targets):" in text
         assert f"| add_recall | 0.25 | {column} |" in text
+    fast = card(1, spec, {TRANSLATION: (1, 3)}, Circles.objects, replace(made, reduced=True))
+    assert "this model" not in fast
+    assert fast.count("| before --fast or --int8 |") == 2
 
 
 def test_commands_on_cards_name_no_folder_of_a_machine() -> None:

@@ -188,6 +188,22 @@ def test_what_cannot_be_begun_with_is_told(
         begun(version)
 
 
+def test_a_first_network_that_is_not_there_leaves_no_run(tmp_path: Path, cache: Path) -> None:
+    config = replace(CONFIG, images=4, init=tmp_path / "nowhere")
+    with pytest.raises(UsageError, match="neither a run folder"):
+        learn(config, tmp_path / "run", Interruption(), resume=False, cache=cache)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_first_network_is_found_from_every_folder(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(run.parent)
+    config = replace(CONFIG, init=Path(run.name))
+    monkeypatch.chdir(tmp_path)
+    assert method_before(config) == CONFIG.method
+
+
 def test_networks_of_other_shapes_name_what_differs(model: Path) -> None:
     other = replace(CONFIG, network=NetworkConfig(hidden=16))
     with pytest.raises(UsageError, match=r"--init .*: its network does not fit this world \(size mismatch for heads"):

@@ -19,6 +19,19 @@ def save(path: Path, pixels: np.ndarray, mode: str | None = None, **options: obj
     return path
 
 
+@pytest.mark.parametrize(("suffix", "is_read"), [(".png", True), (".jpg", True), (".tiff", False)])
+def test_a_rotation_that_cannot_be_ignored_is_refused(tmp_path: Path, suffix: str, is_read: bool) -> None:
+    file, stored, exif = tmp_path / f"a{suffix}", np.zeros((48, 64, 3), np.uint8), Image.Exif()
+    stored[:16, :16] = 255
+    exif[0x0112] = 3
+    Image.fromarray(stored).save(file, exif=exif)
+    if is_read:
+        assert read_photograph(file)[4, 4, 0] > 200
+    else:
+        with pytest.raises(DataError, match="a TIFF file with an EXIF rotation"):
+            read_photograph(file)
+
+
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff"])
 def test_rgb(tmp_path: Path, suffix: str) -> None:
     assert np.array_equal(read_photograph(save(tmp_path / f"a{suffix}", PIXELS)), PIXELS)

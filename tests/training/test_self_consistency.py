@@ -151,6 +151,14 @@ def test_a_file_about_other_photographs_is_refused(tmp_path: Path) -> None:
         read_views(tmp_path / "photos", file)
 
 
+def test_one_pose_alone_is_refused(tmp_path: Path) -> None:
+    file, _ = _photographs(tmp_path / "photos", 3, None)
+    poses = json.loads(file.read_text())
+    file.write_text(json.dumps({"000.png": poses["000.png"]}))
+    with pytest.raises(DataError, match="has the poses of 1 of 3 photographs"):
+        read_views(tmp_path / "photos", file)
+
+
 @pytest.mark.parametrize("flags", [["--photos", "a", "--intervals"], ["--photos", "a", "--views", "b"]])
 def test_photographs_adjust_a_measurement_or_nothing(flags: list[str], circles_run: Path) -> None:
     command = ["from curio_train.commands.export import export; export()", str(circles_run), *flags]

@@ -10,15 +10,15 @@ import pytest
 import torch
 import trimesh
 from curio_train.commands.prepare import prepared
-from curio_train.commands.train import parse
-from curio_train.config import RunConfig
+from curio_train.commands.train import Session, parse
+from curio_train.config import Recipe, RunConfig
 from curio_train.data import backgrounds
 from curio_train.errors import UsageError
 from curio_train.evaluation.unlabelled.photographed import judge
 from curio_train.scene_code import COLOR, CONFIDENCE
 from curio_train.templates.build import template_network
 from curio_train.worlds import build
-from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.options import CaptureOptions, LinemodOptions
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
 WIDTH, HEIGHT = 160, 120
@@ -83,8 +83,20 @@ def test_a_part_without_colours_is_painted_and_others_keep_theirs(folder: Path) 
     np.testing.assert_allclose(red.mesh.vertex_colors_srgb[0], np.array([200, 30, 30]) / 255, atol=0.01)
     only = build(options(folder, mesh=(folder / "block.stl", folder / "again.stl"), paint="#33804d"))
     assert all(np.allclose(one.mesh.vertex_colors_srgb[0], [0.2, 0.502, 0.302], atol=0.01) for one in only.members)
+    mixed = build(options(folder, paint="#33804d")).members
+    np.testing.assert_allclose(mixed[0].mesh.vertex_colors_srgb[0], [0.2, 0.502, 0.302], atol=0.01)
+    np.testing.assert_allclose(mixed[1].mesh.vertex_colors_srgb[0], red.mesh.vertex_colors_srgb[0])
     with pytest.raises(UsageError, match=r"--paint #33804d: .*red\.ply has colours"):
-        build(options(folder, paint="#33804d"))
+        build(options(folder, mesh=(folder / "red.ply",), paint="#33804d"))
+
+
+def test_no_colour_is_looked_for_beside_parts_that_have_their_own(folder: Path) -> None:
+    said: list[str] = []
+    given = options(folder)
+    config = prepared(RunConfig(given, recipe=replace(Recipe(), self_training=0.0)), folder, said.append, said.append)
+    assert isinstance(config.world, CaptureOptions)
+    assert config.world.paint is None
+    assert any("is not looked for beside parts that have their own" in line for line in said)
 
 
 def test_calls_that_contradict_themselves_are_refused(folder: Path, tmp_path: Path) -> None:
@@ -96,6 +108,13 @@ def test_calls_that_contradict_themselves_are_refused(folder: Path, tmp_path: Pa
         prepared(taught, tmp_path, print, print)
     with pytest.raises(UsageError, match="--method templates finds one object"):
         template_network(build(options(folder)))
+    for changes in ({"minutes": 3.0}, {"images": 64}, {"init": tmp_path}):
+        with pytest.raises(UsageError, match="has no effect with --method templates"):
+            prepared(RunConfig(options(folder), method="templates", **changes), tmp_path, print, print)
+    with pytest.raises(UsageError, match="--class ape,can,ape: found a class twice"):
+        LinemodOptions("ape,can,ape")
+    with pytest.raises(UsageError, match="goes on in its own folder; leave out --out"):
+        Session(out=tmp_path / "a", resume=tmp_path / "b")
 
 
 def test_the_command_trains_a_locator(folder: Path) -> None:

@@ -271,7 +271,9 @@ class RunConfig:
     shorten the training of the next."""
 
     def __post_init__(self) -> None:
-        """Refuse what contradicts itself."""
+        """Make the path of the first network absolute, and refuse what contradicts itself."""
+        if self.init is not None:
+            object.__setattr__(self, "init", self.init.absolute())
         if self.seed < 0:
             raise UsageError(f"--seed is {self.seed}, expected 0 or more")
         if not 0 < self.labels <= 1:

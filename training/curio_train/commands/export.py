@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from curio_serve.command_line import parsed
 from rich.console import Console
@@ -13,6 +13,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from curio_train.commands.command_line.running import CACHE, answer
 from curio_train.errors import CurioError, UsageError
+
+if TYPE_CHECKING:
+    from curio_train.data.photographs import UnlabelledPhotographs
 
 
 @dataclass(frozen=True)
@@ -68,28 +71,30 @@ def _export(command: ExportCommand) -> int:
         from curio_train.export.hub import check_repository
 
         check_repository(command.push)
+    views = _views(command)
     is_written = bool(ModelFolder(command.run).versions())
     if is_written and (command.half or command.int8 or command.fast or command.name is not None):
         done = "measured" if command.push is None else "pushed"
         raise UsageError(
             f"{command.run} is a model and {done} as it is; --half, --int8, --fast and --name are for run folders"
         )
-    folder = command.run if is_written else _write(command).parent
+    folder, is_measured = command.run if is_written else _write(command).parent, not command.intervals
     try:
         if command.intervals:
-            _measure(command, folder)
+            _measure(command, folder, views)
+            is_measured = True
         if command.push is not None:
             _push(folder, command.push, command.license)
     except CurioError as exc:
         if is_written:
             raise
-        asked = [*(["--intervals"] if command.intervals else []), *(["--push", command.push] if command.push else [])]
-        for flag in ("data", "photos", "views", "license"):
-            if (given := getattr(command, flag)) is not None:
-                asked += [f"--{flag}", str(given)]
-        again = shlex.join(["curio-export", str(folder), *asked])
+        if is_measured:
+            license_ = [] if command.license is None else ["--license", command.license]
+            again = ["curio-export", str(folder), "--push", str(command.push), *license_]
+            raise type(exc)(f"{exc}\n{folder} was written; to push it again: {shlex.join(again)}") from exc
         raise type(exc)(
-            f"{exc}\n{folder} was written; to {'push' if command.push else 'measure'} it again: {again}"
+            f"{exc}\n{folder} was written, and not measured; once that is put right, the same call writes and measures "
+            "its next version"
         ) from exc
     return 0
 
@@ -101,18 +106,26 @@ def _push(folder: Path, repository: str, licence: str | None) -> None:
         print(push(folder, repository, licence))
 
 
-def _measure(command: ExportCommand, folder: Path) -> None:
+def _views(command: ExportCommand) -> "UnlabelledPhotographs | None":
+    """The photographs to adjust by, found and read before a model is made for minutes."""
+    if command.photos is None or command.views is None:
+        return None
+    from curio_train.evaluation.unlabelled.self_consistency import read_views
+
+    return read_views(command.photos, command.views)
+
+
+def _measure(command: ExportCommand, folder: Path, views: "UnlabelledPhotographs | None") -> None:
     """Measure the latest version of a model on renderings, and write what was found beside it."""
     from curio_train.evaluation.reliability import NUM_IMAGES, fit_reliability, held_out_answers
     from curio_train.evaluation.subject import load_subject, model_reader
-    from curio_train.evaluation.unlabelled.self_consistency import adjusted, adjustment, photographed_pairs, read_views
+    from curio_train.evaluation.unlabelled.self_consistency import adjusted, adjustment, photographed_pairs
     from curio_train.export.folder import ModelFolder
     from curio_train.exported_model import ExportedModel, find_model
 
     world = load_subject(command.run, command.data).world
     predict = model_reader(ExportedModel.open(find_model(folder)), world)
     with Console(stderr=True).status("reading photographs") as status:
-        views = None if command.photos is None or command.views is None else read_views(command.photos, command.views)
         pairs = None if views is None else photographed_pairs(world, predict, views)
         cache = command.cache.expanduser()
         answers = held_out_answers(world, predict, "validation", NUM_IMAGES, cache, status.update)

@@ -26,10 +26,14 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
 
     Raises:
         UsageError: Pseudo-labels are asked for, and there are no photographs; LineMOD has no such class; or a
-            download was declined; or there are photographs that the method does not learn from.
+            download was declined; or there are photographs that the method does not learn from, or flags that it
+            has no use for.
         DataError: A download failed, or files of one's own are certain not to work.
     """
     options = config.world
+    for flag in ("minutes", "images", "init"):
+        if config.terms.templates and (given := getattr(config, flag)) is not None:
+            raise UsageError(f"--{flag} {given} has no effect with --method templates, which trains nothing")
     if config.recipe.self_training and getattr(options, "photos", None) is None:
         raise UsageError(
             f"--self-training {config.recipe.self_training}: found no photographs to learn from; expected --photos, "
@@ -131,12 +135,16 @@ def _with_paint(options: CaptureOptions, report: Callable[[str], None]) -> Captu
 
     if options.plane is not None or options.paint is not None:
         return options
-    if not any(is_unpainted(load_mesh(file, options.mesh_unit, options.body)) for file in options.mesh):
+    are_unpainted = [is_unpainted(load_mesh(file, options.mesh_unit, options.body)) for file in options.mesh]
+    if not any(are_unpainted):
         return options
     drawn = "it is drawn in grey" if options.names_several else "it is learned in any colour, which takes longer"
     anyway = f"{drawn}; --paint '#8a6f4c' says which it has"
     if options.background is None:
         report(f"the part's colour is not known without --background, a photograph of the empty scene: {anyway}")
+        return options
+    if not all(are_unpainted):
+        report(f"the colour of parts without one is not looked for beside parts that have their own: {anyway}")
         return options
     found = find_color(options.photos, options.background, load_intrinsics(options.camera))
     if found is None:

@@ -49,7 +49,9 @@ class Session:
     """Minutes of training between checkpoints; 0: after every step."""
 
     def __post_init__(self) -> None:
-        """Refuse what is no time."""
+        """Refuse what is no time, and two folders for one run."""
+        if self.out is not None and self.resume is not None and self.out.absolute() != self.resume.absolute():
+            raise UsageError(f"--out {self.out}: --resume {self.resume} goes on in its own folder; leave out --out")
         if not self.checkpoint_minutes >= 0:
             raise UsageError(f"--checkpoint-minutes is {self.checkpoint_minutes}, expected 0 or more")
 
@@ -214,6 +216,8 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     if not session.resume:
         config = with_kept_meshes(config, path)
     if config.terms.templates:
+        if session.device == "cuda":
+            raise UsageError("--device cuda: --method templates runs on the CPU; leave it out")
         with one_thread() as num_threads, _traced_ahead(config, num_threads) as ahead:
             is_old = session.resume is not None
             seconds = draw_templates(config, path, session.cache, num_threads, resume=is_old).seconds

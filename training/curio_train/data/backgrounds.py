@@ -81,7 +81,7 @@ class ClutterBackgrounds(Backgrounds):
                 detector must not take for it.
 
         Raises:
-            DataError: The cache folder cannot be written.
+            DataError: The cache folder cannot be written, or the file in it is damaged.
         """
         names = [mesh.sha256 for mesh in others]
         recipe = json.dumps([POOL_SIZE, POOL_WIDTH, POOL_HEIGHT, CLUTTER_LAYERS, NUM_SLOTS, _SEED, "v3", *names])
@@ -89,7 +89,10 @@ class ClutterBackgrounds(Backgrounds):
         if not path.is_file():
             _make_folder(path.parent)  # before half a minute is spent on the pictures
             _save(path, render_pool(POOL_SIZE, _SEED, others))
-        return cls(np.load(path, mmap_mode="r"))
+        try:
+            return cls(np.load(path, mmap_mode="r"))
+        except (OSError, ValueError, EOFError) as exc:
+            raise DataError(f"{path}: the rendered clutter is damaged ({exc}); remove the file") from exc
 
     def split(self, train: bool) -> "ClutterBackgrounds":
         return ClutterBackgrounds(self._pool[_share(len(self._pool), train)])

@@ -63,6 +63,8 @@ LARGEST_PIXELS = 50_000_000
 
 LONGEST_KEPT_PX = 768
 
+_ORIENTATION = 0x0112  # EXIF tag
+
 
 def read_photograph(path: Path) -> np.ndarray:
     """The pixels of an image file, [height, width, 3] uint8 sRGB, as they are stored.
@@ -148,6 +150,11 @@ def _check(path: Path) -> None:
             if width * height > LARGEST_PIXELS:
                 raise DataError(
                     f"{path}: found {width}x{height} pixels, expected at most {LARGEST_PIXELS:,}; resize it"
+                )
+            if image.format == "TIFF" and image.getexif().get(_ORIENTATION, 1) != 1:
+                raise DataError(
+                    f"{path}: found a TIFF file with an EXIF rotation, which decoders apply; save its pixels as they "
+                    "are stored, without it, or as PNG"
                 )
             image.load()
     except Image.DecompressionBombError as exc:

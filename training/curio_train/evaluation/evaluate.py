@@ -1,6 +1,6 @@
 """Score a run or a model on held-out images of its world, beside the same network untrained, and on real frames."""
 
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Mapping, Sized
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -122,13 +122,19 @@ def evaluate(
     if (judgement := _judged(subject, warn)) is not None:
         result["photographs"] = judgement.summary
     if reads == 1 and (path / CONFIG_FILE).exists():  # cards and reports are of the model as it answers by itself
-        keep(path / EVALUATION_FILE, result)
+        _keep_held_out(path, result)
         progress("the report")
         try:
             write_report(path, subject, split, cache, scored.errors, result, judgement)
         except ReportError as exc:
             warn(str(exc))
     return result
+
+
+def _keep_held_out(run: Path, result: Mapping[str, Any]) -> None:
+    """Keep what cards quote: images that were learned from say nothing about a model."""
+    if result["split"] != "train":
+        keep(run / EVALUATION_FILE, result)
 
 
 def _judged(subject: Subject, warn: Callable[[str], None]) -> Judgement | None:

@@ -50,6 +50,13 @@ class Provenance:
     """Whether a trunk that others trained reads images in it, or found the poses that it learned from."""
     chooses: bool
     """Whether a caller may ask for some objects alone."""
+    reduced: bool = False
+    """Whether the run's scores are of another network than this version's: of the one before --fast or --int8."""
+
+    @property
+    def scored(self) -> str:
+        """Name of the network that the run's scores are of."""
+        return "before --fast or --int8" if self.reduced else "this model"
 
 
 def card(
@@ -65,17 +72,18 @@ def card(
         made: Where it comes from.
     """
     evaluation = read_evaluation(made.run, made.progress.all_images)
+    unscored = "curio-eval had not scored it on renderings when it was exported.\n"
     parts = [
         f"## Version {version}\n",
         _table(("", ""), _origin(version, spec, made)),
         _table(("output", "shape", "unit", "frame"), _outputs(spec, shapes)),
         _table(("object", "diameter", "mesh SHA-256", "source and licence of the mesh"), _objects(spec, objects)),
-        _metrics(evaluation) if evaluation else "curio-eval had not scored it on renderings when it was exported.\n",
+        _metrics(evaluation, made.scored) if evaluation else unscored,
     ]
     if judgement := (evaluation or {}).get("photographs") or _read(made.run / JUDGEMENT_FILE, made.progress.all_images):
-        parts.append(_photographs(judgement))
+        parts.append(_photographs(judgement, made.scored))
     if evaluation and "real" in evaluation:
-        parts.append(_real_frames(evaluation))
+        parts.append(_real_frames(evaluation, made.scored))
     return "\n".join(parts)
 
 
@@ -153,23 +161,23 @@ def _objects(spec: ModelSpec, objects: Sequence[ObjectKind]) -> Iterable[tuple[s
         yield kind.name, f"{kind.diameter_m:.4g} {unit}", digest, kind.attribution or "–"
 
 
-def _metrics(evaluation: Mapping[str, Any]) -> str:
+def _metrics(evaluation: Mapping[str, Any], scored: str) -> str:
     untrained = evaluation.get("untrained", {})
     head = f"On {evaluation['num_images']} held-out images of the {evaluation['split']} split:\n"
-    return f"{head}\n{_tables(('this model', 'untrained network'), evaluation['metrics'], untrained)}"
+    return f"{head}\n{_tables((scored, 'untrained network'), evaluation['metrics'], untrained)}"
 
 
-def _photographs(judgement: Mapping[str, Any]) -> str:
+def _photographs(judgement: Mapping[str, Any], scored: str) -> str:
     """The verdict on unlabelled photographs, and its figures."""
     head = f"In {judgement['num_photographs']} photographs, without labels: {judgement['verdict']}\n"
-    return f"{head}\n{_tables(('this model',), judgement['metrics'])}"
+    return f"{head}\n{_tables((scored,), judgement['metrics'])}"
 
 
-def _real_frames(evaluation: Mapping[str, Any]) -> str:
+def _real_frames(evaluation: Mapping[str, Any], scored: str) -> str:
     """Table of the scores on real frames of a data set, whose labels only score."""
     real, refined = evaluation["real"], evaluation.get("refined", {}).get("real", {}).get("metrics", {})
     head = f"On {real['num_targets']} targets in real frames of {real['dataset']} ({real['split_name']}):\n"
-    return f"{head}\n{_tables(('this model', 'after render-and-compare'), real['metrics'], refined)}"
+    return f"{head}\n{_tables((scored, 'after render-and-compare'), real['metrics'], refined)}"
 
 
 def _tables(headings: Sequence[str], first: Mapping[str, float], *others: Mapping[str, float]) -> str:

@@ -151,13 +151,20 @@ class ModelFolder:
     def _add_version(self, draft: Path, target: Path, files: Mapping[str, bytes], config: str, card: str) -> None:
         """Beside earlier versions: first what speaks of it, at last the version itself, by one rename."""
         _write(draft, files)
-        others = [line for line in _text(self.path / SUMS_FILE).splitlines() if f"  {target.name}/" not in line]
+        before = _text(self.path / SUMS_FILE).splitlines()
+        others = [line for line in before if f"  {target.name}/" not in line]
         sums = "".join(f"{line}\n" for line in others) + _sums(target.name, files)
         title, _, earlier = _text(self.path / _CARD).partition("\n\n")
         if not (self.path / CONFIG_FILE).exists():
             write_whole(self.path / CONFIG_FILE, config)
+        if target.exists():
+            raise ExportError(f"cannot write {target}: another export has just written it; export again")
         write_whole(self.path / SUMS_FILE, sums)
-        draft.rename(target)
+        try:
+            draft.rename(target)
+        except OSError:
+            write_whole(self.path / SUMS_FILE, "".join(f"{line}\n" for line in before))
+            raise
         write_whole(self.path / _CARD, f"{title or _title(self.path.name)}\n\n{card}\n{earlier}")
 
 

@@ -31,7 +31,8 @@ from curio_train.export.folder import ModelFolder
 
 _PIPELINE = "object-detection"  # the nearest of the hub's tasks, of which none is pose estimation
 _TAGS = ("pose-estimation", "6dof-pose-estimation", "onnx")
-_LICENCES = {"CC BY-SA 4.0": "cc-by-sa-4.0"}  # of meshes, as cards name them and as the hub does
+# Licences of meshes, as cards and the hub name them.
+_LICENCES = {"CC BY-SA 4.0": "cc-by-sa-4.0", "CC BY 4.0": "cc-by-4.0"}
 
 
 def check_repository(name: str) -> None:

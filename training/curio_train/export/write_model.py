@@ -141,8 +141,10 @@ def export(
     put_spec(model, spec)
     version = target.next_version()
     pretrained = _uses_pretrained(state.pose.network, world, folder.config)
-    chooses = num_choosable(state.pose.network) is not None
-    made = Provenance(run, folder.config, sessions, state.progress, weights + _FAST * fast, pretrained, chooses)
+    chooses, is_reduced = num_choosable(state.pose.network) is not None, fast or reduce is not None
+    made = Provenance(
+        run, folder.config, sessions, state.progress, weights + _FAST * fast, pretrained, chooses, is_reduced
+    )
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),

@@ -6,6 +6,8 @@ from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Literal
 
+import torch
+
 from curio_train.config import RunConfig
 from curio_train.learning.explaining import Found, search_of
 from curio_train.learning.hardware import choose_threads, one_thread
@@ -16,7 +18,7 @@ from curio_train.learning.runs.initial import begin_with
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.progress import reporting
 from curio_train.learning.runs.provenance import record_session
-from curio_train.learning.state import TrainingProgress
+from curio_train.learning.state import TrainingProgress, TrainState
 from curio_train.learning.trainer import Trainer
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.two_stage.network import TwoStageNetwork
@@ -92,8 +94,10 @@ def learn(
         CurioError: Any of this package's errors; checkpoints that were written stay.
     """
     with ranks(device) as here, ExitStack() as own:
-        # The world comes first, so that an error in its data leaves no run folder behind.
+        # World and first network come first, so that an error in either leaves no run folder behind.
         world = build(config.world)
+        if config.init is not None and not resume:
+            begin_with(TrainState(config, world, torch.device("cpu")), config.init)
         training_images = _training_images(config, world, cache)
         run = RunFolder(path, config)
         if here.leads:

@@ -135,6 +135,9 @@ def build(options: CaptureOptions) -> World:
         return build_tabletop(options)
     camera = load_intrinsics(options.camera)
     members = [_object(options, camera, file, slot) for slot, file in enumerate(options.mesh)]
+    if options.paint is not None and not any(member.unpainted for member in members):
+        named = ", ".join(map(str, options.mesh))
+        raise UsageError(f"--paint {options.paint}: {named} has colours of its own; leave it out")
     photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera))
     if len(members) > 1:
         name = "-".join(member.kind.name for member in members)
@@ -149,8 +152,6 @@ def _object(options: CaptureOptions, camera: Intrinsics, file: Path, slot: int) 
     center_m = found.point_left(of_file.box_corners_m.mean(axis=0)) if options.centered else np.zeros(3)
     mesh = of_file.moved(-center_m)
     _refuse_collision(options, file, mesh)
-    if options.paint is not None and not is_unpainted(mesh):
-        raise UsageError(f"--paint {options.paint}: {file} has colours of its own; leave it out")
     paint = None if options.paint is None else srgb_of(options.paint)
     kind = ObjectKind(
         file.stem,

@@ -116,6 +116,9 @@ class LinemodOptions(WorldOptions):
             raise UsageError(
                 f"--photos {self.photos}: the paper's network does not learn from them; leave out --one-stage"
             )
+        names = str(self.class_name).split(",")  # which is a marker where it is left out
+        if len(set(names)) < len(names):
+            raise UsageError(f"--class {self.class_name}: found a class twice, expected each once")
         if not self.gaze and self.two_stage:
             raise UsageError("found --one-stage and --two-stage, expected one network")
         if (self.two_stage or not self.gaze) and self.names_several:

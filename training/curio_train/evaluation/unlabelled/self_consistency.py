@@ -40,6 +40,7 @@ from curio_train.worlds.single_object.world import Object, SingleObjectWorld
 
 _NEIGHBOURS = 4  # photographs before each that it is compared with: objects may be moved in longer times
 _FEWEST_PAIRS = 30
+_FEWEST_VIEWS = 2  # photographs with camera poses
 _NUM_POINTS = 300  # about so many vertices for ADD
 _LEAST = 1e-6  # nearer to 0 and 1 confidences say nothing
 _MOST_DEG = 180.0
@@ -67,11 +68,17 @@ def read_views(folder: Path, file: Path) -> UnlabelledPhotographs:
         file: As ``curio-train capture --calibrate --views-out`` writes it.
 
     Raises:
-        DataError: The folder has no photographs.
+        DataError: The folder has no photographs, or the file has poses of fewer than two.
         CameraError: The file has no pose of them, or cannot be read.
     """
     paths = spread(Photographs(folder).paths, MAX_UNLABELLED)
-    return UnlabelledPhotographs(paths, read_camera_poses(file, paths, any_unit=True))
+    cameras = read_camera_poses(file, paths, any_unit=True)
+    if (num_known := int(cameras.known.sum())) < _FEWEST_VIEWS:
+        raise DataError(
+            f"--views {file}: has the poses of {num_known} of {len(paths)} photographs in {folder}, expected "
+            f"{_FEWEST_VIEWS} or more"
+        )
+    return UnlabelledPhotographs(paths, cameras)
 
 
 def photographed_pairs(world: World, predict: Predict, photographs: UnlabelledPhotographs) -> list[Pairs]:
