@@ -108,9 +108,12 @@ def test_calls_that_contradict_themselves_are_refused(folder: Path, tmp_path: Pa
         prepared(taught, tmp_path, print, print)
     with pytest.raises(UsageError, match="--method templates finds one object"):
         template_network(build(options(folder)))
-    for changes in ({"minutes": 3.0}, {"images": 64}, {"init": tmp_path}):
-        with pytest.raises(UsageError, match="has no effect with --method templates"):
-            prepared(RunConfig(options(folder), method="templates", **changes), tmp_path, print, print)
+    warnings: list[str] = []
+    without = RunConfig(options(folder), method="templates", minutes=3.0, recipe=replace(Recipe(), self_training=0.0))
+    prepared(without, tmp_path, warnings.append, print)
+    assert "--minutes 3.0 has no effect with --method templates, which trains nothing" in warnings
+    with pytest.raises(UsageError, match=r"--init .* has no effect with --method templates"):
+        prepared(replace(without, init=tmp_path), tmp_path, print, print)
     with pytest.raises(UsageError, match="--class ape,can,ape: found a class twice"):
         LinemodOptions("ape,can,ape")
     with pytest.raises(UsageError, match="goes on in its own folder; leave out --out"):

@@ -31,9 +31,8 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
         DataError: A download failed, or files of one's own are certain not to work.
     """
     options = config.world
-    for flag in ("minutes", "images", "init"):
-        if config.terms.templates and (given := getattr(config, flag)) is not None:
-            raise UsageError(f"--{flag} {given} has no effect with --method templates, which trains nothing")
+    if config.terms.templates:
+        _without_training(config, warn)
     if config.recipe.self_training and getattr(options, "photos", None) is None:
         raise UsageError(
             f"--self-training {config.recipe.self_training}: found no photographs to learn from; expected --photos, "
@@ -59,6 +58,15 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
             warn(doubt)
         return replace(config, world=_with_paint(options, report), network=_usual_network(config, options))
     return config
+
+
+def _without_training(config: RunConfig, warn: Callable[[str], None]) -> None:
+    """Say which flags are for training: budgets may stand in a project file, but a first network would be expected."""
+    if config.init is not None:
+        raise UsageError(f"--init {config.init} has no effect with --method templates, which trains nothing")
+    for flag in ("minutes", "images"):
+        if (given := getattr(config, flag)) is not None:
+            warn(f"--{flag} {given} has no effect with --method templates, which trains nothing")
 
 
 def _with_stages(options: LinemodOptions, method: MethodName) -> LinemodOptions:
