@@ -187,7 +187,7 @@ class BopDataset:
 
         Raises:
             UsageError: There is no such class.
-            DataError: ``models_info.json`` is missing, broken or without that class.
+            DataError: ``models_info.json`` is missing, broken or without that class, or says what cannot be.
         """
         record = read_records(self.root / "models" / "models_info.json").entry(str(self.object_id(name)))
         discrete = [
@@ -195,8 +195,16 @@ class BopDataset:
             for i in range(record.length("symmetries_discrete"))
         ]
         axes = [record.entry(f"symmetries_continuous/{i}") for i in range(record.length("symmetries_continuous"))]
+        diameter_mm = record.numbers("diameter", 1)[0]
+        if not diameter_mm > 0:
+            raise DataError(f"{record.where}, diameter: found {diameter_mm}, expected more than 0 millimetres")
+        for axis in axes:
+            if not any(axis.numbers("axis", 3)):
+                raise DataError(f"{axis.where}, axis: found 0 in all directions, expected an axis")
+        for i, matrix in enumerate(discrete):
+            _check_rotation(matrix.reshape(4, 4)[:3, :3], f"{record.where}, symmetries_discrete/{i}")
         return ModelInfo(
-            diameter_m=record.numbers("diameter", 1)[0] * _MM,
+            diameter_m=diameter_mm * _MM,
             symmetries=tuple(_in_metres(matrix.reshape(4, 4)) for matrix in discrete),
             symmetry_axes=tuple((np.array(a.numbers("axis", 3)), np.array(a.numbers("offset", 3)) * _MM) for a in axes),
         )
@@ -293,7 +301,11 @@ def _in_metres(matrix: np.ndarray) -> np.ndarray:
 
 def _pose(record: Record) -> Pose:
     rotation = np.reshape(record.numbers("cam_R_m2c", 9), (3, 3))
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > 1e-2 or np.linalg.det(rotation) < 0:
-        raise DataError(f"{record.where}, cam_R_m2c: found {rotation.tolist()}, which is not a rotation")
+    _check_rotation(rotation, f"{record.where}, cam_R_m2c")
     return Pose(rotation, np.array(record.numbers("cam_t_m2c", 3)) * _MM)
+
+
+def _check_rotation(matrix: np.ndarray, where: str) -> None:
+    error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if error > 1e-2 or np.linalg.det(matrix) < 0:
+        raise DataError(f"{where}: found {matrix.tolist()}, which is not a rotation")
