@@ -81,6 +81,10 @@ class ModelError(CurioError):
     """A model folder or file cannot be used."""
 
 
+class CheckNotDone(ModelError):
+    """A model could not be checked, which says nothing about it: no process or memory was left, or it took too long."""
+
+
 class OutputError(CurioError):
     """Results cannot be written where they were asked for."""
 

@@ -59,8 +59,9 @@ def limit_this_process(memory_bytes: int, cpu_s: int) -> None:
     except ImportError:
         return
     for name, limit in (("RLIMIT_AS", memory_bytes), ("RLIMIT_CPU", cpu_s), ("RLIMIT_CORE", 0)):
+        hard = limit + (name == "RLIMIT_CPU")  # so that SIGXCPU comes, and not SIGKILL as from outside
         with contextlib.suppress(ValueError, OSError):  # the limit that is there is lower, or cannot be set
-            resource.setrlimit(getattr(resource, name), (limit, limit))
+            resource.setrlimit(getattr(resource, name), (limit, hard))
 
 
 def c_function(name: str) -> Any:

@@ -136,6 +136,22 @@ def test_our_json(tmp_path: Path) -> None:
     assert camera.distortion == (0.1, 0, 0, 0, 0)
 
 
+@pytest.mark.parametrize("name", ["distortion_coefficients", "dist_coeffs", "dist"])
+def test_distortion_counts_by_whichever_name(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "camera.json"
+    content = {"camera_matrix": K.tolist(), "width": 640, "height": 480}
+    path.write_text(json.dumps(content | {name: [0.1, 0, 0, 0, 0]}))
+    assert read_camera_file(path).camera_for("any.png").distortion == (0.1, 0, 0, 0, 0)
+    for wrong, text in (
+        ({name: [0.1, 0, 0, 0], "distortion": [0.1, 0, 0, 0]}, "expected the distortion once"),
+        ({"k1": 0.1, "k2": 0, "p1": 0}, "found k1; expected distortion as a list"),
+        ({name: [0.1, 0, 0, 0], "distortion_model": "equidistant"}, "distortion_model is 'equidistant'"),
+    ):
+        path.write_text(json.dumps(content | wrong))
+        with pytest.raises(CameraError, match=text):
+            read_camera_file(path)
+
+
 def test_bop_camera(tmp_path: Path) -> None:
     path = tmp_path / "camera.json"
     path.write_text(

@@ -209,16 +209,24 @@ def test_a_stream_forgets_what_is_no_longer_asked_for(client: PoseClient) -> Non
     assert ids[3]["bolt"] != ids[1]["bolt"]
 
 
-def detect(model: str, folder: Path, **flags: Any) -> list[str]:
+def detect(model: str, folder: Path, more: tuple[str, ...] = (), **flags: Any) -> list[str]:
     """The objects that the command writes down about one image."""
     cv2.imwrite(str(folder / "frame.png"), GREY)
     (folder / "camera.json").write_text(json.dumps({"camera_matrix": K.tolist(), "width": 96, "height": 64}))
     out = folder / "out.jsonl"
     call = DetectArguments(
-        model, (str(folder / "frame.png"),), camera=folder / "camera.json", out=str(out), overwrite=True, **flags
+        model, (*more, str(folder / "frame.png")), camera=folder / "camera.json", out=str(out), overwrite=True, **flags
     )
     assert run(call) == 0
     return [one["object"] for line in out.read_text().splitlines() for one in json.loads(line)["detections"]]
+
+
+def test_of_several_models_each_is_asked_for_what_it_knows(models: Path, client: PoseClient, tmp_path: Path) -> None:
+    """Behind a server as without one."""
+    for names_of in ((models / "choosing", models / "pinhole"), ("choosing", "pinhole")):
+        first, second = (str(one) if isinstance(one, Path) else f"{client.address}/{one}" for one in names_of)
+        found = detect(first, tmp_path, more=(second,), objects="plate,spot")
+        assert {"plate"} <= {*found} <= {"plate", "spot"}
 
 
 def test_the_command_writes_what_is_asked_for(models: Path, client: PoseClient, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import pytest
 from curio_serve.batch.arguments import DetectArguments
 from curio_serve.batch.detect_cli import run
 from curio_serve.errors import ModelNotFound, TokenError, Unavailable, UsageError
+from PIL import Image
 
 K = [[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]]
 
@@ -61,13 +62,43 @@ def test_file_and_server_write_the_same(
     assert detect(models_dir / "pinhole", frames, out=local, overlays=tmp_path / "one", **flags) == 1
     assert detect(f"{server.address}/pinhole", frames, out=remote, overlays=tmp_path / "other", **flags) == 1
     assert len(without_times(local)) == 5
-    if "exif_rotation" in flags:  # sent as pixels, decoded in full: the server may not shrink them beforehand
-        for here, there in zip(without_times(local), without_times(remote), strict=True):
-            assert here.keys() == there.keys()
-            assert here["camera_matrix"] == there["camera_matrix"]
-    else:
-        assert without_times(local) == without_times(remote)
-        assert (tmp_path / "one/000001.jpg").read_bytes() == (tmp_path / "other/000001.jpg").read_bytes()
+    assert without_times(local) == without_times(remote)
+    assert (tmp_path / "one/000001.jpg").read_bytes() == (tmp_path / "other/000001.jpg").read_bytes()
+
+
+def test_photographs_are_sent_as_they_are_stored_and_turned_there(
+    start_server: Callable[..., Any], models_dir: Path, camera: Path, frames: Path, tmp_path: Path
+) -> None:
+    """Their pixels would be larger than the server accepts."""
+    small = start_server(models_dir, "--max-message-mb", "1")
+    pixels = cv2.resize(cv2.imread(str(frames / "000001.jpg")), (1280, 960))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(pixels[..., ::-1]).save(frames / "000001.jpg", exif=exif)
+    camera.write_text(json.dumps({"camera_matrix": (np.diag([4.0, 4, 1]) @ K).tolist(), "width": 1280, "height": 960}))
+    lines = []
+    for model in (str(models_dir / "pinhole"), f"{small.address}/pinhole"):
+        out = tmp_path / "out.jsonl"
+        detect(model, frames / "000001.jpg", camera=camera, out=out, exif_rotation=True, overwrite=True)
+        lines += without_times(out)
+    assert lines[0] == lines[1]
+    assert (lines[0]["width"], lines[0]["exif_rotation"]) == (960, True)
+
+
+def test_a_server_without_a_call_left_is_asked_again(
+    start_server: Callable[..., Any], models_dir: Path, frames: Path, tmp_path: Path
+) -> None:
+    busy = start_server(models_dir, "--max-calls", "1", "--workers", "1")
+    for number in range(10, 30):
+        (frames / f"{number:06d}.jpg").write_bytes((frames / "000001.jpg").read_bytes())
+    detect(f"{busy.address}/flat", frames, out=tmp_path / "out", jobs=6)
+    errors = [line["error"] for line in without_times(tmp_path / "out") if "error" in line]
+    assert len(errors) == 1, "the file that is no image"
+
+
+def test_flags_for_servers_are_refused_without_one(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"--token-file .* is for a model on a server"):
+        detect(models_dir / "flat", frames, token_file=tmp_path / "none")
 
 
 def test_a_version_may_be_named(server: Any, frames: Path, tmp_path: Path) -> None:

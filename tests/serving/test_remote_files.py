@@ -21,6 +21,18 @@ def detect(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
     return subprocess.run([sys.executable, "-c", DETECT, *map(str, arguments)], capture_output=True, text=True)
 
 
+@pytest.mark.parametrize(
+    ("url", "path"),
+    [
+        ("s3://bucket/a#1.jpg", "s3/bucket/a#1.jpg"),
+        ("s3://bucket/what?.jpg", "s3/bucket/what?.jpg"),
+        ("https://host/a.jpg#top", "https/host/a.jpg"),
+    ],
+)
+def test_keys_of_stores_may_hold_any_character(url: str, path: str) -> None:
+    assert path_of(url) == path
+
+
 @pytest.fixture
 def flaky() -> Iterator[tuple[str, list[str]]]:
     """A web server that is overloaded twice before each answer, and the paths that it was asked for."""

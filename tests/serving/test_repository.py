@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-from curio_serve.errors import ModelError, ModelNotFound
+from curio_serve.errors import CheckNotDone, ModelError, ModelNotFound
 from curio_serve.models.model_check import ChildCheck
 from curio_serve.models.model_folder import load_version, open_model
 from curio_serve.models.repository import Repository
@@ -184,8 +184,8 @@ def test_a_check_that_is_killed_refuses_the_candidate(root: Path) -> None:
         waiting = pool.submit(check, root / "flat", 1)
         while not waiting.done():
             check.stop()
-        assert isinstance(waiting.exception(), ModelError)
-        assert "its check ended with status -9" in str(waiting.exception())
+        assert isinstance(waiting.exception(), CheckNotDone)
+        assert "its check was killed from outside" in str(waiting.exception())
 
 
 def test_a_check_that_cannot_be_started_refuses_the_candidate(root: Path) -> None:
@@ -196,6 +196,40 @@ def test_a_check_that_cannot_be_started_refuses_the_candidate(root: Path) -> Non
             ChildCheck()(root / "flat", 1)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_a_check_that_was_not_done_is_tried_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, checked = [0.0], list[float]()
+    monkeypatch.setattr("curio_serve.models.repository.time.monotonic", lambda: clock[0])
+
+    def check(folder: Path, version: int) -> None:
+        if folder.name == "flat":
+            checked.append(clock[0])
+            if len(checked) < 4:
+                raise CheckNotDone("no memory")
+
+    repository = Repository(root)
+    for second in range(60):
+        clock[0] = float(second)
+        repository.refresh(check)
+    assert checked == [0, 5, 15, 35], "after ever longer pauses, and no more once it loaded"
+    assert repository.get("flat").version == 1
+
+
+def test_a_check_runs_no_file_of_the_working_folder(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "copy.py").write_text("raise SystemExit(1)")
+    monkeypatch.chdir(tmp_path)
+    ChildCheck()(root / "flat", 1)
+
+
+def test_a_reliability_that_is_listed_and_missing_is_refused(root: Path) -> None:
+    with (root / "flat" / "SHA256SUMS").open("a") as sums:
+        sums.write("0" * 64 + "  1/reliability.json\n")
+    repository = Repository(root)
+    (refused,) = [change for change in repository.refresh() if change.event == "refused"]
+    assert "reliability.json is missing, and SHA256SUMS lists it" in refused.reason
 
 
 def test_many_replacements(root: Path, spot_onnx: MakeOnnx, write_folder: WriteFolder) -> None:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import urllib.request
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -105,6 +106,28 @@ def test_accepted_requests_are_finished_before_it_leaves(
         with pytest.raises(grpc.RpcError) as caught:
             stub.Detect(SMALL_REQUEST, timeout=10)
         assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
+
+
+def test_a_server_that_loses_all_models_is_not_ready(
+    start_server: StartServer, models_dir: Path, tmp_path: Path
+) -> None:
+    models = Path(shutil.copytree(models_dir, tmp_path / "models"))
+    server = start_server(models, "--refresh-s", "0.1")
+    with grpc.insecure_channel(server.address) as channel:
+        health = health_pb2_grpc.HealthStub(channel)
+
+        def wait_for(status: str) -> None:
+            wanted, end = health_pb2.HealthCheckResponse.ServingStatus.Value(status), time.monotonic() + 60
+            while health.Check(health_pb2.HealthCheckRequest()).status != wanted:
+                assert time.monotonic() < end, f"not {status}"
+                time.sleep(0.05)
+
+        wait_for("SERVING")
+        for name in ("flat", "pinhole"):
+            shutil.rmtree(models / name)
+        wait_for("NOT_SERVING")
+        shutil.copytree(models_dir / "flat", models / "flat")
+        wait_for("SERVING")
 
 
 def test_a_full_queue_is_told_with_the_time_to_come_back(

@@ -109,6 +109,18 @@ def test_exif_rotation_turns_the_camera_too(stub: PoseDetectorStub, picture: np.
     np.testing.assert_allclose(first, second, rtol=0.01, atol=1e-3)
 
 
+def test_a_turned_frame_has_to_have_the_size_of_its_camera(stub: PoseDetectorStub, picture: np.ndarray) -> None:
+    jpeg = _jpeg(picture)
+    exif = b"Exif\x00\x00MM\x00*\x00\x00\x00\x08\x00\x01\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00\x00\x00"
+    turned = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+    camera = pb.Camera(camera_matrix=K, width=1280, height=960)
+    for asked in (False, True):
+        with pytest.raises(grpc.RpcError, match="K belongs to frames of 1280x960, this one has 640x480"):
+            stub.Detect(
+                pb.DetectRequest(models=[PINHOLE], encoded=turned, camera=camera, apply_exif_rotation=asked), timeout=10
+            )
+
+
 def test_streams_answer_in_order(stub: PoseDetectorStub, spot_image: Callable[..., np.ndarray]) -> None:
     places = [100 + 40 * i for i in range(12)]
     requests = (

@@ -170,6 +170,16 @@ def test_after_a_damaged_frame_a_video_goes_on(clip: Path) -> None:
     assert [frame.time_s for frame in frames] == [0, None, *map(pytest.approx, (0.2, 0.3, 0.4))]
 
 
+def test_a_video_that_is_cut_off_ends_with_an_error(clip: Path) -> None:
+    content = clip.read_bytes()
+    _, _, _, third, *_ = (found.start() for found in re.finditer(rb"00dc", content))  # after one in the header
+    clip.write_bytes(content[: third + 8])
+    frames = list(images([str(clip)], PassedOver()))
+    assert [frame.name for frame in frames] == [f"{clip}#{i}" for i in range(3)]
+    with pytest.raises(ImageError, match="damaged"):
+        frames[2].read()
+
+
 def test_a_video_that_is_none_gives_one_error(tmp_path: Path) -> None:
     touch(tmp_path, "clip.mp4")
     (image,) = images([str(tmp_path / "clip.mp4")], PassedOver())

@@ -40,7 +40,7 @@ class InferenceService(GRPCInferenceServiceServicer):
         return messages.ServerLiveResponse(live=True)
 
     def ServerReady(self, request: messages.ServerReadyRequest, context: Context) -> messages.ServerReadyResponse:
-        return messages.ServerReadyResponse(ready=self._is_ready)
+        return messages.ServerReadyResponse(ready=self._is_ready and any(True for _ in self._repository))
 
     def ModelReady(self, request: messages.ModelReadyRequest, context: Context) -> messages.ModelReadyResponse:
         with self._calls.record("ModelReady", context):

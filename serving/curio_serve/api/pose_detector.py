@@ -280,5 +280,6 @@ def _decode(
         apply_exif_rotation=apply_exif_rotation,
     )
     if camera is not None and frame.quarter_turns:
+        camera.check_frame(header.width, header.height)  # before the size that it knows is turned, too
         camera = camera.turned(frame.quarter_turns, header.width, header.height)
     return frame, camera

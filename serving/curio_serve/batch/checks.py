@@ -112,6 +112,18 @@ def check_camera(arguments: DetectArguments, estimator: Estimator, recordings: S
         )
 
 
+def refuse_server_flags(arguments: DetectArguments, models: Sequence[str]) -> None:
+    """Refuse flags that are for a server where all models are on this machine.
+
+    Raises:
+        UsageError: There is such a flag; it is named.
+    """
+    for flag in ("server_ca", "tls_certificate", "tls_key", "token_file"):
+        if (given := getattr(arguments, flag)) is not None and all(map(os.path.exists, models)):
+            name = flag.replace("_", "-")
+            raise UsageError(f"--{name} {given} is for a model on a server, HOST:PORT/NAME; leave it out")
+
+
 def refuse_images(arguments: DetectArguments) -> None:
     """Refuse to write results over an image, a video or a recording.
 

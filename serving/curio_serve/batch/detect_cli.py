@@ -174,6 +174,7 @@ def _settings(arguments: DetectArguments) -> "Settings":
 
 def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "Settings") -> "list[Estimator]":
     """An estimator for each model, on this machine or behind a server."""
+    from curio_serve.batch.checks import refuse_server_flags
     from curio_serve.batch.estimators import LocalEstimator, RemoteEstimator
     from curio_serve.batch.named_models import SERVED_MODEL
     from curio_serve.models.model_folder import open_model
@@ -181,6 +182,7 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
     from curio_serve.models.spec import check_known
 
     found: list[Estimator] = []
+    refuse_server_flags(arguments, models)
     for model in models:
         if os.path.exists(model):
             opened = open_model(model, Runtime(read_providers(arguments.provider)))

@@ -248,7 +248,8 @@ class LocalEstimator(Estimator):
             header = images.open_header(data)
             reduction = self._detector.reduction(camera, header.width, header.height)
         frame = self._frame(image, data, header, reduction)
-        camera = _turned(camera, frame) or self.canonical.for_frame(frame.width, frame.height)
+        stored = (header.width, header.height) if header is not None else (frame.width, frame.height)
+        camera = _turned(camera, frame.quarter_turns, *stored) or self.canonical.for_frame(frame.width, frame.height)
         decoded = time.perf_counter()
         results: Sequence[RegionResult]
         if self.settings.track_objects is None:
@@ -305,34 +306,36 @@ class RemoteEstimator(Estimator):
         found = client.get_model(model, timeout_s=timeout_s)
         super().__init__(model.partition("/")[0], found.version, found.spec, settings)
         self._client = client
+        # Of several models each is asked for those of the wanted objects that it knows.
+        self._wanted = [kind.name for kind in found.spec.objects if kind.name in settings.objects]
 
     def _look(self, image: SourceImage, data: bytes, camera: PinholeCamera | None) -> Seen:
-        payload = data if image.pixels is None else image.pixels
-        if self.settings.apply_exif_rotation and image.pixels is None:
-            frame = self._frame(image, data)  # turned here, so that the K written down is the turned one
-            payload, camera = frame.pixels, _turned(camera, frame)
+        is_turned = self.settings.apply_exif_rotation and image.pixels is None
         answer = self._client.detect(
             f"{self.name}/{self.version}",
-            payload,
+            data if image.pixels is None else image.pixels,
             camera,
             min_confidence=self.settings.min_confidence,
             max_detections=self.settings.max_detections,
             max_instances=self.settings.max_instances,
             reads=self.settings.num_reads if self.settings.num_reads > 1 else None,
-            objects=self.settings.objects,
+            objects=self._wanted,
+            apply_exif_rotation=is_turned,
         )
+        if is_turned:  # by the server, and so is the K that is written down
+            header = images.open_header(data)
+            camera = _turned(camera, images.quarter_turns_of(header), header.width, header.height)
         camera = camera or self.canonical.for_frame(answer.width, answer.height)
         spent = answer.milliseconds
         return Seen(answer.width, answer.height, camera, answer.results, spent.decode, spent.inference)
 
 
-def _turned(camera: PinholeCamera | None, frame: images.Frame) -> PinholeCamera | None:
-    """The camera of a decoded frame, given the camera of its stored pixels."""
-    if camera is None or not frame.quarter_turns:
+def _turned(camera: PinholeCamera | None, quarter_turns: int, width: int, height: int) -> PinholeCamera | None:
+    """The camera of a frame that was turned, given the camera and the size of its stored pixels."""
+    if camera is None or not quarter_turns:
         return camera
-    stored = (frame.height, frame.width) if frame.quarter_turns % 2 else (frame.width, frame.height)
-    camera.check_frame(*stored)
-    return camera.turned(frame.quarter_turns, *stored)
+    camera.check_frame(width, height)
+    return camera.turned(quarter_turns, width, height)
 
 
 def _drawing_path(folder: Path, image: SourceImage, root: Path) -> Path:

@@ -113,6 +113,8 @@ def read_rig(arguments: DetectArguments, models: Sequence[str]) -> list[RigCamer
         "--max-instances": arguments.max_instances,
         "--reads": arguments.reads != 1,
         "--refine": arguments.refine,
+        "--mesh": arguments.mesh,
+        "--mesh-unit": arguments.mesh_unit,
     }
     if wrong := [flag for flag, value in given.items() if value]:
         raise UsageError(f"--rig and {wrong[0]} do not go together: the rig's file has the cameras; leave one out")

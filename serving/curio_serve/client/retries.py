@@ -13,6 +13,7 @@ from curio_serve.errors import CurioError, ImageError, Overloaded, Unavailable, 
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
 _LONGEST_S = 1e9  # thirty years
+_TOO_LARGE = "larger than max"  # in gRPC's words about a message
 _STATUS_DETAILS_KEY = "grpc-status-details-bin"
 
 
@@ -63,8 +64,9 @@ def error_from_call(failure: Any, address: str) -> CurioError:
         return Unavailable(f"no server answers at {address} ({text}); is curio-serve running there?")
     if not reason and status == "DEADLINE_EXCEEDED":
         text = f"{address} did not answer in time; give the call a longer timeout_s ({text})"
-    if not reason and status == "RESOURCE_EXHAUSTED" and retry_after_s is None:
-        # gRPC's own refusal of a message over its limit carries this status too; that never helps to repeat
+    if not reason and status == "RESOURCE_EXHAUSTED" and _TOO_LARGE in text:
+        # gRPC's own refusal of a message over its limit carries this status, as that of a call over the limit of calls
+        # does; this one never helps to repeat.
         return ImageError(f"the request is larger than {address} accepts ({text}); send a smaller image")
     error = error_from_status(status, reason, text)
     if isinstance(error, Overloaded) and retry_after_s is not None:

@@ -23,6 +23,8 @@ from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 
 MAX_BYTES = 64 << 20
+_DISTORTION = ("distortion", "distortion_coefficients", "dist_coeffs", "dist")
+_COEFFICIENT = re.compile(r"[kp]\d")  # each by itself, as some calibrations write them
 _ROS_MODELS = ("", "plumb_bob", "rational_polynomial")  # OpenCV's own lenses
 
 
@@ -83,16 +85,14 @@ def read_camera_file(path: str | Path) -> CameraFile:
 
 def _from_json(path: Path, content: Any) -> CameraFile:
     if isinstance(content, dict) and "camera_matrix" in content:
-        size = _size(content.get("width"), content.get("height"))
-        distortion = _distortion(content.get("distortion"))
+        size, distortion = _size(content.get("width"), content.get("height")), _known_lens(content)
         return CameraFile(path, PinholeCamera(_matrix(content["camera_matrix"]), distortion, size), {})
     if isinstance(content, dict) and (names := content.keys() & {"k", "K"}):
         return CameraFile(path, camera_of_info(content, names.pop()), {})
     if isinstance(content, dict) and {"fx", "fy", "cx", "cy"} <= content.keys():
         fx, fy, cx, cy = (float(content[name]) for name in ("fx", "fy", "cx", "cy"))
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        distortion = _distortion(content.get("distortion"))
-        size = _size(content.get("width"), content.get("height"))
+        size, distortion = _size(content.get("width"), content.get("height")), _known_lens(content)
         return CameraFile(path, PinholeCamera(matrix, distortion, size), {})
     if isinstance(content, dict) and content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
         return CameraFile(path, None, {int(n): PinholeCamera(_matrix(v["cam_K"])) for n, v in content.items()})
@@ -106,6 +106,18 @@ def _from_json(path: Path, content: Any) -> CameraFile:
 def _matrix(values: Any) -> np.ndarray:
     array = np.asarray(values, float)
     return array.reshape(3, 3) if array.shape == (9,) else array
+
+
+def _known_lens(content: Mapping[str, Any]) -> tuple[float, ...]:
+    """The coefficients in a JSON file, by whichever name it has for them; what is not read is refused."""
+    given = [name for name in _DISTORTION if content.get(name) is not None]
+    if len(given) > 1:
+        raise CameraError(f"found {' and '.join(given)}; expected the distortion once")
+    distortion = _distortion(content[given[0]]) if given else ()
+    if unread := [name for name in content if _COEFFICIENT.fullmatch(name) and content[name]]:
+        raise CameraError(f"found {', '.join(sorted(unread))}; expected distortion as a list [k1, k2, p1, p2, k3]")
+    _refuse_other_lens(content.get("distortion_model", ""), distortion)
+    return distortion
 
 
 def _distortion(values: Any) -> tuple[float, ...]:
@@ -129,7 +141,7 @@ def camera_of_info(content: Mapping[str, Any], name: str) -> PinholeCamera:
     Raises:
         CameraError: It has the lenses of another model than plumb_bob or rational_polynomial.
     """
-    distortion = content.get("d" if name == "k" else "D") or []
+    distortion = content.get("d") or content.get("D") or []
     _refuse_other_lens(content.get("distortion_model", ""), distortion)
     size = _size(content.get("width"), content.get("height"))
     return PinholeCamera(_matrix(content[name]), _distortion(distortion), size)
@@ -173,7 +185,8 @@ def _from_yaml(text: str) -> PinholeCamera:
         matrix = _yaml_matrix(storage.getNode("camera_matrix"))
         if matrix is None:
             raise CameraError("no matrix camera_matrix; expected a file of OpenCV's or ROS's calibration")
-        distortion = _yaml_matrix(storage.getNode("distortion_coefficients"))
+        nodes = [node for name in _DISTORTION if not (node := storage.getNode(name)).empty()]
+        distortion = _yaml_matrix(nodes[0]) if nodes else None
         model = storage.getNode("distortion_model")
         _refuse_other_lens("" if model.empty() else model.string(), () if distortion is None else distortion.ravel())
         width, height = storage.getNode("image_width"), storage.getNode("image_height")

@@ -95,7 +95,7 @@ def decode(
         ImageError: Says what is wrong with it.
     """
     header = header or open_header(data, max_pixels)
-    quarter_turns = _quarter_turns(header) if apply_exif_rotation else 0
+    quarter_turns = quarter_turns_of(header) if apply_exif_rotation else 0
     reduction = _reduction(header, max_reduction)
     pixels = _decode_pixels(data, header, reduction)
     if quarter_turns:
@@ -104,7 +104,12 @@ def decode(
     return Frame(pixels, width, height, reduction, quarter_turns)
 
 
-def _quarter_turns(header: Header) -> int:
+def quarter_turns_of(header: Header) -> int:
+    """Clockwise quarter turns that EXIF asks for.
+
+    Raises:
+        ImageError: It asks for a mirror image.
+    """
     if header.orientation not in _QUARTER_TURNS:
         raise ImageError(
             f"EXIF orientation {header.orientation} mirrors the image, which no camera does; decode it as stored, "

@@ -8,6 +8,7 @@ import numpy as np
 
 _MOST_DIGITS = 6  # of a camera's number
 _MOST_DAMAGED = 30  # frames in a row; after so many, nothing more is expected of a video
+_WHOLE = 0.9  # of the frames, or of the time, that a video says it has: both are estimates in some files
 
 
 def open_video(source: str) -> cv2.VideoCapture:
@@ -28,10 +29,11 @@ def decoded_frames(path: str) -> Iterator[tuple[np.ndarray | None, float | None]
     """The frames of a video file, uint8 RGB [height, width, 3], as they are stored, or None for damaged ones.
 
     Beside each: the seconds since the first frame, by the video's own times or else by its frame rate; None: unknown.
+    A video that ends long before it says it does has a damaged frame there.
     """
     capture = open_video(os.path.abspath(path))  # never the number of a camera
-    rate = capture.get(cv2.CAP_PROP_FPS)
-    number, damaged, first_ms = 0, 0, None
+    rate, announced = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    number, damaged, first_ms, at_ms = 0, 0, None, 0.0
     try:
         while damaged <= _MOST_DAMAGED:
             is_read, pixels = capture.read()
@@ -45,5 +47,8 @@ def decoded_frames(path: str) -> Iterator[tuple[np.ndarray | None, float | None]
             by_rate_s = number / rate if rate > 0 else None
             yield cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), (at_ms - first_ms) / 1000 if at_ms > first_ms else by_rate_s
             number += 1
+        is_short = rate > 0 and (at_ms - (first_ms or 0.0)) / 1000 < _WHOLE * announced / rate
+        if is_short and 0 < number < _WHOLE * announced:
+            yield None, None
     finally:
         capture.release()

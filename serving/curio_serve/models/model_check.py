@@ -11,12 +11,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-from curio_serve.errors import ModelError
+from curio_serve.errors import CheckNotDone, ModelError
 from curio_serve.systems import limit_this_process
 
 MAX_MEMORY_BYTES = 4 << 30
 MAX_CPU_S = 30
 TIMEOUT_S = 60
+_KILLED = -9  # by SIGKILL: from outside, as its own limits send another signal
 
 
 class ChildCheck:
@@ -34,26 +35,30 @@ class ChildCheck:
             version: Of the folder.
 
         Raises:
-            ModelError: The last line that the child wrote, or how it died.
+            ModelError: The last line that the child wrote.
+            CheckNotDone: It could not be started, was killed from outside, or took too long.
         """
         arguments = [str(path)] if version is None else [str(path), str(version)]
         label = Path(*arguments)
-        command = [sys.executable, "-m", "curio_serve.models.model_check", *arguments]
+        # -P: what lies in the working folder is no module of ours.
+        command = [sys.executable, "-P", "-m", "curio_serve.models.model_check", *arguments]
         try:
             child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         except OSError as exc:  # no memory, no process, no file left for it
-            raise ModelError(f"{label}: its check could not be started: {exc.strerror}") from exc
+            raise CheckNotDone(f"{label}: its check could not be started: {exc.strerror}") from exc
         with child:
             self._child = child
             try:
                 _, output = child.communicate(timeout=TIMEOUT_S)
             except subprocess.TimeoutExpired as exc:
-                raise ModelError(f"{label}: its check took longer than {TIMEOUT_S} s") from exc
+                raise CheckNotDone(f"{label}: its check took longer than {TIMEOUT_S} s") from exc
             finally:
                 child.kill()  # also after Ctrl-C
         last = (output.strip().splitlines() or ["without a word"])[-1]
         if child.returncode == 1:
             raise ModelError(last if str(path) in last else f"{label}: {last}")
+        if child.returncode == _KILLED:
+            raise CheckNotDone(f"{label}: its check was killed from outside, perhaps for want of memory: {last}")
         if child.returncode:
             raise ModelError(f"{label}: its check ended with status {child.returncode}: {last}")
 

@@ -71,6 +71,9 @@ def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME)
         _check_sum(folder, f"{version}/{MODEL_FILE}", model.sha256)
         if model.spec.HasField("reliability"):
             _check_file_sum(folder, f"{version}/{RELIABILITY_FILE}")
+        elif (folder / SUMS_FILE).exists() and f"{version}/{RELIABILITY_FILE}" in listed_sums(folder):
+            missing = folder / str(version) / RELIABILITY_FILE
+            raise ModelError(f"{missing} is missing, and {SUMS_FILE} lists it; copy the folder again")
         _check_config(folder, model)
         check_golden(folder / str(version) / GOLDEN_FILE, model)
     except OSError as exc:

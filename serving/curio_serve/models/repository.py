@@ -5,11 +5,13 @@ that a call sees the old or the new state and never a mixture. A check in a chil
 comes before loading; a candidate that fails it leaves the models that serve untouched.
 """
 
+import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from curio_serve.errors import ModelError, ModelNotFound
+from curio_serve.errors import CheckNotDone, ModelError, ModelNotFound
 from curio_serve.models.golden import GOLDEN_FILE
 from curio_serve.models.model import Model
 from curio_serve.models.model_folder import MODEL_FILE, is_model_name, load_version, versions
@@ -18,6 +20,7 @@ from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime
 
 Key = tuple[str, int]
 Signature = tuple[tuple[int, int, int, int], ...]
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 5.0, 600.0  # before a check that was not done is tried again
 _FOLDER = 0  # in place of a version: the model's folder itself
 
 
@@ -49,6 +52,7 @@ class Repository:
         self._root, self._num_versions, self._runtime = root, num_versions, runtime
         self._models: Mapping[str, Mapping[int, Model]] = {}
         self._seen: dict[Key, Signature] = {}
+        self._put_off: dict[Key, tuple[int, float]] = {}  # how many checks were not done, and when the next is
 
     def get(self, name: str, version: int = 0) -> Model:
         """A loaded model; version 0 is the latest.
@@ -74,7 +78,8 @@ class Repository:
             check: Called with the model's folder and the version before this process opens the file; raises ModelError.
 
         Returns:
-            The changes. A refused candidate is not tried again until its files change.
+            The changes. A refused candidate is not tried again until its files change; one whose check was not done is
+            tried again, after ever longer pauses.
 
         Raises:
             ModelError: The folder itself cannot be read.
@@ -133,16 +138,22 @@ class Repository:
         changes: list[Change],
     ) -> Model | None:
         """A version's model: loaded anew if its files changed; else, or if that fails, the present one."""
-        present = self._models.get(folder.name, {}).get(version)
-        if self._seen.get((folder.name, version)) == signature:
+        key, present = (folder.name, version), self._models.get(folder.name, {}).get(version)
+        failed, next_s = self._put_off.get(key, (0, math.inf))
+        if self._seen.get(key) == signature and time.monotonic() < next_s:
             return present
         try:
             if check is not None:
                 check(folder, version)
             model = load_version(folder, version, self._runtime)
         except ModelError as exc:
+            self._put_off.pop(key, None)
+            if isinstance(exc, CheckNotDone):
+                pause_s = min(_FIRST_PAUSE_S * 2**failed, _LONGEST_PAUSE_S)
+                self._put_off[key] = failed + 1, time.monotonic() + pause_s
             changes.append(Change(folder.name, version, "refused", str(exc)))
             return present
+        self._put_off.pop(key, None)
         changes.append(Change(folder.name, version, "loaded"))
         return model
 

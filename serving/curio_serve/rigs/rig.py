@@ -66,7 +66,7 @@ def _rig_camera(entry: Any, where: str, number: int) -> RigCamera:
         pose = np.array(entry["cam_from_rig"], float)
         distortion = tuple(float(value) for value in entry.get("distortion") or ())
         known = (int(size[0]), int(size[1])) if size[0] is not None and size[1] is not None else None
-    except (TypeError, ValueError) as exc:
+    except (TypeError, ValueError, OverflowError) as exc:
         raise CameraError(f"{where} has values that are no numbers: {exc}") from exc
     try:
         camera = PinholeCamera(matrix, distortion, known)

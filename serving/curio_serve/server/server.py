@@ -145,12 +145,15 @@ class PoseServer:
                 f"cannot serve metrics on port {port}: {exc.strerror}; choose another --metrics-port"
             ) from exc
         http.start()
-        return f"http://{self.config.host}:{http.server_port}/metrics"
+        host = f"[{self.config.host}]" if ":" in self.config.host else self.config.host
+        return f"http://{host}:{http.server_port}/metrics"
 
     def _announce(self) -> None:
-        """Set the health status of the server and of each service and model."""
+        """Set the health status of the server and of each service and model; without a model nothing serves."""
         names = [name for name, _ in self._repository]
-        for name in ("", _POSE.full_name, _INFERENCE.full_name, *names):
+        for name in ("", _POSE.full_name, _INFERENCE.full_name):
+            self._health.set(name, _SERVING if names else _NOT_SERVING)
+        for name in names:
             self._health.set(name, _SERVING)
 
     def serve_until_stopped(self) -> None:

@@ -52,7 +52,9 @@ def is_store(url: str) -> bool:
 
 def path_of(url: str) -> str:
     """A relative path made of a URL, unique to it, for files such as drawings."""
-    place, _, query = url.partition("#")[0].partition("?")
+    place, query = url, ""
+    if not is_store(url):  # whose keys may hold these characters
+        place, _, query = url.partition("#")[0].partition("?")
     path, suffix = posixpath.splitext(posixpath.normpath(place.replace("://", "/")).lstrip("./"))
     return path + (f"-{hashlib.sha256(query.encode()).hexdigest()[:8]}" if query else "") + suffix
 

@@ -193,7 +193,8 @@ def _is_remote_folder(url: str) -> bool:
 
 
 def _url_suffix(url: str) -> str:
-    return PurePath(path_of(url)).suffix.lower() if "/" in path_of(url) else ""
+    """Suffix of the file that a URL names, with its dot; empty where it names a server or a bucket alone."""
+    return PurePath(path_of(url)).suffix.lower() if "/" in url.partition("://")[2].rstrip("/") else ""
 
 
 def _remote_image(url: str) -> SourceImage:
