@@ -13,6 +13,7 @@
     │       ├── DeadlineError   the deadline passed before the work was done
     │       └── CallCancelled   the client hung up
     ├── ModelError              a model folder or file cannot be used
+    │   └── CheckNotDone        nobody knows: its check could not be done
     ├── OutputError             results cannot be written
     └── ServiceError            the service, not the request
         ├── Overloaded          the queue is full; try again later
@@ -133,6 +134,7 @@ STATUS_OF: dict[type[CurioError], str] = {
     CallEnded: "CANCELLED",
     Overloaded: "RESOURCE_EXHAUSTED",
     Unavailable: "UNAVAILABLE",
+    CheckNotDone: "UNAVAILABLE",
     Unsupported: "UNIMPLEMENTED",
     OutputError: "DATA_LOSS",
     InternalError: "INTERNAL",

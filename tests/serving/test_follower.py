@@ -1,7 +1,11 @@
 """What is followed of the shipped model of an ape: when whole frames are looked at, and what a frame changes."""
 
 import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,6 +13,8 @@ import onnx
 import pytest
 from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, Field, ModelSpec, ObjectModel
+from curio_serve.client import PoseClient
+from curio_serve.client.request import detect_request
 from curio_serve.errors import CameraMissing
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
@@ -211,3 +217,43 @@ def test_an_object_that_is_read_twice_takes_no_other_ones_place() -> None:
     for result in results:
         found = {one.track.track_id: one.translation_m[0] for one in result.detections}
         assert found == pytest.approx({1: -28 / 110, 2: 22 / 110}, abs=0.01)
+
+
+def test_a_stream_keeps_its_version_and_numbers_are_given_once(
+    start_server: Callable[..., Any],
+    models_dir: Path,
+    tmp_path: Path,
+    spot_image: Callable[..., np.ndarray],
+    spot_onnx: Callable[..., Any],
+    write_folder: Callable[..., Path],
+) -> None:
+    folder = Path(shutil.copytree(models_dir / "pinhole", tmp_path / "models" / "pinhole"))
+    server = start_server(folder.parent, "--refresh-s", "0.05")
+    pixels = spot_image(320, 240, 150, 120, 12, 12, (255, 128, 0))
+    matrix = np.array([[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]])
+
+    answers: list[messages.RegionResult] = []
+
+    def wait_until(is_met: Callable[[], bool]) -> None:
+        end = time.monotonic() + 60
+        while not is_met():
+            assert time.monotonic() < end
+            time.sleep(0.02)
+
+    def requests() -> Iterator[messages.DetectRequest]:
+        request = detect_request("pinhole", pixels, matrix, min_confidence=0.3, track=messages.Tracking())
+        yield request
+        wait_until(lambda: len(answers) == 1)
+        write_folder(folder, spot_onnx(True), 2)
+        wait_until(lambda: client.get_model("pinhole").version == 2)
+        yield request
+        wait_until(lambda: len(answers) == 2)
+        shutil.rmtree(folder / "1")
+        wait_until(lambda: client.list_models()[0].versions == [2])
+        yield request
+
+    with PoseClient(server.address) as client:
+        for answer in client.detect_stream(requests(), timeout_s=120):
+            answers.append(answer.results[0])  # while the generator waits for it
+    assert [answer.model_version for answer in answers] == [1, 1, 2]
+    assert [answer.detections[0].track.track_id for answer in answers] == [1, 1, 2]

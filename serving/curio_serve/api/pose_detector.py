@@ -17,11 +17,11 @@ from curio_serve.api.registration import only_message
 from curio_serve.api.rig_request import check_views, rig_view, view_camera
 from curio_serve.api.status import CallLog, frame_error
 from curio_serve.api.streams import Streams
-from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError
+from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, ModelNotFound
 from curio_serve.imaging import image
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector, check_min_confidence
-from curio_serve.models.model import answering
+from curio_serve.models.model import Model, answering
 from curio_serve.models.repository import Repository
 from curio_serve.rigs.detect_views import detect_views
 from curio_serve.telemetry import Metrics
@@ -90,7 +90,7 @@ class PoseService(PoseDetectorServicer):
         try:
             with self._calls.record("DetectStream.frame", context) as call:
                 call.request_id = request.request_id
-                detectors = self._detectors(request)
+                detectors = self._detectors(request, following)
                 with self._work.slot(context, always=True) as waited_s:
                     return self._detect(request, detectors, waited_s, context, following)
         except CallEnded:
@@ -209,7 +209,7 @@ class PoseService(PoseDetectorServicer):
         self._metrics.decode_s.observe(decoded - begun)
         self._metrics.inference_s.observe(inferred - decoded)
 
-    def _detectors(self, request: messages.DetectRequest) -> list[Detector]:
+    def _detectors(self, request: messages.DetectRequest, following: FollowingStream | None = None) -> list[Detector]:
         """The models that a request names. Requests that can be refused without work are refused here."""
         limits, models, num_regions = self._limits, request.models, len(request.regions)
         if not 1 <= len(models) <= limits.max_models:
@@ -231,10 +231,21 @@ class PoseService(PoseDetectorServicer):
                 f"{len(models)} models times {max(num_regions, 1)} regions{times} are {num_runs} runs of a network; "
                 f"at most {most_runs} are accepted (the larger of --max-models and --max-regions)"
             )
-        found = [self._repository.get(model.name, model.version) for model in models]
+        found = [self._model(model, following) for model in models]
         if len(set(found)) < len(found):
             raise ArgumentError("models names a model more than once; expected each once")
         return [Detector(model, num_reads) for model in answering(found, request.objects)]
+
+    def _model(self, wanted: messages.ModelSelector, following: FollowingStream | None) -> Model:
+        """A model of a request; a stream keeps the version that it began with for as long as that is served."""
+        if wanted.version or following is None:
+            return self._repository.get(wanted.name, wanted.version)
+        try:
+            found = self._repository.get(wanted.name, following.versions.get(wanted.name, 0))
+        except ModelNotFound:
+            found = self._repository.get(wanted.name)
+        following.versions[wanted.name] = found.version
+        return found
 
 
 def _check_following(request: messages.DetectRequest, following: FollowingStream | None) -> FollowingStream:

@@ -60,9 +60,12 @@ class Following:
 class Follower:
     """The objects of one model in one stream; not to be shared between threads."""
 
-    def __init__(self) -> None:
+    last_number: int
+    """The number of the track that was begun last; 0: none was."""
+
+    def __init__(self, last_number: int = 0) -> None:
         self._tracks: list[Track] = []
-        self._last_number = 0
+        self.last_number = last_number
         self._looked_s = self._searched_s = self._time_s = -math.inf
 
     def follow(
@@ -206,8 +209,8 @@ class Follower:
             if (replaced.is_seen and not is_surer) or self._is_taken(replaced, measured.translation_m):
                 return
             self._tracks.remove(replaced)
-        self._last_number += 1
-        self._tracks.append(Track.begin(self._last_number, kind, measured, frame.time_s))
+        self.last_number += 1
+        self._tracks.append(Track.begin(self.last_number, kind, measured, frame.time_s))
 
     def _answer(
         self,

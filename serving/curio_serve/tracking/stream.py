@@ -10,6 +10,7 @@ from curio_proto.v1.detector_pb2 import RegionResult, Tracking
 from curio_serve.errors import ArgumentError, CameraError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
+from curio_serve.models.model import Model
 from curio_serve.tracking.follower import Follower, Following
 
 if TYPE_CHECKING:
@@ -23,7 +24,11 @@ _SAME_CAMERA = 1e-6  # relative difference of K
 class FollowingStream:
     """The followed objects of one stream's models. A frame that is refused changes nothing here."""
 
+    versions: dict[str, int]
+    """Version of each model that was asked for by its name alone."""
+
     def __init__(self) -> None:
+        self.versions = {}
         self._followers: dict[str, Follower] = {}
         self._time_s: float | None = None
         self._size: tuple[int, int] | None = None
@@ -90,7 +95,7 @@ class FollowingStream:
             camera.check_frame(*size)
         followers = {} if request.restart else dict(self._followers)
         answers = [
-            followers.setdefault(detector.model.label, Follower()).follow(
+            _follower(followers, detector.model).follow(
                 detector,
                 pixels,
                 camera,
@@ -120,6 +125,14 @@ class FollowingStream:
                 "K or the distortion differ from those of the frames before; objects are followed in the frames of one "
                 "camera: set track.restart to begin anew"
             )
+
+
+def _follower(followers: dict[str, Follower], model: Model) -> Follower:
+    """The follower of a model's version; one that takes the place of another version's goes on with its numbers."""
+    if model.label not in followers:
+        of_name = [one.last_number for label, one in followers.items() if label.rpartition("/")[0] == model.name]
+        followers[model.label] = Follower(max(of_name, default=0))
+    return followers[model.label]
 
 
 def _is_same(one: PinholeCamera | None, other: PinholeCamera | None) -> bool:
