@@ -114,7 +114,8 @@ def _known_lens(content: Mapping[str, Any]) -> tuple[float, ...]:
     if len(given) > 1:
         raise CameraError(f"found {' and '.join(given)}; expected the distortion once")
     distortion = _distortion(content[given[0]]) if given else ()
-    if unread := [name for name in content if _COEFFICIENT.fullmatch(name) and content[name]]:
+    unread = [name for name in content if _COEFFICIENT.fullmatch(name) and content[name]]
+    if unread and not given:
         raise CameraError(f"found {', '.join(sorted(unread))}; expected distortion as a list [k1, k2, p1, p2, k3]")
     _refuse_other_lens(content.get("distortion_model", ""), distortion)
     return distortion
