@@ -8,6 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
+from curio_serve.batch.images import sources
 from curio_serve.batch.images.remote_files import Patience, RemoteFiles, path_of
 from curio_serve.errors import ImageError, UsageError
 
@@ -31,6 +32,12 @@ def detect(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
 )
 def test_keys_of_stores_may_hold_any_character(url: str, path: str) -> None:
     assert path_of(url) == path
+
+
+@pytest.mark.parametrize("url", ["s3://my.bucket", "s3://my.bucket/", "s3://my.bucket/day"])
+def test_a_dot_in_a_buckets_name_is_no_suffix(url: str) -> None:
+    assert sources._is_remote_folder(url)
+    assert not sources._is_remote_folder("s3://my.bucket/a.jpg")
 
 
 @pytest.fixture

@@ -87,13 +87,16 @@ def test_thresholds(stub: PoseDetectorStub, picture: np.ndarray) -> None:
     assert stub.Detect(request, timeout=10).results[0].status == pb.REGION_STATUS_DETECTED
 
 
+def _with_orientation_6(jpeg: bytes) -> bytes:
+    exif = b"Exif\x00\x00MM\x00*\x00\x00\x00\x08\x00\x01\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00\x00\x00"
+    return jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+
+
 def test_exif_rotation_turns_the_camera_too(stub: PoseDetectorStub, picture: np.ndarray) -> None:
     """The same scene, stored upright, and stored lying with EXIF orientation 6: the upright pose both times."""
     upright = PinholeCamera(np.reshape(K, (3, 3)))
     lying = upright.turned(3, 640, 480)
-    jpeg = _jpeg(np.ascontiguousarray(np.rot90(picture, 1)))
-    exif = b"Exif\x00\x00MM\x00*\x00\x00\x00\x08\x00\x01\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00\x00\x00"
-    turned = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+    turned = _with_orientation_6(_jpeg(np.ascontiguousarray(np.rot90(picture, 1))))
     requests = [
         pb.DetectRequest(models=[PINHOLE], encoded=_jpeg(picture), camera=pb.Camera(camera_matrix=K)),
         pb.DetectRequest(
@@ -110,9 +113,7 @@ def test_exif_rotation_turns_the_camera_too(stub: PoseDetectorStub, picture: np.
 
 
 def test_a_turned_frame_has_to_have_the_size_of_its_camera(stub: PoseDetectorStub, picture: np.ndarray) -> None:
-    jpeg = _jpeg(picture)
-    exif = b"Exif\x00\x00MM\x00*\x00\x00\x00\x08\x00\x01\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00\x00\x00"
-    turned = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+    turned = _with_orientation_6(_jpeg(picture))
     camera = pb.Camera(camera_matrix=K, width=1280, height=960)
     for asked in (False, True):
         with pytest.raises(grpc.RpcError, match="K belongs to frames of 1280x960, this one has 640x480"):

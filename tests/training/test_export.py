@@ -158,31 +158,6 @@ def test_versions_stand_beside_each_other(single: Exported, half: Exported, mode
     assert find_model(models / "circles") == half.path / "model.onnx"
 
 
-def test_a_number_that_is_taken_is_passed_over_and_a_lost_config_is_written_again(tmp_path: Path) -> None:
-    folder, files_of = ModelFolder(tmp_path / "one"), {"model.onnx": b"graph"}
-    folder.add(folder.next_version(), files_of, "config", "first")
-    (tmp_path / "one" / "2").mkdir()
-    (tmp_path / "one" / "2" / "notes.txt").write_text("dear")
-    (tmp_path / "one" / "config.pbtxt").unlink()
-    assert folder.add(folder.next_version(), files_of, "config", "third").name == "3"
-    assert (tmp_path / "one" / "config.pbtxt").read_text() == "config"
-    listed = [line.split("  ")[1] for line in (tmp_path / "one" / "SHA256SUMS").read_text().splitlines()]
-    assert listed == ["1/model.onnx", "3/model.onnx"]
-    assert (tmp_path / "one" / "2" / "notes.txt").read_text() == "dear"
-
-
-def test_of_two_exports_at_once_the_first_stays_whole(tmp_path: Path) -> None:
-    folder = ModelFolder(tmp_path / "one")
-    folder.add(folder.next_version(), {"model.onnx": b"graph"}, "config", "first")
-    number = folder.next_version()  # both find it
-    folder.add(number, {"model.onnx": b"faster"}, "config", "second")
-    before = (tmp_path / "one" / "SHA256SUMS").read_text()
-    with pytest.raises(ExportError, match="another export has just written it"):
-        folder.add(number, {"model.onnx": b"slower"}, "config", "third")
-    assert (tmp_path / "one" / "SHA256SUMS").read_text() == before
-    assert (tmp_path / "one" / "2" / "model.onnx").read_bytes() == b"faster"
-
-
 def test_the_card_quotes_an_evaluation_of_the_same_checkpoint_only(single: Exported, tmp_path: Path) -> None:
     spec = ExportedModel.open(single.path / "model.onnx").spec
     config, progress = RunConfig(CirclesOptions(), method="noncur"), TrainingProgress(step=2, images=64, seconds=1.5)
