@@ -239,6 +239,7 @@ def test_the_command_writes_what_is_asked_for(models: Path, client: PoseClient, 
     ("objects", "told"),
     [
         ("bolt,", "--objects bolt,: expected names with commas between them, such as ape,can"),
+        ("bolt,screw", "--objects: objects names 'screw'; expected some of bolt, nut, plate"),
         ("screw", "objects names screw, and model"),
     ],
 )

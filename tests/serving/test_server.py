@@ -60,7 +60,8 @@ def test_a_taken_port_is_named(server: Any, models_dir: Path) -> None:
     ("arguments", "status", "words"),
     [
         (["{tmp}/nowhere"], 1, "models folder {tmp}/nowhere cannot be read"),
-        (["{tmp}"], 1, "no model could be loaded from {tmp}"),
+        (["{tmp}"], 1, "no model could be loaded from {tmp}: it holds no <name>/<version>/model.onnx"),
+        (["{models}/flat"], 1, "it is the folder of one model; give the folder that holds it, {models}"),
         (["{models}", "--token-file", "{tmp}/none"], 2, "--token-file {tmp}/none cannot be read"),
         (["{models}", "--tls-key", "{tmp}/k", "--tls-certificate", "{tmp}/c"], 2, "--tls-key {tmp}/k cannot be read"),
         (["{models}", "--tls-key", "{readme}", "--tls-certificate", "{readme}"], 2, "expected PEM files"),

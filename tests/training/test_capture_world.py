@@ -221,6 +221,8 @@ def test_what_contradicts_itself_is_refused(folder: Path, tmp_path: Path) -> Non
         options(folder, backgrounds=folder / "photos")
     with pytest.raises(UsageError, match="inside it"):
         build(options(folder, near_m=0.05))
+    with pytest.raises(UsageError, match=r"--far-m 1000:.* pixels large.*are in metres"):
+        build(options(folder, near_m=300.0, far_m=1000.0))
     with pytest.raises(MeshError, match="--mesh-unit to"):
         build(options(folder, mesh_unit=None))
     with pytest.raises(MeshError, match=r"none\.stl"):

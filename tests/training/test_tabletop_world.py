@@ -259,14 +259,19 @@ def test_a_camera_that_moves_has_a_plate_for_each_photograph(folder: Path, tmp_p
     turned = {"plate": str(folder / "b" / "plate-b.png"), "cam_from_world": pose(90).tolist()}
     (tmp_path / "views.json").write_text(json.dumps(views | {"03.png": turned}))
     moving = build(options(folder, plane=tmp_path / "views.json"))
-    source = moving.source("train", 0, with_code=False, cache=tmp_path)
-    batch = source.batch(0, NUM)
+    batch = moving.source("train", 0, with_code=False, cache=tmp_path).batch(0, NUM)
     assert batch.backgrounds is not None
     differing = (batch.backgrounds - batch.backgrounds[0]).abs().amax(dim=(1, 2, 3)) > 0.02
     assert differing.sum() in (1, NUM - 1)
     higher = {"plate": str(folder / "b" / "plate-b.png"), "cam_from_world": pose(90, height=0.7).tolist()}
     (tmp_path / "views.json").write_text(json.dumps(views | {"03.png": higher}))
     with pytest.raises(CameraError, match=r"03\.png was taken 0\.7 m above"):
+        build(options(folder, plane=tmp_path / "views.json"))
+
+
+def test_camera_poses_in_millimetres_are_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "views.json").write_text(json.dumps({"plate-a.png": {"cam_from_world": pose(90, 600.0).tolist()}}))
+    with pytest.raises(CameraError, match=r"m away from the plane.*cam_from_world is in metres"):
         build(options(folder, plane=tmp_path / "views.json"))
 
 

@@ -182,10 +182,12 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
     from curio_serve.models.spec import check_known
 
     found: list[Estimator] = []
+    specs: list[ModelSpec] = []  # with all of a model's objects, not only those that are asked for
     refuse_server_flags(arguments, models)
     for model in models:
         if os.path.exists(model):
             opened = open_model(model, Runtime(read_providers(arguments.provider)))
+            specs.append(opened.spec)
             _check_objects(opened.spec, model, settings)
             try:
                 found.append(LocalEstimator(opened, settings))
@@ -201,12 +203,13 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
         if arguments.provider != DetectArguments.provider:
             raise UsageError(f"--provider {arguments.provider}: found a model on a server, which chooses its own")
         found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
+        specs.append(found[-1].spec)
         _check_objects(found[-1].spec, model, settings)
     versions = [f"{estimator.name}/{estimator.version}" for estimator in found]
     if twice := next((one for number, one in enumerate(versions) if one in versions[:number]), None):
         raise UsageError(f"two models are {twice}, and their results could not be told apart; give one another name")
     try:
-        check_known([estimator.spec for estimator in found], settings.objects)
+        check_known(specs, settings.objects)
     except ArgumentError as exc:
         raise UsageError(f"--objects: {exc}") from exc
     return found

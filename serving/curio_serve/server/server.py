@@ -4,6 +4,7 @@ import contextlib
 import logging
 import socket
 import threading
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from curio_serve.api.registration import register
 from curio_serve.cores import memory_limit, num_cores
 from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.models.model_check import ChildCheck
+from curio_serve.models.model_folder import MODEL_FILE, versions
 from curio_serve.models.repository import Change, Repository
 from curio_serve.models.runtime import Runtime, on_processor, read_providers
 from curio_serve.server.config import ServeConfig
@@ -80,12 +82,10 @@ class PoseServer:
         # Frames run in parallel already, one a core; OpenCV's own threads would only get in their way.
         cv2.setNumThreads(1)
         memory.bound_heaps()
-        self._report(self._repository.refresh(self._check))
+        changes = self._repository.refresh(self._check)
+        self._report(changes)
         if not list(self._repository):
-            raise ModelError(
-                f"no model could be loaded from {self.config.models}; the log says why each was refused. "
-                "Export one with curio-export"
-            )
+            raise ModelError(f"no model could be loaded from {self.config.models}: {self._why_none(changes)}")
         self._server = self._build()
         addresses = [self._open_port(self._server)]
         if self.config.metrics_port is not None:
@@ -94,6 +94,15 @@ class PoseServer:
         self._server.start()
         self._announce()
         return addresses
+
+    def _why_none(self, changes: Sequence[Change]) -> str:
+        """What to do about a folder none of whose models serves."""
+        if changes:
+            return "the log says why each was refused"
+        folder = Path(self.config.models)
+        if versions(folder):
+            return f"it is the folder of one model; give the folder that holds it, {folder.absolute().parent}"
+        return f"it holds no <name>/<version>/{MODEL_FILE}; export a model with curio-export"
 
     def _build(self) -> grpc.Server:
         config = self.config

@@ -79,7 +79,7 @@ def _exported(
         done = export(run, models, ahead=model)
     except CurioError as exc:
         raise ExportError(
-            f"{run} is trained and whole, but no model could be made of it: {exc}. Once that is put right: "
+            f"{run} is trained and whole, but no model could be made of it ({exc}). Once that is put right: "
             f"curio-export {run} --out {models}"
         ) from exc
     said = verdict()

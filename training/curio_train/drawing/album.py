@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from curio_train.drawing.glb import from_glb, to_glb
+from curio_train.drawing.mesh_check import check_meshes
 from curio_train.drawing.pictures import RenderOptions, SceneContext, picture
 from curio_train.drawing.scenes import Scene, mesh_world, read_scenes
 from curio_train.errors import DataError, UsageError
@@ -52,8 +53,9 @@ def draw(
             recording, with photographs, cameras, boxes and confidence over time.
 
     Raises:
-        UsageError: Both meshes and a world, or neither where one is needed; or the format's extra is not installed.
-        DataError: The file of scenes, a photograph or the folder.
+        UsageError: Both meshes and a world, or neither where one is needed; one mesh without a name for several kinds
+            of objects; or the format's extra is not installed.
+        DataError: The file of scenes, a photograph or the folder; or a mesh is not of the object that was detected.
         MeshError: A mesh.
         RendererError: No usable libLLVM.
     """
@@ -77,6 +79,7 @@ def _with_context(scenes: Path, given: SceneContext | None) -> Iterator[tuple[Sc
         around = SceneContext.of_world(mesh_world(scene.world)) if scene.world else given
         if around is None:
             raise UsageError(f"{scenes}: detections don't say what the objects look like; add --mesh FILE or --world")
+        check_meshes(scene, around)
         yield scene, around
 
 

@@ -39,6 +39,8 @@ class Placed:
     """Albedo [3] that multiplies the mesh's own."""
     confidence: float = 1.0
     """Opacity that the object is drawn with, 0 to 1."""
+    box_px: np.ndarray | None = None
+    """Corners of the object's box [8, 2] in the photograph, pixels, as they were detected; None: not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +182,7 @@ def _cam_from_rig(record: Mapping[str, Any], where: str) -> Pose:
 
 
 def _placed(detection: Mapping[str, Any], cam_from_rig: Pose) -> Placed:
-    rotation, color = detection["rotation"], detection["color"]
+    rotation, color, box_px = detection["rotation"], detection["color"], detection.get("box_px")
     return Placed(
         str(detection["object"]),
         cam_from_rig
@@ -190,7 +192,15 @@ def _placed(detection: Mapping[str, Any], cam_from_rig: Pose) -> Placed:
         ),
         (1.0, 1.0, 1.0) if color is None else tuple(_numbers(color, (3,), "color").tolist()),
         float(detection["confidence"]),
+        _corners(box_px),
     )
+
+
+def _corners(box_px: Any) -> np.ndarray | None:
+    """The corners of a box as they were detected; None where they are not written or one is behind the camera."""
+    if box_px is None or any(value is None for corner in box_px for value in corner):
+        return None
+    return _numbers(box_px, (8, 2), "box_px")
 
 
 def _from_code(record: Mapping[str, Any], number: int) -> Scene:

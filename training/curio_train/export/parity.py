@@ -36,6 +36,6 @@ def refuse_disparity(expected: dict[str, Tensor], found: dict[str, Tensor]) -> f
     if errors[worst] > LARGEST_PARITY_ERROR:
         raise ExportError(
             f"torch and onnxruntime differ by {errors[worst]:.3g} in {worst}, expected at most "
-            f"{LARGEST_PARITY_ERROR:g}; nothing was written. Has the training diverged?"
+            f"{LARGEST_PARITY_ERROR:g}; nothing was written. Has the training diverged, or hardly begun?"
         )
     return errors[worst]

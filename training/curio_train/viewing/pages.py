@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from curio_train.drawing.album import MeshFiles, scene_context, scenes_of
+from curio_train.drawing.mesh_check import check_meshes
 from curio_train.drawing.photograph import photograph_of
 from curio_train.drawing.pictures import LIGHT, SceneContext
 from curio_train.drawing.scenes import Scene, mesh_world, scene_of_code
@@ -161,8 +162,7 @@ def _of_results(path: Path, opening: Opening) -> list[Page]:
         context = SceneContext.of_world(mesh_world(scene.world)) if scene.world else given
         if context is None:
             raise UsageError(f"{path}: detections do not hold the shape of the objects; add --mesh FILE or NAME=FILE")
-        for item in scene.objects:
-            context.mesh(item.kind)
+        check_meshes(scene, context)
         has_photograph = scene.photograph is not None
         image = photograph_of(scene) if has_photograph else np.zeros((scene.height, scene.width, 3), np.uint8)
         pages.append(Page(scene, context, image, over_image=has_photograph))

@@ -47,10 +47,12 @@ from curio_train.worlds.options import CaptureOptions
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.base_colors import MIDDLE_GREY, any_base_color, base_colors_near, srgb_of
 from curio_train.worlds.single_object.crop_pose_stage import MAX_LOG_SCALE
-from curio_train.worlds.single_object.two_stage import TwoStageWorld, frame_camera
+from curio_train.worlds.single_object.two_stage import LONGEST_SIDE_PX, TwoStageWorld, frame_camera
 from curio_train.worlds.single_object.viewpoints import upper_hemisphere_rotations
 from curio_train.worlds.single_object.world import Object
 from curio_train.worlds.tabletop.files import build_tabletop
+
+_SMALLEST_PX = 8.0  # of a part at its largest distance; a pose cannot be read from less
 
 
 class CapturePhotographs:
@@ -152,6 +154,7 @@ def _object(options: CaptureOptions, camera: Intrinsics, file: Path, slot: int) 
     center_m = found.point_left(of_file.box_corners_m.mean(axis=0)) if options.centered else np.zeros(3)
     mesh = of_file.moved(-center_m)
     _refuse_collision(options, file, mesh)
+    _refuse_invisible(options, file, of_file.diameter_m, camera)
     paint = None if options.paint is None else srgb_of(options.paint)
     kind = ObjectKind(
         file.stem,
@@ -196,6 +199,19 @@ def _refuse_collision(options: CaptureOptions, file: Path, mesh: Mesh) -> None:
         f"--near-m {options.near_m:g}: {file} reaches {reach:.3g} m from its middle, so the camera would be "
         f"inside it; expected more than {least:.3g} m. If the part is smaller than that, check --mesh-unit"
     )
+
+
+def _refuse_invisible(options: CaptureOptions, file: Path, diameter_m: float, camera: Intrinsics) -> None:
+    """Distances in millimetres make objects of less than a pixel."""
+    matrix = frame_camera(camera).matrix
+    assert matrix is not None  # it has a pinhole camera
+    size_px = float(matrix[0, 0]) * diameter_m / options.far_m
+    if size_px < _SMALLEST_PX:
+        raise UsageError(
+            f"--far-m {options.far_m:g}: at this distance {file}, whose diameter is {diameter_m:.3g} m, is "
+            f"{size_px:.2g} pixels large in frames of {LONGEST_SIDE_PX}; expected at least {_SMALLEST_PX:g}. "
+            "--near-m and --far-m are in metres; check --mesh-unit, too"
+        )
 
 
 def _backgrounds(options: CaptureOptions, camera: Intrinsics, cache: Path) -> Backgrounds:

@@ -4,6 +4,7 @@ A model's ONNX file cannot be trained further: batch norm is folded into the con
 shares constants. So each version also stores the network as it was trained, in ``weights.safetensors``.
 """
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.two_stage.network import TwoStageNetwork
 
 _IMAGES, _SECONDS, _SYNTHETIC_LABELS = "images_seen", "training_seconds", "synthetic_labels"
+_MESSAGE_LENGTH = 160
 
 
 def begin_with(state: TrainState, path: Path) -> None:
@@ -51,10 +53,15 @@ def begin_with(state: TrainState, path: Path) -> None:
         network.load_state_dict(_without_drawn(network, tensors) | _kept(network, tensors))
     except RuntimeError as exc:
         raise UsageError(
-            f"--init {path}: its network does not fit this world ({str(exc).splitlines()[-1].strip()}); "
+            f"--init {path}: its network does not fit this world ({_first_difference(exc)}); "
             "expected a run or a model of the same world and the same network flags, such as --two-stage"
         ) from exc
     state.progress.images_before, state.progress.seconds_before = images, seconds
+
+
+def _first_difference(exc: RuntimeError) -> str:
+    """The last line of torch's message, without the names of all parameters that are missing or too many."""
+    return textwrap.shorten(str(exc).splitlines()[-1], _MESSAGE_LENGTH, placeholder=" …")
 
 
 def weights_file(state: TrainState, config: RunConfig, *, half: bool) -> bytes:

@@ -13,7 +13,7 @@ from curio_train.capture.plane import CameraPoseFile, changed_pixels, points_on_
 from curio_train.data.bop import ModelInfo
 from curio_train.data.part_color import is_unpainted
 from curio_train.data.photographs import Photographs, read_frames
-from curio_train.errors import DataError
+from curio_train.errors import CameraError, DataError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import Mesh, load_mesh
 from curio_train.meshes.symmetries import Symmetries, find_symmetries
@@ -26,6 +26,7 @@ from curio_train.worlds.single_object.world import resized
 from curio_train.worlds.tabletop.world import Part, TabletopPhotographs, TabletopWorld
 
 SIDE_PX = 128
+_SMALLEST_PX = 2.0  # smaller parts are no more than noise, and their files are of another unit
 _OFF_AXIS = 0.01  # of the diameter; symmetries are not found exactly enough to correct the box's middle by less
 _UP = np.array([0.0, 1.0, 0.0])
 _PARALLEL, _LEVEL = 0.999, 0.04  # cosine of the angle between an axis and the vertical: the same, and across it
@@ -68,9 +69,25 @@ def build_tabletop(options: CaptureOptions) -> TabletopWorld:
         ground_srgb=GROUND_SRGB,
         outline_samples=OUTLINE_SAMPLES,
     )
+    _refuse_invisible(setup, max(part.kind.diameter_m for part in parts), options.plane)
     highest_m = max(part.radius_m for part in parts) if options.lying else 0.0
     photographs = _photographs(options, options.background, cameras, intrinsics, setup, highest_m)
     return TabletopWorld(parts, setup, photographs, lying=options.lying, blur_px=options.blur_px)
+
+
+def _refuse_invisible(setup: SceneSetup, diameter_m: float, file: Path) -> None:
+    """Camera poses in millimetres make parts of less than a pixel."""
+    matrix, pose = setup.camera.matrix, setup.cam_from_world
+    assert matrix is not None  # it has a pinhole camera
+    height_m = float(-(pose.rotation.T @ pose.translation_m)[1])
+    distance_m = height_m / -float(pose.rotation[2, 1])  # along the optical axis, to the plane
+    size_px = float(matrix[0, 0]) * diameter_m / distance_m
+    if size_px < _SMALLEST_PX:
+        raise CameraError(
+            f"--plane {file}: the camera is {distance_m:.3g} m away from the plane, so the largest part, whose "
+            f"diameter is {diameter_m:.3g} m, is {size_px:.2g} pixels large in images of {SIDE_PX}; expected at least "
+            f"{_SMALLEST_PX:g}. cam_from_world is in metres; check --mesh-unit, too"
+        )
 
 
 def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_count: int) -> Part:
