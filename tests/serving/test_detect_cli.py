@@ -48,7 +48,14 @@ def test_a_folder_a_version_and_a_file_are_the_same_model(models_dir: Path, fram
     ("changes", "told"),
     [
         ({"model": "models/none"}, "no such folder or file, nor HOST:PORT/NAME"),
+        ({"model": "127.0.0.1:8500"}, "which model of that server"),
         ({"images": ()}, "no images given"),
+        (
+            {"model": "frames", "images": ("flat",)},
+            "frames is no model; models come first, and then images: flat frames",
+        ),
+        ({"camera": Path("frames")}, "--camera: camera file frames cannot be read: Is a directory"),
+        ({"camera": Path("frames/000000.png")}, "is no text; expected JSON or YAML"),
         ({"images": ("missing.png",)}, "missing.png: no such file"),
         ({"model": "pinhole"}, "--camera FILE"),
         ({"model": "pinhole", "images": (), "video": "clip.mp4", "out": None}, "--camera FILE"),

@@ -107,7 +107,7 @@ def test_missing_and_folder(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match="cannot be read"):
         load_mesh(tmp_path / "none.ply")
     (tmp_path / "folder.ply").mkdir()
-    with pytest.raises(MeshError, match="cannot be read"):
+    with pytest.raises(MeshError, match=r"folder\.ply: is a folder"):
         load_mesh(tmp_path / "folder.ply")
 
 

@@ -1,6 +1,7 @@
 """curio-view of run folders: newer checkpoints, edits that they must not lose, and the frames of parts on a plane."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ import trimesh
 from curio_train.drawing import pictures
 from curio_train.drawing.album import MeshFiles
 from curio_train.drawing.pictures import RenderOptions, picture
+from curio_train.errors import UsageError
 from curio_train.evaluation.subject import load_subject
 from curio_train.geometry import camera_looking_at
 from curio_train.rendering.renderer import Renderer
@@ -83,6 +85,11 @@ def test_a_large_picture_is_drawn_in_rounds(tmp_path: Path, monkeypatch: pytest.
     parts = picture(page.scene, page.context, RenderOptions()).astype(np.float64)
     assert len(set(rounds)) > 3
     assert np.abs(parts - whole).mean() < 0.5
+
+
+def test_a_folder_of_runs_is_no_folder_of_photographs(plane: Path) -> None:
+    with pytest.raises(UsageError, match=re.escape(f"{plane.parent}: holds runs; give one of them, such as {plane}")):
+        open_pages(Opening(str(plane.parent)))
 
 
 def test_an_edited_scene_of_a_run_is_opened_again(plane: Path, tmp_path: Path) -> None:

@@ -196,6 +196,8 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
             continue
         served = SERVED_MODEL.fullmatch(model)
         if served is None:
+            if SERVED_MODEL.fullmatch(f"{model.rstrip('/')}/NAME"):
+                raise UsageError(f"MODEL {model}: which model of that server? Expected {model.rstrip('/')}/NAME")
             raise UsageError(
                 f"MODEL {model}: no such folder or file, nor HOST:PORT/NAME of a server; expected a folder that "
                 "curio-export wrote, such as models/ape"

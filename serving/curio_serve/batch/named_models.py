@@ -22,12 +22,14 @@ def split_models(first: str, rest: Sequence[str]) -> tuple[tuple[str, ...], tupl
         rest: The others; those at their beginning that are models are taken as such.
 
     Raises:
-        UsageError: A model is named twice.
+        UsageError: A model is named twice, or after the images.
         CurioError: A model on a hub cannot be had.
     """
     count = 0
     while count < len(rest) and _names_models(rest[count]):
         count += 1
+    if count and count == len(rest) and os.path.exists(first) and not _names_models(first):
+        raise UsageError(f"{first} is no model; models come first, and then images: {' '.join((*rest, first))}")
     models = tuple(model for argument in (first, *rest[:count]) for model in _expanded(argument))
     places = [os.path.realpath(model) if os.path.exists(model) else model for model in models]
     twice = next((model for number, model in enumerate(models) if places[number] in places[:number]), None)

@@ -68,8 +68,10 @@ def read_camera_file(path: str | Path) -> CameraFile:
     path = Path(path)
     try:
         text = read_file(path, MAX_BYTES).decode("utf-8")
-    except (OSError, UnicodeDecodeError) as exc:
-        raise CameraError(f"camera file {path} cannot be read: {exc}") from exc
+    except OSError as exc:
+        raise CameraError(f"camera file {path} cannot be read: {exc.strerror}") from exc
+    except ValueError as exc:
+        raise CameraError(f"camera file {path} is no text; expected JSON or YAML") from exc
     try:
         if path.suffix.lower() in (".yml", ".yaml"):
             return CameraFile(path, _from_yaml(text), {})

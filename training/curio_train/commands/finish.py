@@ -21,7 +21,12 @@ MODELS_FOLDER = "models"
 
 
 def end(
-    run: Path, config: RunConfig, cache: Path, warn: Callable[[str], None], ahead: "TracingAhead | None" = None
+    run: Path,
+    config: RunConfig,
+    cache: Path,
+    warn: Callable[[str], None],
+    say: Callable[[str], None],
+    ahead: "TracingAhead | None" = None,
 ) -> str:
     """Write the report and, of one's own part, the next version of RUN/models/NAME.
 
@@ -30,6 +35,7 @@ def end(
         config: Its configuration.
         cache: Where worlds keep their image sets.
         warn: Called with the reason if the report could not be made; the run has succeeded all the same.
+        say: Called with what is done next, because each takes up to minutes.
         ahead: Traces the graph of its model, if that was begun before. A further process then makes the report.
 
     Returns:
@@ -41,14 +47,17 @@ def end(
     from curio_train.evaluation.reporting.report import REPORT_FILE, report_training
 
     if isinstance(config.world, CaptureOptions) and ahead is not None:
+        say(f"{run}: writing report and model")
         with SecondProcess(report_training, run, cache) as reporting:
             told = functools.cache(lambda: _told(reporting.result, warn))
             return _exported(run, config.world.camera, told, ahead.model)
+    say(f"{run}: writing the report")
     try:
         verdict = report_training(run, cache)
     except CurioError as exc:
         verdict = _told(exc, warn)
     if isinstance(config.world, CaptureOptions):
+        say(f"{run}: writing the model, which takes a minute or two")
         return _exported(run, config.world.camera, lambda: verdict)
     viewed = "" if config.world.is_flat else f", or curio-view {run}"
     return (

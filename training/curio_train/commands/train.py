@@ -222,7 +222,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
             is_old = session.resume is not None
             seconds = draw_templates(config, path, session.cache, num_threads, resume=is_old).seconds
             print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
-            report(end(path, config, session.cache, warn, ahead))
+            report(end(path, config, session.cache, warn, report, ahead))
         return 0
     report(f"{path}: preparing images and renderer, which takes a minute or so where it was not done before")
     outcome, progress = learn(
@@ -240,7 +240,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         if outcome is Outcome.INTERRUPTED:
             print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
         else:
-            report(end(path, config, session.cache, warn))
+            report(end(path, config, session.cache, warn, report))
     if outcome is Outcome.INTERRUPTED and interruption.signum is not None:
         return 128 + interruption.signum
     return 0

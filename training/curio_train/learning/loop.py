@@ -53,6 +53,8 @@ def train(
             if outcome or seconds - saved_at >= 60 * checkpoint_minutes:
                 trainer.synthetic.wait_idle()
                 if outcome and outcome is not Outcome.INTERRUPTED and progress.finished_step != progress.step:
+                    if reporter and config.terms.knows_codes:
+                        reporter.say(f"{outcome.value}; now the confidence is calibrated, which may take minutes")
                     finish()
                     progress.finished_step = progress.step
                 if reporter:

@@ -158,6 +158,8 @@ def _from_cad(path: Path, content: bytes, unit: Unit | None, body: str | None) -
 
 
 def _read(path: Path) -> bytes:
+    if path.is_dir():
+        raise MeshError(f"{path}: is a folder; expected a mesh file")
     if path.suffix.lower() not in SUFFIXES:
         raise MeshError(f"{path}: unknown kind of mesh {path.suffix!r}; expected one of {' '.join(SUFFIXES)}")
     try:

@@ -174,6 +174,9 @@ def _of_results(path: Path, opening: Opening) -> list[Page]:
 def _of_photographs(path: Path, opening: Opening) -> list[Page]:
     """Read photographs with ``curio-detect``, in a process of its own, and open its result file."""
     if opening.model is None:
+        runs = sorted(str(file.parent) for file in path.glob(f"*/{CONFIG_FILE}"))
+        if runs:
+            raise UsageError(f"{path}: holds runs; give one of them, such as {runs[0]}")
         raise UsageError(f"{path}: photographs are read by a model: add --model MODEL (and --camera FILE)")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "found.jsonl"

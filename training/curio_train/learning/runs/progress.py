@@ -93,6 +93,10 @@ class Reporter:
             (self._run / "samples.png").write_bytes(png.tobytes())
             self._write({IMAGE_ERROR: error})
 
+    def say(self, text: str) -> None:
+        """Print a line beside the bar, about what takes long and is no step."""
+        self._console.print(text, soft_wrap=True, markup=False)
+
     def close(self) -> None:
         """Write what is not yet on disk, and end the bar."""
         if self._bar is not None:
