@@ -3,11 +3,9 @@
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
-from itertools import zip_longest
 from pathlib import Path
 
 from curio_proto.v1.detector_pb2 import DetectResponse
@@ -17,7 +15,8 @@ from curio_serve.batch.checks import named_recordings, refuse_images
 from curio_serve.batch.images.parallel import in_order
 from curio_serve.batch.images.remote_files import is_url
 from curio_serve.batch.images.source_image import SourceImage, Topics
-from curio_serve.batch.images.sources import ANY_TOPICS, PassedOver, images
+from curio_serve.batch.images.sources import PassedOver, images
+from curio_serve.batch.instants import Instants, RigImage, refuse_other_images
 from curio_serve.batch.progress import Progress
 from curio_serve.batch.results.formats import ImageLines, ImageResult, JsonLines
 from curio_serve.batch.results.result_file import ResultFile
@@ -32,16 +31,6 @@ from curio_serve.rigs.detect_views import RigView, detect_views
 from curio_serve.rigs.rig import RigCamera, read_rig_file
 
 _OF_ONE_INSTANT = (ImageError, CameraError, ArgumentError, InternalError)
-
-
-@dataclass(frozen=True)
-class RigImage:
-    """The images of all cameras at one instant."""
-
-    name: str
-    """Name of the first camera's image."""
-    images: tuple[SourceImage, ...]
-    """One image of each camera, in the rig's order."""
 
 
 class RigEstimator:
@@ -133,26 +122,8 @@ def read_rig(arguments: DetectArguments, models: Sequence[str]) -> list[RigCamer
             f"--rig {arguments.rig} has {len(cameras)} cameras ({names}), found {len(arguments.images)} IMAGES; "
             "expected a folder, glob or video of each camera, in the file's order"
         )
+    refuse_other_images(arguments.images, cameras)
     return cameras
-
-
-def instants(arguments: Sequence[str], passed_over: PassedOver, topics: Topics = ANY_TOPICS) -> Iterator[RigImage]:
-    """The images of each instant. Those of each camera are taken in the order of their names.
-
-    Args:
-        arguments: One of each camera.
-        passed_over: Counts the other files.
-        topics: What to read of recordings.
-
-    Raises:
-        UsageError: One camera has more images than another.
-    """
-    for number, found in enumerate(zip_longest(*(images([argument], passed_over, topics) for argument in arguments))):
-        there = [image for image in found if image is not None]
-        if len(there) < len(arguments):
-            ended = arguments[next(index for index, image in enumerate(found) if image is None)]
-            raise UsageError(f"--rig: {ended} has {number} images, others have more; expected as many of each camera")
-        yield RigImage(there[0].name, tuple(there))
 
 
 def answer_instant(estimators: Sequence[RigEstimator], form: JsonLines, instant: RigImage) -> ImageLines:
@@ -182,13 +153,14 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
     names = [(model.name, model.version) for model in opened]
     path = None if arguments.out is None else Path(arguments.out)
     with ResultFile(path, form, names, overwrite=arguments.overwrite) as output:
-        remaining = output.unanswered(instants(arguments.images, passed_over, topics))
+        taken = Instants([images([one], passed_over, topics) for one in arguments.images], arguments.images)
+        remaining = output.unanswered(iter(taken))
         results = in_order(partial(answer_instant, estimators, form), remaining, arguments.jobs)
         with closing(results), Progress(output.num_images, output.num_errors, is_shown=path is not None) as progress:
             for result in results:
                 output.write(result)
                 progress.count(result)
-        for line in passed_over.lines():
+        for line in (*passed_over.lines(), *taken.unpaired.lines()):
             print(f"curio-detect: {line}", file=sys.stderr)
         if output.num_images == 0:
             raise UsageError(f"--rig: no images in {' '.join(arguments.images)}")

@@ -87,8 +87,7 @@ def read_camera_file(path: str | Path) -> CameraFile:
 
 def _from_json(path: Path, content: Any) -> CameraFile:
     if isinstance(content, dict) and "camera_matrix" in content:
-        size, distortion = _size(content.get("width"), content.get("height")), _known_lens(content)
-        return CameraFile(path, PinholeCamera(_matrix(content["camera_matrix"]), distortion, size), {})
+        return CameraFile(path, camera_of_entry(content), {})
     if isinstance(content, dict) and (names := content.keys() & {"k", "K"}):
         return CameraFile(path, camera_of_info(content, names.pop()), {})
     if isinstance(content, dict) and {"fx", "fy", "cx", "cy"} <= content.keys():
@@ -103,6 +102,17 @@ def _from_json(path: Path, content: Any) -> CameraFile:
         f"unknown format with {found}; expected camera_matrix (3x3 rows) with width and height, "
         "BOP's fx, fy, cx, cy, or BOP's scene_camera.json with cam_K for each image"
     )
+
+
+def camera_of_entry(content: Mapping[str, Any]) -> PinholeCamera:
+    """The camera of our JSON: ``camera_matrix``, and where given ``width``, ``height`` and ``distortion``.
+
+    Raises:
+        CameraError: It is impossible, or has something about its lens that is not read.
+        TypeError: A value is of another kind; ValueError and OverflowError: a number cannot be read.
+    """
+    size, distortion = _size(content.get("width"), content.get("height")), _known_lens(content)
+    return PinholeCamera(_matrix(content["camera_matrix"]), distortion, size)
 
 
 def _matrix(values: Any) -> np.ndarray:

@@ -26,6 +26,7 @@ from curio_serve.models.object_frames import (
     transformed,
 )
 from curio_serve.models.reliability import region_status, status_of
+from curio_serve.rigs.rig import check_baselines
 
 if TYPE_CHECKING:
     from curio_serve.models.detector import Results
@@ -89,6 +90,7 @@ def detect_views(
 
     Raises:
         ArgumentError: The model is of a 2D world, or without rotations.
+        CameraError: Cameras are too far apart for their places to be in metres.
         As :meth:`~curio_serve.models.detector.Detector.detect`.
     """
     model = detector.model
@@ -96,6 +98,7 @@ def detect_views(
         raise ArgumentError(f"model {model.label} is of a 2D world, which several cameras cannot see")
     if not any(field.name in ("rotation", "rotation_6d") for field in model.spec.fields):
         raise ArgumentError(f"model {model.label} answers no rotations, which the poses of several cameras need")
+    check_baselines([view.cam_from_rig for view in views], "views")
     kinds = {kind.name: kind for kind in model.spec.objects}
     seen = [one for number, view in enumerate(views) for one in _whole(detector, number, view, kinds, before_run)]
     found: list[tuple[float, Consensus, list[_Seen]]] = []

@@ -18,12 +18,14 @@ import numpy as np
 from curio_serve.errors import CameraError
 from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.camera_files import camera_of_entry
 
 Array = np.ndarray
 LEAST_VIEWS, MOST_VIEWS = 2, 16
 _MAX_BYTES = 1 << 20
 _TOLERANCE = 1e-3  # of a rotation's entries, as files round them
 _FARTHEST_M = 1e4
+_FARTHEST_APART_M = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,22 +56,39 @@ def read_rig_file(path: str | Path) -> list[RigCamera]:
     if not isinstance(entries, list) or not LEAST_VIEWS <= len(entries) <= MOST_VIEWS:
         num = len(entries) if isinstance(entries, list) else "no list of"
         raise CameraError(f'{path} has {num} cameras under "cameras"; expected {LEAST_VIEWS} to {MOST_VIEWS}')
-    return [_rig_camera(entry, f"{path}: cameras[{number}]", number) for number, entry in enumerate(entries)]
+    cameras = [_rig_camera(entry, f"{path}: cameras[{number}]", number) for number, entry in enumerate(entries)]
+    check_baselines([camera.cam_from_rig for camera in cameras], str(path))
+    return cameras
+
+
+def check_baselines(cam_from_rig: Sequence[Array], where: str) -> None:
+    """Refuse cameras that are too far apart to see the same object: their places are in another unit than metres.
+
+    Args:
+        cam_from_rig: Of each camera, [4, 4].
+        where: For messages.
+
+    Raises:
+        CameraError: Names two cameras by their numbers.
+    """
+    places_m = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in cam_from_rig])
+    apart_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
+    first, second = np.unravel_index(apart_m.argmax(), apart_m.shape)
+    if apart_m[first, second] > _FARTHEST_APART_M:
+        raise CameraError(
+            f"{where}: cameras {first} and {second} are {apart_m[first, second]:.4g} m apart, expected at most "
+            f"{_FARTHEST_APART_M:g}; cam_from_rig is in metres: are these millimetres?"
+        )
 
 
 def _rig_camera(entry: Any, where: str, number: int) -> RigCamera:
     if not isinstance(entry, Mapping) or not {"camera_matrix", "cam_from_rig"} <= entry.keys():
         raise CameraError(f"{where} is no object with camera_matrix and cam_from_rig")
-    size = entry.get("width"), entry.get("height")
     try:
-        matrix = np.array(entry["camera_matrix"], float)
+        camera = camera_of_entry(entry)
         pose = np.array(entry["cam_from_rig"], float)
-        distortion = tuple(float(value) for value in entry.get("distortion") or ())
-        known = (int(size[0]), int(size[1])) if size[0] is not None and size[1] is not None else None
     except (TypeError, ValueError, OverflowError) as exc:
         raise CameraError(f"{where} has values that are no numbers: {exc}") from exc
-    try:
-        camera = PinholeCamera(matrix, distortion, known)
     except CameraError as exc:
         raise CameraError(f"{where}: {exc}") from exc
     return RigCamera(str(entry.get("name", number)), camera, check_cam_from_rig(pose, f"{where}.cam_from_rig"))

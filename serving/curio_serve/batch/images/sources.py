@@ -1,16 +1,18 @@
 """Lists the images that a command line names by files, folders, globs, videos, recordings or a list, one at a time.
 
-The order is the order of the arguments, and inside a folder that of the names. Nothing here grows with the number of
+The order is the order of the arguments, and inside a folder that of the names, where numbers count by their value:
+``frame10.png`` follows ``frame9.png``. Only an object store gives its own order. Nothing here grows with the number of
 images: a folder of a million is listed in batches, and a video is read as it is used.
 """
 
 import glob
 import heapq
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from curio_serve.batch.images.remote_files import files_of, is_store, is_url, path_of
 from curio_serve.batch.images.source_image import SourceImage, Topics
@@ -28,6 +30,8 @@ STANDARD_INPUT = "-"
 _NAMED = 20  # files passed over that are named; the others are counted
 _HEIC = (".heic", ".heif")
 _NAMES_A_PASS = 1 << 16
+_NUMBER = re.compile(r"(\d+)")
+_Place = tuple[list[Any], str]
 _STDIN_BYTES = 1 << 16
 _BOP_SCENE_FILES = ("scene_camera.json", "scene_gt.json")
 _BOP_IMAGE_FOLDERS = ("rgb", "gray")
@@ -134,7 +138,7 @@ def matching_paths(argument: str) -> list[str]:
     Args:
         argument: As on the command line.
     """
-    return [argument] if os.path.exists(argument) else sorted(glob.iglob(argument, recursive=True))
+    return [argument] if os.path.exists(argument) else sorted(glob.iglob(argument, recursive=True), key=_place)
 
 
 def names_recordings(argument: str) -> bool:
@@ -230,22 +234,31 @@ def _sorted_entries(folder: str, passed_over: PassedOver) -> Iterator[tuple[str,
 
     Each pass over the folder keeps the next names alone, so that memory does not depend on how many there are.
     """
-    last = ""
+    last: _Place | None = None
     while batch := heapq.nsmallest(_NAMES_A_PASS, _entries_after(folder, last, passed_over)):
-        yield from batch
+        yield from ((place[-1], is_folder) for place, is_folder in batch)
         last = batch[-1][0]
 
 
-def _entries_after(folder: str, last: str, passed_over: PassedOver) -> Iterator[tuple[str, bool]]:
+def _place(name: str) -> _Place:
+    """What a name is sorted by: its texts, with the numbers between them as such, and then itself (01 is not 1)."""
+    parts: list[Any] = _NUMBER.split(name)
+    parts[1::2] = map(int, parts[1::2])
+    return parts, name
+
+
+def _entries_after(folder: str, last: _Place | None, passed_over: PassedOver) -> Iterator[tuple[_Place, bool]]:
     with os.scandir(folder) as entries:
         for entry in entries:
             is_hidden, is_folder = entry.name.startswith("."), entry.is_dir(follow_symlinks=False)
             is_image = not is_hidden and os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES
             leads_to_folder = _leads_to_folder(entry)
-            if not is_image and not last and not leads_to_folder:  # in the first pass alone
+            if not is_image and last is None and not leads_to_folder:  # in the first pass alone
                 passed_over.file(entry.name)
-            if entry.name > last and ((is_folder and not is_hidden) or (is_image and not leads_to_folder)):
-                yield entry.name, is_folder
+            if (is_folder and not is_hidden) or (is_image and not leads_to_folder):
+                place = _place(entry.name)
+                if last is None or place > last:
+                    yield place, is_folder
 
 
 def _leads_to_folder(entry: os.DirEntry[str]) -> bool:
