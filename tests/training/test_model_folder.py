@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from curio_serve.models.model_folder import is_model_name
 from curio_train.errors import ExportError
 from curio_train.export.folder import ModelFolder
 
@@ -44,3 +45,19 @@ def test_a_version_that_cannot_be_put_in_place_leaves_the_sums(tmp_path: Path, m
     with pytest.raises(ExportError, match="No space left on device"):
         folder.add(2, {"model.onnx": b"faster"}, "config", "second")
     assert (tmp_path / "one" / "SHA256SUMS").read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("ape", "ape"),
+        ("Träger links", "Trager-links"),
+        (".hidden", "hidden"),
+        ("部品", "part"),
+        ("a" * 70, "a" * 64),
+        ("bracket_v1.2", "bracket_v1.2"),
+    ],
+)
+def test_names_of_files_become_names_of_models(text: str, name: str) -> None:
+    assert ModelFolder.fitting_name(text) == name
+    assert is_model_name(name)

@@ -35,6 +35,9 @@ def cup() -> Mesh:
     ("mesh", "num_discrete", "num_continuous"),
     [
         pytest.param(shapes.box((0.03, 0.05, 0.08)), 3, 0, id="box"),
+        pytest.param(shapes.box((0.1, 0.092, 0.04)), 3, 0, id="almost square box"),
+        pytest.param(shapes.box((0.034, 0.078, 0.071)), 3, 0, id="box with two almost equal moments"),
+        pytest.param(shapes.box((0.1, 0.1, 0.04)), 7, 0, id="square box"),
         pytest.param(prism(4, 0.09), 7, 0, id="square prism"),
         pytest.param(prism(6, 0.09), 11, 0, id="hexagonal prism"),
         pytest.param(shapes.cone(0.03, 0.08), 0, 1, id="cone"),
@@ -47,6 +50,11 @@ def cup() -> Mesh:
 def test_groups_of_known_shapes(mesh: Mesh, num_discrete: int, num_continuous: int) -> None:
     found = find_symmetries(mesh)
     assert (len(found.discrete), len(found.continuous)) == (num_discrete, num_continuous)
+
+
+def test_flips_of_a_box_leave_its_middle() -> None:
+    for motion in find_symmetries(shapes.box((0.1, 0.1, 0.04))).discrete:
+        assert np.linalg.norm(motion[:3, 3]) < 1e-6
 
 
 def test_motions_are_of_the_object_frame_wherever_its_origin_lies() -> None:

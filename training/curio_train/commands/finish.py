@@ -1,6 +1,7 @@
 """What a finished run leaves beside itself: a report, and of one's own part a model that can be served."""
 
 import functools
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -89,12 +90,13 @@ def _exported(
     except CurioError as exc:
         raise ExportError(
             f"{run} is trained and whole, but no model could be made of it ({exc}). Once that is put right: "
-            f"curio-export {run} --out {models}"
+            f"{shlex.join(['curio-export', str(run), '--out', str(models)])}"
         ) from exc
     said = verdict()
     return (
         f"{done.path}: the model, {done.num_bytes / 1e6:.1f} MB; what it finds in the photographs: {run}/report.html\n"
         + (f"by its photographs, without labels: {said}\n" if said else "")
-        + f"to serve it: curio-serve {models}\n"
-        f"to try it:   curio-detect {done.path.parent} PHOTOS --camera {camera} --out poses.jsonl --overlays overlays/"
+        + f"to serve it: curio-serve {shlex.quote(str(models))}\n"
+        f"to try it:   curio-detect {shlex.quote(str(done.path.parent))} PHOTOS --camera {shlex.quote(str(camera))} "
+        "--out poses.jsonl --overlays overlays/"
     )

@@ -56,7 +56,8 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
 
         for doubt in refuse_unfit(options, self_training=config.recipe.self_training > 0):
             warn(doubt)
-        return replace(config, world=_with_paint(options, report), network=_usual_network(config, options))
+        options = _with_sha256(_with_judged(_with_paint(options, report)))
+        return replace(config, world=options, network=_usual_network(config, options))
     return config
 
 
@@ -133,6 +134,27 @@ def _refuse_unreadable(options: LinemodOptions) -> None:
         read_frame(path, camera)
     if options.views is not None:
         read_camera_poses(options.views, paths)
+
+
+def _with_sha256(options: CaptureOptions) -> CaptureOptions:
+    """Note which mesh files the run is of."""
+    from curio_train.meshes.meshes import load_mesh
+
+    meshes = [load_mesh(file, options.mesh_unit, options.body) for file in options.mesh]
+    return replace(options, mesh_sha256=tuple(mesh.sha256 for mesh in meshes))
+
+
+def _with_judged(options: CaptureOptions) -> CaptureOptions:
+    """In free space, choose the photographs that judge the model, and set their names."""
+    from curio_train.camera import load_intrinsics
+    from curio_train.worlds.capture import CapturePhotographs
+    from curio_train.worlds.single_object.two_stage import frame_camera
+
+    if options.plane is not None:
+        return options
+    camera = load_intrinsics(options.camera)
+    photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera))
+    return replace(options, judged=photographs.names_judged())
 
 
 def _with_paint(options: CaptureOptions, report: Callable[[str], None]) -> CaptureOptions:

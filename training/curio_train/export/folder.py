@@ -14,8 +14,10 @@
 
 import hashlib
 import os
+import re
 import secrets
 import shutil
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -34,6 +36,7 @@ from curio_train.exported_model import WEIGHTS_FILE
 _CARD = "CARD.md"
 _LISTED = (MODEL_FILE, GOLDEN_FILE, WEIGHTS_FILE, RELIABILITY_FILE)
 _MAX_BATCH_SIZE = 64
+_NOT_IN_NAMES, _LONGEST_NAME = re.compile(r"[^A-Za-z0-9_.-]+"), 64
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,12 @@ class ModelFolder:
                 "--name or --out"
             )
         return folder
+
+    @staticmethod
+    def fitting_name(text: str) -> str:
+        """A model's name made of another, such as a file's: ``Trager-links`` of ``Träger links``."""
+        plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+        return _NOT_IN_NAMES.sub("-", plain).strip("-.")[:_LONGEST_NAME] or "part"
 
     def versions(self) -> list[int]:
         """Versions that are there, ascending."""

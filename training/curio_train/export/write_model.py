@@ -87,7 +87,7 @@ def export(
     Args:
         run: The run folder. Its training images are not needed.
         out: Folder of models.
-        name: Of the model; the world's choice unless given (a LineMOD model is named after its class).
+        name: Of the model; unless given, made of the object's: a LineMOD class or the name of a mesh file.
         half: Store weights as float16, half as large; they are computed with in float32.
         fast: Let a detector for several objects look at each in one crop a pass.
         reduce: Applied to the float32 graph once that agrees with torch; stores the rest as ``half`` says.
@@ -101,7 +101,7 @@ def export(
     """
     folder = RunFolder.open(run)
     world = build(folder.config.world)
-    target = ModelFolder.named(out, world.model_name if name is None else name)
+    target = ModelFolder.named(out, ModelFolder.fitting_name(world.model_name) if name is None else name)
     state = folder.trained(world)
     if fast:
         _look_less(state.pose.network, run)

@@ -6,19 +6,21 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import SimpleMaterial
 
 from curio_train.errors import MeshError
 
 _TRIMESH_DEFAULT_COLOR = (102, 102, 102)
+_BESIDE = 0.01  # of a texture's side, by which coordinates may leave it
 
 
 def joined(path: Path, scene: Any) -> Any:
     """The parts of a scene as one mesh.
 
     Textures are packed into one, with a patch for every part of a single colour. Where a part has several colours
-    of its own, vertices get the colours that the textures of the others have there.
+    of its own, or one of several textures repeats, vertices get the colours that the textures have there.
 
     Args:
         path: The file, for errors.
@@ -71,6 +73,8 @@ def _tell_apart(path: Path, parts: Sequence[Any]) -> None:
 
 def _decoded(path: Path, image: Any) -> Any:
     try:
+        if image.mode.startswith("I"):  # 16 bits a pixel, which Pillow would clip
+            return Image.fromarray((np.asarray(image) / 257).round().astype(np.uint8)).convert("RGB")
         return image.convert("RGB")  # decodes only now
     except (OSError, ValueError) as exc:
         raise MeshError(f"{path}: its texture cannot be decoded ({exc})") from exc
@@ -82,12 +86,21 @@ def _make_alike(parts: Sequence[Any]) -> None:
     others = [part for part in parts if part.visual.kind != "texture"]
     if not textured:
         return
-    if all(_num_colors(part) == 1 for part in others):
+    can_pack = len({id(part.visual.material) for part in textured}) + len(others) == 1 or not any(
+        map(_repeats, textured)
+    )
+    if can_pack and all(_num_colors(part) == 1 for part in others):
         for part in others:
             part.visual = TextureVisuals(material=SimpleMaterial(diffuse=part.visual.vertex_colors[0]))
     else:
         for part in textured:
             part.visual = part.visual.to_color()
+
+
+def _repeats(part: Any) -> bool:
+    """Whether its texture is laid side by side, which cannot be packed with others."""
+    uv = np.asarray(part.visual.uv)
+    return bool(uv.min(initial=0) < -_BESIDE or uv.max(initial=1) > 1 + _BESIDE)
 
 
 def _num_colors(part: Any) -> int:

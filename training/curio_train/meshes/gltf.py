@@ -1,12 +1,20 @@
 """glTF files as scenes with colours in sRGB: the file has its textures in sRGB, all other colours in linear light."""
 
 import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 
+from curio_train.errors import MeshError
+
 GLTF_SUFFIXES = (".glb", ".gltf")
+
+_READABLE = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")  # beginnings of names of extensions
+_FLOAT32 = 5126
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -30,6 +38,53 @@ def read_gltf(content: bytes, kind: str, resolver: trimesh.resolvers.Resolver) -
     for part in described["geometry"].values():
         _encode(part)
     return trimesh.load_scene(described)
+
+
+def refuse_unread(path: Path, content: bytes, kind: str) -> None:
+    """Refuse a file with something that trimesh passes over without a word, and that changes shape or texture.
+
+    Args:
+        path: The file, for errors.
+        content: Its content.
+        kind: ``glb`` or ``gltf``.
+
+    Raises:
+        MeshError: Says what it is.
+        ValueError: The file is damaged; as LookupError, TypeError and AttributeError.
+    """
+    file = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")] if kind == "glb" else content)
+    for found in _unread(file):
+        raise MeshError(f"{path}: has {found}, which curio does not read; export it without, uncompressed")
+
+
+def _unread(file: dict[str, Any]) -> Iterator[str]:
+    for name in file.get("extensionsRequired", ()):
+        if not name.startswith(_READABLE):
+            yield f"the extension {name}"
+    for primitive in (primitive for mesh in file.get("meshes", ()) for primitive in mesh["primitives"]):
+        used = {name: file["accessors"][number] for name, number in primitive["attributes"].items()}
+        used |= {"indices": file["accessors"][primitive["indices"]]} if "indices" in primitive else {}
+        for name, accessor in used.items():
+            if "sparse" in accessor:
+                yield f"a sparse accessor ({name})"
+        texture = _texture(file, primitive)
+        if texture is None:
+            continue
+        if "KHR_texture_transform" in texture.get("extensions", ()):
+            yield "a texture with KHR_texture_transform"
+        if texture.get("texCoord", 0) != 0:
+            yield f"a texture with other coordinates than the first (TEXCOORD_{texture['texCoord']})"
+        if used.get("TEXCOORD_0", {}).get("componentType", _FLOAT32) != _FLOAT32:
+            yield "texture coordinates that are whole numbers"
+
+
+def _texture(file: dict[str, Any], primitive: dict[str, Any]) -> dict[str, Any] | None:
+    """The texture of a primitive's colours, if it has one."""
+    if "material" not in primitive:
+        return None
+    rough = file["materials"][primitive["material"]].get("pbrMetallicRoughness", {})
+    found: dict[str, Any] | None = rough.get("baseColorTexture")
+    return found
 
 
 def _encode(part: dict[str, Any]) -> None:

@@ -6,6 +6,7 @@ Units are settled here, once: nothing behind :func:`load_mesh` knows millimetres
 import dataclasses
 import hashlib
 import io
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,8 +21,9 @@ from curio_train.errors import MeshError, UsageError
 from curio_train.meshes.appearance import appearance, joined
 from curio_train.meshes.beside import Beside
 from curio_train.meshes.cad import CAD_SUFFIXES, read_cad
+from curio_train.meshes.color_range import refuse_bytes_as_fractions
 from curio_train.meshes.extent import box_corners, diameter
-from curio_train.meshes.gltf import GLTF_SUFFIXES, read_gltf
+from curio_train.meshes.gltf import GLTF_SUFFIXES, read_gltf, refuse_unread
 
 Unit = Literal["m", "cm", "mm", "inch"]
 METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
@@ -30,6 +32,7 @@ MAX_BYTES = 1 << 28  # of a mesh, a material or a texture; in memory a mesh take
 SUFFIXES = (".ply", ".obj", ".stl", *GLTF_SUFFIXES, ".off", *CAD_SUFFIXES)
 
 # What trimesh's readers let through on damaged files, found by feeding them such.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # what it logs is told as errors here
 _READER_ERRORS = (
     *(ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError, OSError),
     *(MemoryError, ArithmeticError),
@@ -176,15 +179,18 @@ def _parse(path: Path, content: bytes) -> Any:
     resolver = Beside(path, MAX_BYTES)
     try:
         if kind in ("glb", "gltf"):
+            refuse_unread(path, content, kind)
             scene = read_gltf(content, kind, resolver)
         else:
+            refuse_bytes_as_fractions(path, content, kind)
             scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, process=False, resolver=resolver)
-        if kind != "ply":  # those have colours of vertices, as a rule
-            resolver.refuse_missing()
         points = [part for part in scene.geometry.values() if isinstance(part, trimesh.PointCloud)]
         if len(points) == len(scene.geometry) > 0:
             raise _no_surface(path, sum(len(cloud.vertices) for cloud in points))
-        return joined(path, scene)
+        mesh = joined(path, scene)
+        if kind != "ply" or mesh.visual.kind is None:  # a PLY file may have colours of vertices as well
+            resolver.refuse_missing()
+        return mesh
     except _READER_ERRORS as exc:
         # Without its optional packages for odd encodings trimesh names those; they would not make a mesh of garbage.
         reason = "garbled text" if isinstance(exc, ImportError) else exc
@@ -204,6 +210,8 @@ def _check(path: Path, loaded: Any) -> None:
     if low < 0 or high >= len(vertices):
         wrong = low if low < 0 else high
         raise MeshError(f"{path}: a face names vertex {wrong}, but there are {len(vertices)}; is the file complete?")
+    if not loaded.area > 0:
+        raise MeshError(f"{path}: its {len(faces)} faces have no area; export the surface of a solid")
 
 
 def _no_surface(path: Path, num_vertices: int) -> MeshError:

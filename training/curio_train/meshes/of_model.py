@@ -1,5 +1,7 @@
 """Whether a mesh is the one that a model learned."""
 
+from pathlib import Path
+
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectModel
 
@@ -33,6 +35,24 @@ def refuse_other_mesh(mesh: Mesh, kind: ObjectModel, label: str) -> None:
             f"{label}: its box is from {_point(mesh.box_corners_m.min(0))} to {_point(mesh.box_corners_m.max(0))}, "
             f"the model's from {_point(corners_m.min(0))} to {_point(corners_m.max(0))}; give the mesh that the model "
             "was trained with, in the same frame"
+        )
+
+
+def refuse_changed_mesh(mesh: Mesh, sha256: str | None, file: Path) -> None:
+    """Refuse a mesh file whose content is not what it was when a run began.
+
+    Args:
+        mesh: As it was read.
+        sha256: Of the file then, hexadecimal; None: not known.
+        file: Names the mesh in errors.
+
+    Raises:
+        MeshError: It has changed.
+    """
+    if sha256 is not None and mesh.sha256 != sha256:
+        raise MeshError(
+            f"{file}: is not the file that the run was trained with: its SHA-256 is {mesh.sha256[:12]}…, it was "
+            f"{sha256[:12]}…; put that file back, or train the new part"
         )
 
 

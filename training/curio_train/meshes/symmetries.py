@@ -118,12 +118,14 @@ def find_symmetries(mesh: Mesh) -> Symmetries:
 
 
 class _Surface:
-    """Points of a surface, and how far a turned copy lies from it; lengths in diameters, origin at the points' mean."""
+    """Points of a surface, and how far a turned copy lies from it; lengths in diameters, origin at its centroid."""
 
     def __init__(self, mesh: Mesh) -> None:
         shape = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
         points, faces = trimesh.sample.sample_surface(shape, _NUM_STILL, seed=0)
-        self._size, self.centre = mesh.diameter_m, np.asarray(points).mean(axis=0)
+        # Not the points' mean, which is off by a hundredth of the size: exact symmetries would move the surface so far.
+        self._size, self.centre = mesh.diameter_m, np.asarray(shape.centroid)
+        self._second_moments = _second_moments((np.asarray(shape.triangles) - self.centre) / self._size)
         self._still = (np.asarray(points) - self.centre) / self._size
         self._triangles = (np.asarray(shape.triangles)[faces] - self.centre) / self._size
         self._tree = cKDTree(self._still)
@@ -134,12 +136,13 @@ class _Surface:
         """Unit axes about which the shape may be symmetric, most promising first but for the principal axes.
 
         An axis of symmetry is a principal axis of inertia. Where moments are equal, principal axes are not unique and a
-        whole plane of directions, or all of them, must be searched.
+        whole plane of directions, or all of them, must be searched. Where they are almost equal, as those of a box with
+        sides of 78 and 71 mm, the principal axes are looked at as well: the search alone may take others near them.
         """
-        moments, axes = np.linalg.eigh(self._still.T @ self._still)
+        moments, axes = np.linalg.eigh(self._second_moments)
         low, high = moments[1] < moments[0] * (1 + _EQUAL_MOMENTS), moments[2] < moments[1] * (1 + _EQUAL_MOMENTS)
         unique = [axes[:, i] for i, shared in enumerate((low, low or high, high)) if not shared]
-        yield from unique
+        yield from axes.T
         if low and high:
             directions = _hemisphere(_NUM_DIRECTIONS)
         elif low or high:
@@ -191,7 +194,7 @@ class _Surface:
     def _fitted(self, axis: np.ndarray, angle: float) -> np.ndarray | None:
         """The axis near the given one about which that turn fits best (iterated closest points), or None.
 
-        The points' mean stays where it is under any symmetry, so the axis passes through it and only its direction is
+        The centroid stays where it is under any symmetry, so the axis passes through it and only its direction is
         sought.
         """
         rotation = _about(axis, angle)
@@ -232,6 +235,19 @@ class _Surface:
         result = np.eye(4)
         result[:3, :3], result[:3, 3] = rotation, self.centre - rotation @ self.centre
         return result
+
+
+def _second_moments(triangles: np.ndarray) -> np.ndarray:
+    """Integral of the points' outer products over a surface, [3, 3]; exact, where samples turn axes by degrees.
+
+    Args:
+        triangles: [n, 3, 3], the origin at the surface's centroid.
+    """
+    areas = trimesh.triangles.area(triangles)
+    sums = triangles.sum(axis=1)
+    products = np.einsum("nci,ncj->nij", triangles, triangles) + sums[:, :, None] * sums[:, None]
+    moments: np.ndarray = (areas[:, None, None] * products).sum(axis=0) / 12
+    return moments
 
 
 def _about(axis: np.ndarray, angle: float) -> np.ndarray:

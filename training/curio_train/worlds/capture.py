@@ -16,7 +16,7 @@ Images are rendered without end, as for LineMOD. What a data set's authors publi
 Parts on a plane are the world of ``tabletop``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -41,6 +41,7 @@ from curio_train.data.photographs import (
 from curio_train.errors import UsageError
 from curio_train.geometry import random_rotations
 from curio_train.meshes.meshes import Mesh, load_mesh
+from curio_train.meshes.of_model import refuse_changed_mesh
 from curio_train.meshes.symmetries import find_symmetries
 from curio_train.worlds.base import Camera, ObjectKind, World
 from curio_train.worlds.options import CaptureOptions
@@ -58,7 +59,14 @@ _SMALLEST_PX = 8.0  # of a part at its largest distance; a pose cannot be read f
 class CapturePhotographs:
     """The user's photographs of a part, without the lens's distortion, in the size of the world's camera."""
 
-    def __init__(self, folder: Path, background: Path | None, intrinsics: Intrinsics, camera: Camera) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        background: Path | None,
+        intrinsics: Intrinsics,
+        camera: Camera,
+        judged: Collection[str] = (),
+    ) -> None:
         """Read nothing yet.
 
         Args:
@@ -66,8 +74,10 @@ class CapturePhotographs:
             background: Photograph of the empty scene.
             intrinsics: The camera that took them.
             camera: The world's.
+            judged: File names of those that judge the model; if none is there, as many as there should be are chosen.
         """
         self._folder, self._background, self._intrinsics, self._camera = folder, background, intrinsics, camera
+        self._judged = frozenset(judged)
 
     def paths(self) -> Sequence[Path]:
         """Files of all photographs; the one of the empty scene is none of them.
@@ -76,6 +86,14 @@ class CapturePhotographs:
             DataError: The folder cannot be read.
         """
         return Photographs(self._folder, () if self._background is None else (self._background,)).paths
+
+    def names_judged(self) -> tuple[str, ...]:
+        """File names of those that the model never learns from.
+
+        Raises:
+            DataError: The folder cannot be read.
+        """
+        return tuple(path.name for path in self._split[0])
 
     def judged(self, count: int) -> tuple[list[Path], Tensor]:
         """At most ``count`` of those that the model never learns from: files, and [num, 3, height, width] in [0, 1].
@@ -114,10 +132,11 @@ class CapturePhotographs:
     def _split(self) -> tuple[list[Path], list[Path]]:
         """Photographs to judge by, and the others; a model is judged by all if they are few."""
         paths = list(self.paths())
-        if len(paths) < FEWEST_TO_LEARN_FROM:
-            return paths, []
-        judged = spread(paths, NUM_JUDGED)
-        return judged, sorted(set(paths).difference(judged))
+        is_many = len(paths) >= FEWEST_TO_LEARN_FROM
+        judged = [path for path in paths if path.name in self._judged]
+        if not judged:
+            judged = spread(paths, NUM_JUDGED) if is_many else paths
+        return judged, sorted(set(paths).difference(judged)) if is_many else []
 
     def _read(self, paths: Sequence[Path]) -> Tensor:
         frames = read_frames(paths, self._intrinsics, self._camera.width, self._camera.height)
@@ -140,7 +159,7 @@ def build(options: CaptureOptions) -> World:
     if options.paint is not None and not any(member.unpainted for member in members):
         named = ", ".join(map(str, options.mesh))
         raise UsageError(f"--paint {options.paint}: {named} has colours of its own; leave it out")
-    photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera))
+    photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera), options.judged)
     if len(members) > 1:
         name = "-".join(member.kind.name for member in members)
         painted = [_painted(member) for member in members]
@@ -150,6 +169,7 @@ def build(options: CaptureOptions) -> World:
 
 def _object(options: CaptureOptions, camera: Intrinsics, file: Path, slot: int) -> Object:
     of_file = load_mesh(file, options.mesh_unit, options.body)
+    refuse_changed_mesh(of_file, options.sha256_of(slot), file)
     found = find_symmetries(of_file)
     center_m = found.point_left(of_file.box_corners_m.mean(axis=0)) if options.centered else np.zeros(3)
     mesh = of_file.moved(-center_m)

@@ -199,6 +199,11 @@ class CaptureOptions(WorldOptions):
     centered: Suppress[bool] = True
     """Whether the network reads where the part's middle is; networks of older versions read where the file's origin
     is."""
+    mesh_sha256: Suppress[tuple[str, ...]] = ()
+    """SHA-256 of each mesh file as training began, hexadecimal: a run is of these meshes. Empty: in older runs."""
+    judged: Suppress[tuple[str, ...]] = ()
+    """File names of the photographs that judge the model, chosen as training begins: photographs that are added later
+    change nothing about which it never learns from. Empty: in older runs, and with --plane."""
 
     def __post_init__(self) -> None:
         """Make paths absolute, and refuse what contradicts itself."""
@@ -224,6 +229,10 @@ class CaptureOptions(WorldOptions):
     def upgraded(cls, stored: Mapping[str, Any]) -> Mapping[str, Any]:
         """Options of a stored configuration; those that are older than ``centered`` are of the file's origin."""
         return {"centered": False, **stored}
+
+    def sha256_of(self, number: int) -> str | None:
+        """SHA-256 of a mesh file as training began; None: not known."""
+        return self.mesh_sha256[number] if self.mesh_sha256 else None
 
     @property
     def names_several(self) -> bool:

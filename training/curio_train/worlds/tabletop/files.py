@@ -16,6 +16,7 @@ from curio_train.data.photographs import Photographs, read_frames
 from curio_train.errors import CameraError, DataError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import Mesh, load_mesh
+from curio_train.meshes.of_model import refuse_changed_mesh
 from curio_train.meshes.symmetries import Symmetries, find_symmetries
 from curio_train.scene_code import TRANSLATION, Field
 from curio_train.worlds.base import Camera, ObjectKind, PhotographSet
@@ -56,8 +57,8 @@ def build_tabletop(options: CaptureOptions) -> TabletopWorld:
     count_ranges, intrinsics = options.count_ranges, load_intrinsics(options.camera)
     cameras = CameraPoseFile.read(options.plane)
     parts = [
-        _part(load_mesh(file, options.mesh_unit, options.body), file.stem, options, *counts)
-        for file, counts in zip(options.mesh, count_ranges, strict=True)
+        _part(_mesh(options, number), options.mesh[number].stem, options, *counts)
+        for number, counts in enumerate(count_ranges)
     ]
     setup = SceneSetup(
         resized(intrinsics, SIDE_PX, SIDE_PX),
@@ -88,6 +89,13 @@ def _refuse_invisible(setup: SceneSetup, diameter_m: float, file: Path) -> None:
             f"diameter is {diameter_m:.3g} m, is {size_px:.2g} pixels large in images of {SIDE_PX}; expected at least "
             f"{_SMALLEST_PX:g}. cam_from_world is in metres; check --mesh-unit, too"
         )
+
+
+def _mesh(options: CaptureOptions, number: int) -> Mesh:
+    file = options.mesh[number]
+    mesh = load_mesh(file, options.mesh_unit, options.body)
+    refuse_changed_mesh(mesh, options.sha256_of(number), file)
+    return mesh
 
 
 def _part(mesh: Mesh, name: str, options: CaptureOptions, min_count: int, max_count: int) -> Part:
