@@ -172,6 +172,16 @@ def test_distortion_beside_focal_lengths_counts(tmp_path: Path) -> None:
         read_camera_file(path)
 
 
+def test_bop_scene_camera_is_of_its_own_scene(tmp_path: Path) -> None:
+    for scene in ("000001", "000002"):
+        (tmp_path / scene / "rgb").mkdir(parents=True)
+        (tmp_path / scene / "scene_camera.json").write_text(json.dumps({"0": {"cam_K": K.ravel().tolist()}}))
+    cameras = read_camera_file(tmp_path / "000001" / "scene_camera.json")
+    assert cameras.camera_for(tmp_path / "000001" / "rgb" / "000000.png").matrix.tolist() == K.tolist()
+    with pytest.raises(CameraError, match=r"is of another scene than .*its cameras are in .*000002"):
+        cameras.camera_for(tmp_path / "000002" / "rgb" / "000000.png")
+
+
 def test_bop_scene_camera_is_looked_up_by_the_images_number(tmp_path: Path) -> None:
     path = tmp_path / "scene_camera.json"
     entries = {str(n): {"cam_K": [500.0 + n, 0, 320, 0, 500, 240, 0, 0, 1], "depth_scale": 1.0} for n in (0, 7, 12)}

@@ -191,3 +191,22 @@ def test_standard_input_and_output(models_dir: Path, frames: Path) -> None:
     )
     assert [json.loads(line)["image"] for line in done.stdout.splitlines()] == listed.split()
     assert "6 images" in done.stderr
+
+
+def test_a_file_is_not_gone_on_with_by_another_camera(
+    models_dir: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera, out = tmp_path / "camera.json", tmp_path / "poses.jsonl"
+    for focal_px, told in ((900.0, None), (300.0, "by another camera .fx 900 px; it is 300 px now"), (900.0, None)):
+        camera.write_text(json.dumps({"camera_matrix": [[focal_px, 0, 160], [0, focal_px, 120], [0, 0, 1]]}))
+        if told is None:
+            assert detect(models_dir / "pinhole", frames, camera=camera, out=out) == 0
+            cv2.imwrite(str(frames / "000007.png"), cv2.imread(str(frames / "000000.png")))
+            continue
+        with pytest.raises(UsageError, match=told):
+            detect(models_dir / "pinhole", frames, camera=camera, out=out)
+    assert len(read(out)) == 7
+    (frames / "000008.png").write_bytes(b"no image")
+    for _ in range(2):
+        assert detect(models_dir / "pinhole", frames, camera=camera, out=out) == 1
+    assert "--overwrite answers all again" in capsys.readouterr().err

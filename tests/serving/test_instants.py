@@ -1,4 +1,4 @@
-"""Which images of several cameras go together: by their times, their numbers, or the order of their names."""
+"""Which images of several cameras go together, and when: by their times, their numbers, or the order of their names."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +9,7 @@ import pytest
 from curio_serve.batch.images.source_image import RecordedAt, SourceImage
 from curio_serve.batch.images.sources import PassedOver, images
 from curio_serve.batch.instants import Instants, refuse_other_images
+from curio_serve.batch.tracked import timed
 from curio_serve.errors import UsageError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.rigs.rig import RigCamera
@@ -65,7 +66,7 @@ def test_stamps_that_nobody_set_leave_the_order() -> None:
 def test_files_that_are_numbered_alike_stay_so() -> None:
     names = [("a/left_08.png", "b/right_8.png"), ("a/left_09.png", "b/right_9.png")]
     whole = Instants([iter(files(*side)) for side in zip(*names, strict=True)], LABELS)
-    assert [instant.name for instant in whole] == ["a/left_08.png", "a/left_09.png"]
+    assert [tuple(image.name for image in instant.images) for instant in whole] == names
     missing = Instants([iter(files("a/1.png", "a/2.png")), iter(files("b/1.png", "b/3.png"))], LABELS)
     with pytest.raises(UsageError, match=r"a/2\.png and b/3\.png come together"):
         list(missing)
@@ -83,6 +84,8 @@ def test_images_of_another_camera_or_number_are_refused(tmp_path: Path) -> None:
     for swapped in ([right, left], [f"{right}/*.png", f"{left}/*.png"], ["right.mp4", "left.mp4"]):
         with pytest.raises(UsageError, match=r"comes where camera left is expected; the order is left, right"):
             refuse_other_images(swapped, rig)
+    with pytest.raises(UsageError, match="expected other images of each camera"):
+        refuse_other_images([left, left], rig)
     with pytest.raises(UsageError, match=r"left has 2, .*right has 1"):
         refuse_other_images([left, right], rig)
     (tmp_path / "left" / "1.png").unlink()
@@ -96,3 +99,17 @@ def test_names_are_ordered_by_the_numbers_in_them(tmp_path: Path) -> None:
     expected = ["9.png", "10.png", "a2b9.png", "a2b10.png", "a09.png", "a9.png", "a10.png", "b.png"]
     for argument in (str(tmp_path), f"{tmp_path}/*.png"):
         assert [Path(image.name).name for image in images([argument], PassedOver())] == expected
+
+
+def test_times_of_a_recording_go_on_where_its_stamps_do_not() -> None:
+    log_ns = [10**18 + number * 40_000_000 for number in range(4)]
+    for stamps, steps_s in (
+        ([0, 0, 0, 0], [0.04, 0.04, 0.04]),
+        ([5_000_000_000, 5_050_000_000, 1_000_000_000, 1_050_000_000], [0.05, 0.04, 0.05]),
+    ):
+        images_ = [
+            SourceImage(str(number), "run.mcap", recorded=RecordedAt("/image", stamp, log, ""))
+            for number, (stamp, log) in enumerate(zip(stamps, log_ns, strict=True))
+        ]
+        times_s = [image.time_s for image in timed(images_, 30.0)]
+        np.testing.assert_allclose(np.diff(np.array(times_s, float)), steps_s, atol=1e-6)

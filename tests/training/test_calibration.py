@@ -110,7 +110,9 @@ def test_photographs_of_two_sizes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [(2, 6, 0.03), (9, 6, -1.0), (9, 6, 0.03, 0.05), (9, 6, 0.03, 0.02, "DICT_OF_MINE")], ids=str
+    "values",
+    [(9, 6, 0.00003), (2, 6, 0.03), (9, 6, -1.0), (9, 6, 0.03, 0.05), (9, 6, 0.03, 0.02, "DICT_OF_MINE")],
+    ids=str,
 )
 def test_boards_that_cannot_be(values: tuple[int, int, float]) -> None:
     with pytest.raises(CameraError, match="expected"):

@@ -14,7 +14,7 @@ from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer
 from curio_serve.api.admission import WorkQueue, check_is_wanted
 from curio_serve.api.messages import camera_from_message, frame_from_raw, region_from_message
 from curio_serve.api.registration import only_message
-from curio_serve.api.rig_request import check_views, rig_view, view_camera
+from curio_serve.api.rig_request import check_views, refuse_many_pixels, rig_view, view_camera
 from curio_serve.api.status import CallLog, frame_error
 from curio_serve.api.streams import Streams
 from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, ModelNotFound
@@ -165,7 +165,7 @@ class PoseService(PoseDetectorServicer):
     def _detect_views(
         self, request: messages.DetectRequest, detectors: list[Detector], waited_s: float, context: Context
     ) -> messages.DetectResponse:
-        """Decode the views of a rig and find the poses that explain all of them.
+        """Decode the views of a rig, which are in memory together, and find the poses that explain all of them.
 
         Raises:
             As :meth:`_detect`.
@@ -177,6 +177,7 @@ class PoseService(PoseDetectorServicer):
             frame, camera = _decode(view, view_camera(request, number), detectors, limits)
             views.append(rig_view(request, number, frame, camera, detectors))
             frames.append(frame)
+            refuse_many_pixels(views, limits.max_pixels)
         decoded, answer = time.perf_counter(), messages.DetectResponse()
         for detector in detectors:
             detect_views(

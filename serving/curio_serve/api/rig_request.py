@@ -1,5 +1,7 @@
 """Translates requests with the views of several cameras, and refuses requests that do not describe a rig."""
 
+from collections.abc import Sequence
+
 from curio_proto.v1.detector_pb2 import DetectRequest
 
 from curio_serve.api.messages import camera_from_message
@@ -35,6 +37,23 @@ def check_views(request: DetectRequest, num_models: int, most_runs: int) -> None
     given += ["regions"] * bool(request.regions) + ["apply_exif_rotation"] * request.apply_exif_rotation
     if given:
         raise ArgumentError(f"the request has views and {', '.join(given)}; leave these out: each view has its own")
+
+
+def refuse_many_pixels(views: Sequence[RigView], most: int) -> None:
+    """Refuse views that need too much memory together.
+
+    Args:
+        views: As they are decoded, large JPEGs at a fraction of their size.
+        most: Pixels.
+
+    Raises:
+        ArgumentError: They have more.
+    """
+    if (num_pixels := sum(view.pixels.shape[0] * view.pixels.shape[1] for view in views)) > most:
+        raise ArgumentError(
+            f"views up to views[{len(views) - 1}] have {num_pixels} pixels together; at most {most} are accepted for "
+            "all views of a request (max-pixels): send smaller images, or JPEGs"
+        )
 
 
 def view_camera(request: DetectRequest, number: int) -> PinholeCamera | None:

@@ -19,10 +19,13 @@ _NUMBER = re.compile(r"\d+")
 class RigImage:
     """The images of all cameras at one instant."""
 
-    name: str
-    """Name of the first camera's image."""
     images: tuple[SourceImage, ...]
     """One image of each camera, in the rig's order."""
+
+    @property
+    def name(self) -> str:
+        """Names of all images, by which a result file's line is known to be of this instant."""
+        return "|".join(image.name for image in self.images)
 
 
 @dataclass
@@ -89,7 +92,7 @@ class Instants:
             if has_numbers and len({_number(image) for image in there}) > 1:
                 names = " and ".join(image.name for image in there)
                 raise UsageError(f"--rig: {names} come together and have other numbers; is an image missing before?")
-            yield RigImage(there[0].name, tuple(there))
+            yield RigImage(tuple(there))
 
     def _by_time(self, heads: list[SourceImage]) -> Iterator[RigImage]:
         following = [next(camera, None) for camera in self.cameras]
@@ -99,7 +102,7 @@ class Instants:
                 while (then := following[number]) is not None and _is_nearer(then, heads[number], latest):
                     self.unpaired.count(heads[number])
                     heads[number], following[number] = then, next(camera, None)
-            yield RigImage(heads[0].name, tuple(heads))
+            yield RigImage(tuple(heads))
             if any(then is None for then in following):
                 self.unpaired.ended = self.labels[following.index(None)] if any(following) else ""
                 return
@@ -119,6 +122,8 @@ def refuse_other_images(arguments: Sequence[str], cameras: Sequence[RigCamera]) 
             folders hold different numbers of images.
     """
     names = [camera.name for camera in cameras]
+    if len({os.path.realpath(argument) for argument in arguments}) < len(arguments):
+        raise UsageError(f"--rig: found {' '.join(arguments)}; expected other images of each camera")
     for argument, name in zip(arguments, names, strict=True):
         own = next((part for part in reversed(PurePath(argument).parts) if "*" not in part), "")
         own = own if os.path.isdir(argument) or "*" in argument else PurePath(own).stem

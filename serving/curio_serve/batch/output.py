@@ -1,6 +1,7 @@
 """Chooses the result file of a call, and its format."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,11 +9,12 @@ from curio_serve.batch.arguments import DetectArguments
 from curio_serve.batch.checks import refuse_images
 from curio_serve.batch.estimators import Estimator
 from curio_serve.batch.images.remote_files import is_url
+from curio_serve.batch.images.source_image import SourceImage
 from curio_serve.batch.images.sources import is_recording, names_recordings
 from curio_serve.batch.results.formats import Bop, Csv, JsonLines, ResultFormat, bop_object_ids
 from curio_serve.batch.results.result_file import ResultFile
 from curio_serve.batch.results.result_parts import ResultParts
-from curio_serve.errors import UsageError
+from curio_serve.errors import CameraError, UsageError
 
 if TYPE_CHECKING:
     from curio_serve.batch.results.recorded_poses import Detection3DArrays, PoseRecording
@@ -66,8 +68,22 @@ def open_output(
         if arguments.out is not None and is_url(arguments.out):
             return ResultParts(arguments.out, form, names, overwrite=arguments.overwrite)
         path = None if arguments.out is None else Path(arguments.out)
-        return ResultFile(path, form, names, overwrite=arguments.overwrite)
+        return ResultFile(path, form, names, overwrite=arguments.overwrite, matrix_of=_matrix_of(estimators))
     from curio_serve.batch.results.recorded_poses import PoseRecording  # of an extra
 
     assert arguments.out is not None
     return PoseRecording(Path(arguments.out), overwrite=arguments.overwrite)
+
+
+def _matrix_of(estimators: Sequence[Estimator]) -> Callable[[SourceImage], Sequence[float] | None]:
+    """The camera matrix of an image in the camera file of a call; None where it has none, or there is no file."""
+    cameras = next((estimator.settings.cameras for estimator in estimators), None)
+
+    def matrix(image: SourceImage) -> Sequence[float] | None:
+        if cameras is None:
+            return None
+        with suppress(CameraError):  # answering the image reports that
+            return [float(value) for value in cameras.camera_for(image.relative_name).matrix.ravel()]
+        return None
+
+    return matrix

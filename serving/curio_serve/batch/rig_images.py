@@ -55,9 +55,9 @@ class RigEstimator:
                 results=results,
             )
         except _OF_ONE_INSTANT as exc:
-            return ImageResult(instant.name, self._model.name, self._model.version, error=str(exc), views=names)
+            return ImageResult(names[0], self._model.name, self._model.version, error=str(exc), views=names)
         return ImageResult(
-            instant.name,
+            names[0],
             self._model.name,
             self._model.version,
             *views[0].size,
@@ -152,7 +152,8 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
     form, passed_over, topics = JsonLines(), PassedOver(), Topics(arguments.topic, arguments.info_topic)
     names = [(model.name, model.version) for model in opened]
     path = None if arguments.out is None else Path(arguments.out)
-    with ResultFile(path, form, names, overwrite=arguments.overwrite) as output:
+    matrix = cameras[0].camera.matrix.ravel().tolist()
+    with ResultFile(path, form, names, overwrite=arguments.overwrite, matrix_of=lambda _: matrix) as output:
         taken = Instants([images([one], passed_over, topics) for one in arguments.images], arguments.images)
         remaining = output.unanswered(iter(taken))
         results = in_order(partial(answer_instant, estimators, form), remaining, arguments.jobs)

@@ -11,10 +11,12 @@ from curio_serve.errors import UsageError
 from curio_serve.tracking.follower import MAX_OBJECTS
 
 if TYPE_CHECKING:
-    from curio_serve.batch.images.source_image import SourceImage
+    from curio_serve.batch.images.source_image import RecordedAt, SourceImage
     from curio_serve.batch.results.recorded_poses import PoseRecording
     from curio_serve.batch.results.result_file import ResultFile
     from curio_serve.batch.results.result_parts import ResultParts
+
+_LEAST_STEP_NS = 1_000_000
 
 
 def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectArguments:
@@ -74,14 +76,26 @@ def from_the_first(
 def timed(frames: "Iterable[SourceImage]", frame_rate: float) -> "Iterator[SourceImage]":
     """Frames with the time at which each was taken: as the recording or video says, or one after the other.
 
-    A frame that cannot be read takes its time all the same.
+    A frame that cannot be read takes its time all the same. Where the stamps of a recording do not go forward, because
+    nobody set them or a clock was set back, the time between two frames is that between their recordings.
 
     Args:
         frames: Those of a stream one after the other.
         frame_rate: Of frames that carry no time, frames/s.
     """
-    stream, number = "", 0
+    stream, number, before, time_ns = "", 0, None, 0
     for frame in frames:
-        stream, number = frame.stream, number + 1 if frame.stream == stream else 0
+        if frame.stream != stream:
+            stream, number, before = frame.stream, -1, None
+        number, recorded = number + 1, frame.recorded
         time_s = number / frame_rate if frame.time_s is None else frame.time_s
-        yield replace(frame, time_s=time_s if frame.recorded is None else frame.recorded.stamp_ns / 1e9)
+        if recorded is not None:
+            time_ns = recorded.stamp_ns if before is None else time_ns + _step_ns(before, recorded)
+            before, time_s = recorded, time_ns / 1e9
+        yield replace(frame, time_s=time_s)
+
+
+def _step_ns(before: "RecordedAt", now: "RecordedAt") -> int:
+    """Nanoseconds between two frames of a recording, at least a millisecond."""
+    step_ns = now.stamp_ns - before.stamp_ns
+    return step_ns if step_ns > 0 else max(now.log_time_ns - before.log_time_ns, _LEAST_STEP_NS)

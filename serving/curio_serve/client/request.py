@@ -77,7 +77,7 @@ def detect_request(
         request.raw.CopyFrom(_raw(image, color))
         size: tuple[int, int] | None = (request.raw.width, request.raw.height)
     else:
-        request.encoded = image if isinstance(image, bytes) else _read(image)
+        request.encoded = bytes(image) if isinstance(image, bytes | bytearray | memoryview) else _read(image)
         size = _stored_size(request.encoded)
     if camera is not None:
         request.camera.CopyFrom(_camera(camera, image, size))
@@ -160,11 +160,18 @@ def _raw(pixels: np.ndarray, color: str) -> messages.RawImage:
     return messages.RawImage(format=kind, width=pixels.shape[1], height=pixels.shape[0], data=pixels.tobytes())
 
 
-def _read(path: str | Path) -> bytes:
+def _read(path: object) -> bytes:
+    if not isinstance(path, str | Path):
+        raise ImageError(
+            f"the image is a {type(path).__name__}; expected pixels [height, width, 3] as a numpy array, the bytes of "
+            "an image file, or its path. cv2.imread gives None for a file that it cannot read"
+        )
     try:
         return read_file(path, MAX_FILE_BYTES)
     except OSError as exc:
         raise ImageError(f"{path} cannot be read: {exc.strerror}") from exc
+    except ValueError as exc:  # a null byte
+        raise ImageError(f"{path!r} cannot be read: {exc}") from exc
 
 
 def _stored_size(encoded: bytes) -> tuple[int, int] | None:

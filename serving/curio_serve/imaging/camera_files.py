@@ -9,6 +9,7 @@ ROS JSON          a CameraInfo message: k, d, width, height (ROS 1: K, D)
 """
 
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from curio_serve.imaging.camera import PinholeCamera
 
 MAX_BYTES = 64 << 20
 _DISTORTION = ("distortion", "distortion_coefficients", "dist_coeffs", "dist")
+_OF_SCENE = "scene_camera.json"  # BOP's, in the folder of a scene, whose images lie in folders beside it
 _COEFFICIENT = re.compile(r"[kp]\d")  # each by itself, as some calibrations write them
 _ROS_MODELS = ("", "plumb_bob", "rational_polynomial")  # OpenCV's own lenses
 
@@ -50,6 +52,9 @@ class CameraFile:
         numbers = re.findall(r"\d+", Path(image).stem)
         if not numbers:
             raise CameraError(f"{self.path} has K for each image number, but the name of {image} has no number")
+        other = Path(image).parent.parent / _OF_SCENE
+        if self.path.name == _OF_SCENE and os.path.exists(other) and not os.path.samefile(other, self.path):
+            raise CameraError(f"{image} is of another scene than {self.path}: its cameras are in {other}")
         number = int(numbers[-1])
         if number not in self.per_image:
             known = sorted(self.per_image)

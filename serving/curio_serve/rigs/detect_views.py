@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from curio_proto.v1.detector_pb2 import DETECTION_STATUS_SURE, DETECTION_STATUS_UNSURE, DetectionStatus
 from curio_proto.v1.model_spec_pb2 import ObjectModel
 
 from curio_serve.consensus.poses import Consensus, Predictions, consensus, position_covariance_m2
@@ -17,6 +18,7 @@ from curio_serve.errors import ArgumentError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.models.detector import Detector
+from curio_serve.models.model import Model
 from curio_serve.models.object_frames import (
     as_compared,
     center_of,
@@ -128,9 +130,15 @@ def detect_views(
             box_px=views[0].camera.pixels(corners),
             views=agreeing,
             outside_trained_range=not any(nearest <= depth_m <= farthest for depth_m in depths_m),
-            status=status_of(model.spec.reliability, own[0].object, confidence),
+            status=_status(model, own[0].object, confidence, len(agreeing)),
         )
     result.status = region_status(result.detections)
+
+
+def _status(model: Model, object_: str, confidence: float, num_agreeing: int) -> DetectionStatus:
+    """Whether an answer is sure. That was measured on single images: the surest of several views is not, alone."""
+    status = status_of(model.spec.reliability, object_, confidence)
+    return DETECTION_STATUS_UNSURE if status == DETECTION_STATUS_SURE and num_agreeing < 2 else status
 
 
 def _whole(

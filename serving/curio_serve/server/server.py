@@ -41,6 +41,7 @@ _SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.Heal
 
 
 _MEMORY_USED = 0.8  # of a container's memory, beyond which streams are ended
+_MEMORY_OF_MODELS = 0.6  # of it, beyond which little is left for requests
 _DEVICE_BATCH = 8  # of a GPU provider
 _HEARING_S = 1.0
 
@@ -86,6 +87,7 @@ class PoseServer:
         self._report(changes)
         if not list(self._repository):
             raise ModelError(f"no model could be loaded from {self.config.models}: {self._why_none(changes)}")
+        self._warn_of_little_memory()
         self._server = self._build()
         addresses = [self._open_port(self._server)]
         if self.config.metrics_port is not None:
@@ -94,6 +96,17 @@ class PoseServer:
         self._server.start()
         self._announce()
         return addresses
+
+    def _warn_of_little_memory(self) -> None:
+        """Say where the models leave little of a container's memory: requests would be refused for want of it."""
+        most, used = memory_limit(), memory.resident_bytes()
+        if most is not None and used > _MEMORY_OF_MODELS * most:
+            log(
+                logging.WARNING,
+                "models leave little memory; streams are ended when it is short",
+                used_mb=used >> 20,
+                limit_mb=most >> 20,
+            )
 
     def _why_none(self, changes: Sequence[Change]) -> str:
         """What to do about a folder none of whose models serves."""

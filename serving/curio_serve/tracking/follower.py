@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from curio_proto.v1.detector_pb2 import RegionResult
+from curio_proto.v1.detector_pb2 import DETECTION_STATUS_SURE, DETECTION_STATUS_UNSURE, RegionResult
 
 from curio_serve.errors import ArgumentError
 from curio_serve.imaging.camera import PinholeCamera
@@ -31,6 +31,7 @@ _MORE_S, _VERIFY_S = 0.5, 2.0  # the same for further objects, and to make sure 
 _AROUND = 0.6  # diameters between the crops in which an object is looked for that is not seen
 _OFFSETS = np.array([(x, y, 0) for x in (-1, 0, 1) for y in (-1, 0, 1)])
 _TAKEN = 0.5  # diameters around an object within which no other one is
+_PAUSE = 10.0  # times the step before: a longer step is a pause, after which nothing is where it was
 _SURER = 0.2  # by which another place must be more confident than the one that is followed
 
 
@@ -67,6 +68,7 @@ class Follower:
         self._tracks: list[Track] = []
         self.last_number = last_number
         self._looked_s = self._searched_s = self._time_s = -math.inf
+        self._step_s = 0.0
 
     def follow(
         self,
@@ -100,9 +102,12 @@ class Follower:
         frame = StreamFrame(detector, pixels, camera, reduction, time_s, before_run)
         wanted = [slot.object for slot in detector.model.slots]
         self._tracks = [track for track in self._tracks if track.kind.name in wanted]
+        step_s, last_s = time_s - self._time_s, self._step_s
+        if last_s and step_s > max(following.keep_s, _PAUSE * last_s):  # nobody saw where anything went meanwhile
+            self._tracks = []
         for track in self._tracks:
-            track.predict(time_s - self._time_s)
-        self._time_s = time_s
+            track.predict(step_s)
+        self._time_s, self._step_s = time_s, step_s
         light = self._read_crops(frame)
         is_searched = time_s - self._searched_s >= _SEARCH_S and not all(track.is_seen for track in self._tracks)
         if is_searched:
@@ -237,6 +242,8 @@ class Follower:
                 track.confidence(now_s, keep_s),
             )
             frame.describe(detection.track, track)
+            if raw is None and detection.status == DETECTION_STATUS_SURE:  # this frame does not show it
+                detection.status = DETECTION_STATUS_UNSURE
         result.status = region_status(result.detections)
         return result
 

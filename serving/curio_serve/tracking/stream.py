@@ -46,8 +46,8 @@ class FollowingStream:
             raise ArgumentError(f"track.time_s is {time_s}; expected seconds")
         if before is not None and time_s <= before:
             raise ArgumentError(
-                f"track.time_s is {time_s:.9g}, the frame before was taken at {before:.9g}; expected frames in the "
-                "order in which they were taken, or track.restart to begin anew"
+                f"track.time_s is {time_s:.6f}, {before - time_s:.6g} s before that of the frame before; expected "
+                "frames in the order in which they were taken, or track.restart to begin anew"
             )
         given = {name: getattr(request, name) for name in ("keep_s", "num_objects") if request.HasField(name)}
         return Following(**given, search=request.search), time_s

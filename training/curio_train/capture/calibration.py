@@ -11,6 +11,7 @@ from curio_train.camera import Intrinsics, check_matrix
 from curio_train.data.photographs import Photographs, read_photograph
 from curio_train.errors import CameraError, DataError
 
+_SMALLEST_SQUARE_M, _LARGEST_SQUARE_M = 0.001, 1.0
 _FEWEST_VIEWS = 6
 _FEWEST_INNER = 3  # corners a side that OpenCV finds a plain chessboard by
 _FEWEST_CORNERS = 6  # of a board that is partly seen
@@ -45,6 +46,11 @@ class Board:
         if self.square_m <= 0 or (self.marker_m is not None and not 0 < self.marker_m < self.square_m):
             raise CameraError(
                 f"squares of {self.square_m} m with markers of {self.marker_m} m; expected 0 < marker < square"
+            )
+        if not _SMALLEST_SQUARE_M <= self.square_m <= _LARGEST_SQUARE_M:
+            raise CameraError(
+                f"squares of {1000 * self.square_m:g} mm; expected {1000 * _SMALLEST_SQUARE_M:g} to "
+                f"{1000 * _LARGEST_SQUARE_M:g} mm: sizes of the board are in millimetres (--square-mm, --marker-mm)"
             )
         if not self.dictionary.startswith("DICT_") or not hasattr(cv2.aruco, self.dictionary):
             raise CameraError(f"{self.dictionary!r} is no dictionary of OpenCV; expected one like DICT_4X4_50")

@@ -93,6 +93,8 @@ class Line:
     """(name, version), if the format has them."""
     is_error: bool = False
     """Whether the image had no answer."""
+    camera_matrix: tuple[float, ...] = ()
+    """K row after row, where the format has it and the stored pixels were not turned."""
 
 
 class ResultFormat(ABC):
@@ -165,7 +167,10 @@ class JsonLines(ResultFormat):
         record = json.loads(line)
         try:
             model = (record["model"]["name"], record["model"]["version"])
-            return Line(record["image"], opens_image=True, model=model, is_error="error" in record)
+            key = "|".join(record["views"]) if "views" in record else record["image"]
+            is_stored = record.get("camera_matrix") and not record.get("exif_rotation") and "error" not in record
+            matrix = tuple(float(value) for row in record["camera_matrix"] for value in row) if is_stored else ()
+            return Line(key, opens_image=True, model=model, is_error="error" in record, camera_matrix=matrix)
         except (KeyError, TypeError) as exc:
             raise ValueError("no image or model in it") from exc
 

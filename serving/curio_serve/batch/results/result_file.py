@@ -8,11 +8,11 @@ is the one that an uninterrupted run would have written. Neither the file nor th
 
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO, Protocol, TypeVar
+from typing import Any, BinaryIO, Protocol, TypeVar
 
 from curio_serve.batch.results.formats import ImageLines, Line, ResultFormat
 from curio_serve.errors import OutputError, UsageError
@@ -28,6 +28,7 @@ class Named(Protocol):
 
 
 NamedT = TypeVar("NamedT", bound=Named)
+_SAME_PX = 0.01  # between entries of K
 
 
 class ResultFile:
@@ -38,6 +39,8 @@ class ResultFile:
         form: Format of its lines.
         models: Names and versions of those whose results it holds, in the order of an image's lines.
         overwrite: Drop what is in it.
+        matrix_of: K of an image, row after row, by which it would be answered; None: not known. Lines by another one
+            are not gone on with.
 
     Raises:
         OutputError: The file cannot be opened for writing, or another process writes it.
@@ -49,13 +52,20 @@ class ResultFile:
     """Images that failed, where the format says so."""
 
     def __init__(
-        self, path: Path | None, form: ResultFormat, models: Sequence[tuple[str, int]], *, overwrite: bool = False
+        self,
+        path: Path | None,
+        form: ResultFormat,
+        models: Sequence[tuple[str, int]],
+        *,
+        overwrite: bool = False,
+        matrix_of: Callable[[Any], Sequence[float] | None] = lambda _: None,
     ) -> None:
         self.num_images = 0
         self.num_errors = 0
         self._path = path
         self._form = form
         self._models = tuple(models)
+        self._matrix_of = matrix_of
         self._descriptor = os.dup(1) if path is None else _open_locked(path)
         self._is_regular = path is not None and stat.S_ISREG(os.fstat(self._descriptor).st_mode)
         self._overwrites = self._is_regular and overwrite
@@ -171,16 +181,25 @@ class ResultFile:
             self.num_images += 1
             found = self._form.key(image.name)
             if found == last.key:
+                self._refuse_other_camera(last, self._matrix_of(image), number)
                 self.num_errors += last.is_error
                 return
             if self._form.has_line_for_every_image:
                 raise self._mismatch(number, f"image {last.key} where the images given have {found}")
         raise self._mismatch(number, f"image {last.key}, which is not among the images given or not in this order")
 
+    def _refuse_other_camera(self, last: "_Image", matrix: Sequence[float] | None, number: int) -> None:
+        if not last.camera_matrix or matrix is None:
+            return
+        if any(abs(a - b) > _SAME_PX for a, b in zip(last.camera_matrix, matrix, strict=True)):
+            raise self._mismatch(
+                number, f"poses by another camera (fx {last.camera_matrix[0]:g} px; it is {matrix[0]:g} px now)"
+            )
+
     def _mismatch(self, number: int, found: str) -> UsageError:
         return UsageError(
-            f"cannot go on with {self.label}: line {number} holds {found}. Give the same images, model and format as "
-            "before, another --out, or --overwrite to replace the file."
+            f"cannot go on with {self.label}: line {number} holds {found}. Give the same images, camera, model and "
+            "format as before, another --out, or --overwrite to replace the file."
         )
 
 
@@ -196,11 +215,14 @@ class _Image:
     """The models of its lines, if the format names them."""
     is_error: bool = False
     """Whether a model had no answer."""
+    camera_matrix: tuple[float, ...] = ()
+    """See :class:`Line`."""
 
     def add(self, line: Line) -> None:
         if line.model is not None and line.model not in self.models:
             self.models.append(line.model)
         self.is_error |= line.is_error
+        self.camera_matrix = self.camera_matrix or line.camera_matrix
 
 
 def _label(models: Sequence[tuple[str, int]]) -> str:
