@@ -78,3 +78,9 @@ def test_one_mesh_for_two_kinds_is_refused(folder: Path) -> None:
 @pytest.mark.parametrize("box_px", [None, [[None, None]] * 8])
 def test_a_mesh_cannot_be_compared_without_a_box(folder: Path, box_px: Any) -> None:
     assert len(drawn(found(folder, "tall", box_px=box_px), f"{folder}/flat.ply")) == 1
+
+
+@pytest.mark.parametrize("rotation", [np.diag([2.0, 2, 2]), np.diag([-1.0, 1, 1]), np.zeros((3, 3))], ids=str)
+def test_what_is_no_rotation_is_not_drawn(folder: Path, rotation: np.ndarray) -> None:
+    with pytest.raises(DataError, match="expected rows at right angles"):
+        drawn(found(folder, "tall", rotation=rotation.tolist(), box_px=None), f"{folder}/tall.ply")

@@ -32,6 +32,15 @@ def test_a_rotation_that_cannot_be_ignored_is_refused(tmp_path: Path, suffix: st
             read_photograph(file)
 
 
+def test_transparent_pixels_are_read_beneath_or_refused(tmp_path: Path) -> None:
+    pixels = np.full((4, 4, 4), (200, 100, 10, 0), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert read_photograph(tmp_path / "a.png")[0, 0].tolist() == [200, 100, 10]
+    Image.fromarray(pixels).save(tmp_path / "a.tif")
+    with pytest.raises(DataError, match="has transparent pixels"):
+        read_photograph(tmp_path / "a.tif")
+
+
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff"])
 def test_rgb(tmp_path: Path, suffix: str) -> None:
     assert np.array_equal(read_photograph(save(tmp_path / f"a{suffix}", PIXELS)), PIXELS)

@@ -161,5 +161,10 @@ def test_bootstrap() -> None:
     assert low == pytest.approx(0.451, abs=0.006)
     assert high == pytest.approx(0.549, abs=0.006)
     assert poses.bootstrap_interval(coin) == (low, high)
+    # The mean of two means varies half as much where one of them is certain, not as the mean of two intervals does.
+    low, high = poses.bootstrap_interval(coin, [1.0] * 10)
+    assert (low, high) == (pytest.approx(0.7255, abs=0.006), pytest.approx(0.7745, abs=0.006))
+    low, high = poses.bootstrap_interval(coin, coin)
+    assert high - low == pytest.approx(2 * 1.96 * 0.5 / 800**0.5, rel=0.1)
     with pytest.raises(ValueError, match="at least one"):
         poses.bootstrap_interval([])

@@ -63,6 +63,7 @@ LARGEST_PIXELS = 50_000_000
 
 LONGEST_KEPT_PX = 768
 
+_TIFF, _OPAQUE = (".tif", ".tiff"), 255
 _ORIENTATION = 0x0112  # EXIF tag
 
 
@@ -89,6 +90,8 @@ def read_photograph(path: Path) -> np.ndarray:
         raise DataError(f"{path}: the image cannot be decoded ({exc.err})") from exc
     if pixels is None:
         raise DataError(f"{path}: the image cannot be decoded; expected a PNG, JPEG, WebP, BMP or TIFF file")
+    if path.suffix.lower() in _TIFF and pixels.ndim == 3 and pixels.shape[2] == 4 and pixels[..., 3].min() < _OPAQUE:
+        raise DataError(f"{path}: the TIFF file has transparent pixels, whose colours OpenCV darkens; save it without")
     return _to_rgb8(path, pixels)
 
 

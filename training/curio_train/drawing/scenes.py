@@ -23,6 +23,7 @@ from curio_train.worlds.base import World
 from curio_train.worlds.generated.mesh_world import MeshWorld
 
 _MAX_BYTES = 1 << 28
+_SHEAR = 1e-2  # of a rotation times its transpose, as files round it
 _VIDEO_FRAME = re.compile(r"(.+)#(\d+)", re.DOTALL)
 EXPECTED = 'a line of curio-detect with "detections", or {"world": NAME, "code": {FIELD: numbers}}'
 
@@ -187,13 +188,20 @@ def _placed(detection: Mapping[str, Any], cam_from_rig: Pose) -> Placed:
         str(detection["object"]),
         cam_from_rig
         @ Pose(
-            np.eye(3) if rotation is None else _numbers(rotation, (3, 3), "rotation"),
+            np.eye(3) if rotation is None else _rotation(rotation),
             _numbers(detection["translation_m"], (3,), "translation_m"),
         ),
         (1.0, 1.0, 1.0) if color is None else tuple(_numbers(color, (3,), "color").tolist()),
         float(detection["confidence"]),
         _corners(box_px),
     )
+
+
+def _rotation(values: Any) -> np.ndarray:
+    found = _numbers(values, (3, 3), "rotation")
+    if np.abs(found @ found.T - np.eye(3)).max() > _SHEAR or np.linalg.det(found) < 0:
+        raise ValueError(f"rotation is {_short(values)}, expected rows at right angles of length 1, and no reflection")
+    return found
 
 
 def _corners(box_px: Any) -> np.ndarray | None:

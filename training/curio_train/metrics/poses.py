@@ -143,18 +143,24 @@ def recall(errors: Sequence[float], threshold: float) -> float:
 
 
 def bootstrap_interval(
-    values: Sequence[float], seed: int = 0, level: float = 0.95, num_resamples: int = 2000
+    *groups: Sequence[float], seed: int = 0, level: float = 0.95, num_resamples: int = 2000
 ) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean of ``values`` (for a recall: of zeros and ones).
+    """Percentile bootstrap interval of a mean (for a recall: of zeros and ones), or of the mean of several means.
+
+    Args:
+        groups: Values; of several objects those of each, which are drawn anew by themselves.
+        seed: Of the draws.
+        level: Of the interval.
+        num_resamples: How often all are drawn anew.
 
     Raises:
         ValueError: There are no values.
     """
-    if len(values) == 0:
+    if not groups or any(len(group) == 0 for group in groups):
         raise ValueError("an interval of no values: there must be at least one")
-    found = np.asarray(values, dtype=np.float64)
+    found = [np.asarray(group, dtype=np.float64) for group in groups]
     rng = np.random.default_rng(seed)
     # One resample at a time: a table of all of them would be gigabytes for a whole data set.
-    means = [rng.choice(found, size=len(found)).mean() for _ in range(num_resamples)]
+    means = [np.mean([rng.choice(group, size=len(group)).mean() for group in found]) for _ in range(num_resamples)]
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
