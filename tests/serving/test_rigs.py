@@ -18,7 +18,7 @@ from curio_serve.errors import ArgumentError, CameraError, CameraMissing, UsageE
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
-from curio_serve.rigs.detect_views import RigView, _explained, _Seen, detect_views
+from curio_serve.rigs.detect_views import RigView, _explained, _Seen, _whole, detect_views
 from curio_serve.rigs.rig import check_cam_from_rig, read_rig_file
 from scipy.spatial.transform import Rotation
 
@@ -106,6 +106,20 @@ def test_a_shipped_model_sees_one_photograph_twice_and_agrees() -> None:
     longer = PinholeCamera(np.diag([1.8, 1.8, 1]) @ camera.matrix)  # the wrong K: everything is 1.8 times as far
     detect_views(detector, [RigView(pixels, longer, np.eye(4))] * 2, results=results)
     assert results[1].detections[0].outside_trained_range
+
+
+def test_a_view_errs_along_its_own_ray() -> None:
+    camera = PinholeCamera(np.array(json.loads((ROOT / "samples" / "camera.json").read_text())["camera_matrix"]))
+    pixels = np.ascontiguousarray(cv2.imread(str(ROOT / "samples" / "03.jpg"))[..., ::-1])
+    detector = Detector(open_model(ROOT / "models" / "ape"))
+    kinds = {kind.name: kind for kind in detector.model.spec.objects}
+    for turn_deg in (0, 90):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
+        (seen,) = _whole(detector, 0, RigView(pixels, camera, pose), kinds, lambda: None)
+        variances, axes = np.linalg.eigh(seen.covariance_m2)
+        assert variances[2] > 4 * variances[1]
+        assert abs(axes[:, 2] @ seen.translation_m) / np.linalg.norm(seen.translation_m) > 0.99
 
 
 def test_a_model_without_rotations_is_refused() -> None:
@@ -216,6 +230,8 @@ def test_curio_detect_takes_a_folder_of_each_camera(models_dir: Path, tmp_path: 
         run(DetectArguments(call.model, call.images[:1], rig=rig))
     with pytest.raises(UsageError, match="--camera"):
         run(DetectArguments(call.model, call.images, rig=rig, camera=rig))
+    with pytest.raises(UsageError, match="--rig and --mesh"):
+        run(DetectArguments(call.model, call.images, rig=rig, mesh=(rig,)))
     with pytest.raises(UsageError, match="JSON Lines"):
         run(DetectArguments(call.model, call.images, rig=rig, format="csv"))
     with pytest.raises(UsageError, match="behind a server"):

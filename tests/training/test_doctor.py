@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -170,3 +171,11 @@ def test_a_model_is_tried_on_every_provider(tmp_path: Path) -> None:
     assert [finding.text for finding in examine_files(Subjects(model=version))][1:] == [
         "not compared: there is no golden.npz beside model.onnx"
     ]
+
+
+def test_kinds_of_photographs_that_are_not_served(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    random = np.random.default_rng(0)
+    for name in ("a.png", "b.bmp", "c.tif"):
+        cv2.imwrite(str(tmp_path / name), random.integers(0, 255, (60, 80, 3), dtype=np.uint8))
+    _, findings = run(["--photos", str(tmp_path)], capsys)
+    assert findings["photograph kind"].startswith("warning 2 are BMP or TIFF (b.bmp and 1 more)")

@@ -15,6 +15,7 @@ from curio_train.errors import CurioError
 TOO_FEW = "too few"
 """The fault of a folder with few photographs."""
 
+_NOT_SERVED = (".bmp", ".tif", ".tiff")
 _SAME_FOCAL = 0.15  # focal lengths in EXIF are nominal, and rounded to whole millimetres
 _FULL_FRAME_WIDTH_MM = 36.0
 
@@ -40,7 +41,7 @@ def examine_photographs(
     findings = [*_unreadable(broken, len(there))]
     if photographs:
         findings += [_sizes(folder, photographs, there.note), *_count(photographs, there.note), *_turned(photographs)]
-        findings += [*_other_camera(photographs, camera), *examine_content(photographs)]
+        findings += [*_not_served(photographs), *_other_camera(photographs, camera), *examine_content(photographs)]
     return photographs, findings
 
 
@@ -83,6 +84,15 @@ def _count(photographs: Sequence[Photograph], note: str) -> Iterator[Finding]:
         )
         remedy = f"Take {FEWEST_TO_LEARN_FROM} or more, from all sides and in the light of later use"
         yield Finding("photograph count", "warning", text, remedy, fault=TOO_FEW)
+
+
+def _not_served(photographs: Sequence[Photograph]) -> Iterator[Finding]:
+    """Kinds of files that training reads and detection does not."""
+    others = [photo for photo in photographs if photo.path.suffix.lower() in _NOT_SERVED]
+    if others:
+        text = f"{len(others)} are BMP or TIFF ({named(others)}), which training reads and curio-detect does not"
+        remedy = "To detect in them, convert them to PNG, JPEG or WebP"
+        yield Finding("photograph kind", "warning", text, remedy, fault="not served")
 
 
 def _turned(photographs: Sequence[Photograph]) -> Iterator[Finding]:
