@@ -4,6 +4,7 @@ The command line, ``config.json`` of a run folder and the training loop share th
 is its help text.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -197,10 +198,10 @@ class Recipe:
             "gradient_penalty_every",
             "budget_images",
         ):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected more than 0")
         for name in ("matrix_learning_rate", "critic_learning_rate", "warm_up_steps", "final_learning_rate"):
-            if not getattr(self, name) >= 0:
+            if not 0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected 0 or more")
         if not 0 <= self.sleep_drawn <= 1:
             raise UsageError(f"--sleep-drawn {self.sleep_drawn} is no fraction, expected 0 to 1")

@@ -51,7 +51,7 @@ def end(
         say(f"{run}: writing report and model")
         with SecondProcess(report_training, run, cache) as reporting:
             told = functools.cache(lambda: _told(reporting.result, warn))
-            return _exported(run, config.world.camera, told, ahead.model)
+            return _exported(run, config.world.camera, told, say, ahead.model)
     say(f"{run}: writing the report")
     try:
         verdict = report_training(run, cache)
@@ -59,7 +59,7 @@ def end(
         verdict = _told(exc, warn)
     if isinstance(config.world, CaptureOptions):
         say(f"{run}: writing the model, which takes a minute or two")
-        return _exported(run, config.world.camera, lambda: verdict)
+        return _exported(run, config.world.camera, lambda: verdict, say)
     viewed = "" if config.world.is_flat else f", or curio-view {run}"
     return (
         f"to see what it learned: {run / REPORT_FILE}{viewed}\n"
@@ -75,7 +75,11 @@ def _told(verdict: str | CurioError, warn: Callable[[str], None]) -> str:
 
 
 def _exported(
-    run: Path, camera: Path, verdict: Callable[[], str], traced: "Callable[[Graph], ModelProto | None]" = lambda _: None
+    run: Path,
+    camera: Path,
+    verdict: Callable[[], str],
+    say: Callable[[str], None],
+    traced: "Callable[[Graph], ModelProto | None]" = lambda _: None,
 ) -> str:
     from curio_train.export.write_model import export
 
@@ -85,13 +89,16 @@ def _exported(
         return found
 
     models = run / MODELS_FOLDER
+    again = shlex.join(["curio-export", str(run), "--out", str(models)])
     try:
         done = export(run, models, ahead=model)
     except CurioError as exc:
         raise ExportError(
-            f"{run} is trained and whole, but no model could be made of it ({exc}). Once that is put right: "
-            f"{shlex.join(['curio-export', str(run), '--out', str(models)])}"
+            f"{run} is trained and whole, but no model could be made of it ({exc}). Once that is put right: {again}"
         ) from exc
+    except KeyboardInterrupt:
+        say(f"{run} is trained and whole; to make its model: {again}")
+        raise
     said = verdict()
     return (
         f"{done.path}: the model, {done.num_bytes / 1e6:.1f} MB; what it finds in the photographs: {run}/report.html\n"
