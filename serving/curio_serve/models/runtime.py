@@ -97,6 +97,9 @@ def open_session(data: bytes, where: str, providers: Sequence[str]) -> "onnxrunt
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
+    options.enable_mem_pattern = (
+        False  # plans of memory take more of it (docs/experiments/serving.md), and no less time
+    )
     options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
         # Without its own fallback, which prints to standard output and computes on the CPU.
