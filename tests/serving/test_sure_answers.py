@@ -12,6 +12,7 @@ from curio_serve.errors import ArgumentError
 from curio_serve.imaging.camera import PinholeCamera, scaling
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
+from curio_serve.models.repeated import AGREEMENT_POWER
 from curio_serve.rigs.detect_views import RigView, detect_views
 from curio_serve.tracking.stream import FollowingStream
 from scipy.spatial.transform import Rotation
@@ -108,3 +109,18 @@ def test_views_share_the_pixels_of_a_request(pixels: np.ndarray) -> None:
     refuse_many_pixels(views, 3 * 640 * 480)
     with pytest.raises(ArgumentError, match=r"views up to views\[2\] have 921600 pixels together; at most 900000"):
         refuse_many_pixels(views, 900_000)
+
+
+def test_several_reads_are_no_surer_than_one(ape: Detector) -> None:
+    """Backgrounds without the object: confidence of agreeing reads is higher, and the threshold is of single reads."""
+    random = np.random.default_rng(0)
+    (one,) = ape.model.spec.reliability.objects
+    read_often, statuses = Detector(ape.model, 3), []
+    for _ in range(12):
+        coarse = random.integers(0, 255, (12, 16, 3), dtype=np.uint8)
+        frame = cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC)
+        (found,) = read_often.detect(frame, CAMERA)[0].detections
+        share = found.confidence ** (1 / AGREEMENT_POWER)
+        statuses.append((found.status == SURE, share >= one.min_confidence, found.confidence >= one.min_confidence))
+    assert all(is_sure == by_share for is_sure, by_share, _ in statuses)
+    assert any(by_confidence and not by_share for _, by_share, by_confidence in statuses), "the two differ in some"

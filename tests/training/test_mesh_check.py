@@ -84,3 +84,12 @@ def test_a_mesh_cannot_be_compared_without_a_box(folder: Path, box_px: Any) -> N
 def test_what_is_no_rotation_is_not_drawn(folder: Path, rotation: np.ndarray) -> None:
     with pytest.raises(DataError, match="expected rows at right angles"):
         drawn(found(folder, "tall", rotation=rotation.tolist(), box_px=None), f"{folder}/tall.ply")
+
+
+@pytest.mark.parametrize("form", ["glb", "usd", "rrd"])
+def test_options_of_pictures_are_refused_for_other_formats(folder: Path, form: Any) -> None:
+    options = RenderOptions(height=100, path_traced=True)
+    with pytest.raises(UsageError, match="--height, --path-traced: for pictures"):
+        list(draw(found(folder, "tall"), folder, MeshFiles((f"{folder}/tall.ply",), "m"), None, options, form))
+    with pytest.raises(UsageError, match="--turn-deg nan"):
+        RenderOptions(turn_deg=float("nan"))

@@ -21,8 +21,8 @@ from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
 from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Rows, Values
 from curio_serve.models.model import Model, Outputs, Slot
 from curio_serve.models.object_frames import transformed
-from curio_serve.models.reliability import add_interval, calibrated, region_status, status_of
-from curio_serve.models.repeated import RepeatedReader
+from curio_serve.models.reliability import add_interval, calibrated, region_status, status_of, uncalibrated
+from curio_serve.models.repeated import AGREEMENT_POWER, RepeatedReader
 from curio_serve.models.stages.crop_stage import CropPose
 
 if TYPE_CHECKING:
@@ -179,11 +179,19 @@ class Detector:
         """Write into a result which of its detections are sure, and within which intervals."""
         reliability, center_of = self.model.spec.reliability, {slot.object: slot.center for slot in self.model.slots}
         for detection in result.detections:
-            detection.status = status_of(reliability, detection.object, detection.confidence)
+            confidence = self._of_one_read(detection.confidence)
+            detection.status = status_of(reliability, detection.object, confidence)
             center = [center_of[detection.object]]
             (middle,) = transformed(center, detection.rotation or _UPRIGHT, detection.translation_m)
-            add_interval(detection, reliability, math.hypot(*middle))
+            add_interval(detection, reliability, confidence, math.hypot(*middle))
         result.status = region_status(result.detections)
+
+    def _of_one_read(self, confidence: float) -> float:
+        """What thresholds and bounds go by, which were measured on single reads; that of reads that agree is higher."""
+        if self._repeated is None:
+            return confidence
+        share = uncalibrated(self._calibration, confidence) ** (1 / AGREEMENT_POWER)
+        return calibrated(self._calibration, share)
 
     def _calibrated(self, values: Values) -> Values:
         if "confidence" not in values:

@@ -87,6 +87,15 @@ def calibrated(calibration: Sequence[float], confidence: float) -> float:
     return 1 / (1 + math.exp(-min(max(logit, -_MOST_LOGIT), _MOST_LOGIT)))
 
 
+def uncalibrated(calibration: Sequence[float], confidence: float) -> float:
+    """The confidence that the network gives where one is answered: undoes :func:`calibrated`."""
+    if not calibration:
+        return confidence
+    weight, offset = calibration
+    inside = min(max(confidence, _LEAST), 1 - _LEAST)
+    return calibrated((1 / weight, -offset / weight), inside)
+
+
 def bounds_of(one: ObjectReliability, confidence: float) -> PoseBounds | None:
     """The error bounds of an answer with a given confidence; None if it is unsure or nothing was measured."""
     row = bisect_right([bounds.min_confidence for bounds in one.bounds], confidence) - 1
@@ -101,16 +110,17 @@ def status_of(reliability: Reliability, object_: str, confidence: float) -> Dete
     return DETECTION_STATUS_SURE if confidence >= one.min_confidence else DETECTION_STATUS_UNSURE
 
 
-def add_interval(detection: Detection, reliability: Reliability, distance_m: float) -> None:
+def add_interval(detection: Detection, reliability: Reliability, confidence: float, distance_m: float) -> None:
     """Write the interval of a pose of one image into its detection, if the model has one for it.
 
     Args:
-        detection: With its confidence.
+        detection: Of the object.
         reliability: Of the model.
+        confidence: As one read of the image would give it.
         distance_m: Of the object's middle.
     """
     one = _of(reliability, detection.object)
-    bounds = None if one is None else bounds_of(one, detection.confidence)
+    bounds = None if one is None else bounds_of(one, confidence)
     if bounds is not None:
         interval = detection.interval
         interval.level, interval.lateral_m = reliability.level, bounds.lateral_m

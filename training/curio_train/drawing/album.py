@@ -1,5 +1,6 @@
 """A file of scenes to a folder of pictures, or of files for 3D applications."""
 
+import dataclasses
 import importlib.util
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -53,14 +54,16 @@ def draw(
             recording, with photographs, cameras, boxes and confidence over time.
 
     Raises:
-        UsageError: Both meshes and a world, or neither where one is needed; one mesh without a name for several kinds
-            of objects; or the format's extra is not installed.
+        UsageError: Options of pictures for another format; both meshes and a world, or neither where one is needed; one
+            mesh without a name for several kinds of objects; or the format's extra is not installed.
         DataError: The file of scenes, a photograph or the folder; or a mesh is not of the object that was detected.
         MeshError: A mesh.
         RendererError: No usable libLLVM.
     """
     if meshes.files and world:
         raise UsageError("--mesh and --world exclude each other: a world brings its own meshes")
+    if form != "png" and (given_flags := _of_pictures(options)):
+        raise UsageError(f"{', '.join(given_flags)}: for pictures; --format {form} writes none, leave it out")
     if form in _PACKAGES and importlib.util.find_spec(_PACKAGES[form]) is None:
         raise UsageError(f"--format {form} needs the extra {_EXTRAS[form]}: pip install 'curio-pose[{_EXTRAS[form]}]'")
     given = SceneContext.of_world(mesh_world(world)) if world else scene_context(meshes)
@@ -72,6 +75,13 @@ def draw(
         path = out / f"{scene.name}.{form}"
         _write(path, _content(scene, around, options, form))
         yield path
+
+
+def _of_pictures(options: RenderOptions) -> list[str]:
+    """The flags that are not as they are unless given."""
+    usual = RenderOptions()
+    fields = (field.name for field in dataclasses.fields(options))
+    return [f"--{name.replace('_', '-')}" for name in fields if getattr(options, name) != getattr(usual, name)]
 
 
 def _with_context(scenes: Path, given: SceneContext | None) -> Iterator[tuple[Scene, SceneContext]]:

@@ -103,6 +103,8 @@ class RenderOptions:
         """Refuse what cannot be drawn."""
         if self.samples < 1 or (self.height is not None and self.height < 1):
             raise UsageError(f"found --samples {self.samples} and --height {self.height}, expected at least 1")
+        if not math.isfinite(self.turn_deg):
+            raise UsageError(f"--turn-deg {self.turn_deg}: expected degrees")
         if self.over_photograph and self.turn_deg:
             raise UsageError("--over-photograph and --turn-deg exclude each other: the photograph shows one side alone")
 

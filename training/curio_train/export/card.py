@@ -123,7 +123,11 @@ def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[s
     if made.chooses:
         yield "input", "`slots`, int64 [wanted]: which rows of the outputs to answer; all where it is left out"
     yield "weights", made.weights
-    yield "to train it further", f"`curio-train {spec.world} --init models/{spec.name}/{version}`, other flags as above"
+    if not terms.templates:  # nothing of those was trained
+        yield (
+            "to train it further",
+            f"`curio-train {spec.world} --init models/{spec.name}/{version}`, other flags as above",
+        )
     yield "torch to onnxruntime", f"differ by at most {spec.parity_max_abs_error:.2g} in any output"
 
 
