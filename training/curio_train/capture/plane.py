@@ -112,7 +112,9 @@ class CameraPoseFile:
         return [self.file.parent / str(name) for name in names if name is not None]
 
     def check_same_viewpoint(self, photograph: Path, background: Path) -> None:
-        """Refuse a photograph taken from another height or tilt than the background image; the azimuth may differ.
+        """Refuse a photograph taken from another height or tilt than the background image, or from another place.
+
+        The azimuth may differ where the photograph names its own image of the empty scene.
 
         Raises:
             CameraError: Says how they differ.
@@ -127,6 +129,16 @@ class CameraPoseFile:
                 f"{self.flag} {self.file}: {photograph.name} was taken {heights[0]:.3g} m above the plane and tilted "
                 f"by {tilt:.1f} degrees to {background.name}, taken at {heights[1]:.3g} m; a camera that moves has to "
                 f"keep its height within {_SAME_HEIGHT:.0%} and its tilt within {_SAME_TILT_DEG:g} degrees"
+            )
+        turned = np.degrees(np.arccos(np.clip((np.trace(one[:3, :3] @ other[:3, :3].T) - 1) / 2, -1, 1)))
+        centers = [-matrix[:3, :3].T @ matrix[:3, 3] for matrix in (one, other)]
+        moved_m = float(np.linalg.norm(centers[0] - centers[1]))
+        is_elsewhere = turned > _SAME_TILT_DEG or moved_m > _SAME_HEIGHT * heights[1]
+        if is_elsewhere and self.background_image(photograph) is None:
+            raise CameraError(
+                f"{self.flag} {self.file}: {photograph.name} was taken {moved_m:.3g} m beside {background.name} and "
+                f"turned by {turned:.0f} degrees to it, so that image does not show the scene behind its parts; name "
+                'an image of the empty scene from there as its "plate"'
             )
 
     def _where(self, photograph: Path) -> str:

@@ -126,7 +126,7 @@ def refuse_unfit(options: CaptureOptions, *, self_training: bool = True) -> list
     subjects += [Subjects(mesh, unit, body) for mesh in others]
     found = [finding for subject in subjects for finding in examine_files(subject, empty)]
     found = [finding for finding in found if finding.state != "good" and finding.fault != _HARMLESS]
-    if not self_training and options.plane is None:
+    if not self_training or options.plane is not None:  # the count matters where a part's model learns from them
         found = [finding for finding in found if finding.fault != TOO_FEW]
     if options.backgrounds is not None:
         _, scenes = examine_photographs(options.backgrounds, None)
