@@ -172,6 +172,33 @@ def test_distortion_beside_focal_lengths_counts(tmp_path: Path) -> None:
         read_camera_file(path)
 
 
+@pytest.mark.parametrize("name", ["dist_coeff", "distCoeffs", "D", "distortion_coeffs", "Distortion_Coefficients"])
+@pytest.mark.parametrize("suffix", ["json", "yml"])
+def test_a_lens_under_a_name_that_is_not_read_is_refused(tmp_path: Path, suffix: str, name: str) -> None:
+    path = tmp_path / f"camera.{suffix}"
+    if suffix == "json":
+        path.write_text(json.dumps({"camera_matrix": K.tolist(), name: [0.1, 0, 0, 0, 0]}))
+    else:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        storage.write("camera_matrix", K)
+        storage.write(name, np.array([0.1, 0, 0, 0, 0]))
+        storage.release()
+    with pytest.raises(CameraError, match=f"found {name}, which is not read"):
+        read_camera_file(path)
+
+
+def test_fisheye_and_sizes_by_their_other_names(tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps({"camera_matrix": K.tolist(), "image_width": 640, "image_height": 480}))
+    assert read_camera_file(path).camera_for("a.png").size == (640, 480)
+    storage = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("fisheye_model", 1)
+    storage.write("camera_matrix", K)
+    storage.release()
+    with pytest.raises(CameraError, match="fisheye_model is set"):
+        read_camera_file(tmp_path / "camera.yml")
+
+
 def test_bop_scene_camera_is_of_its_own_scene(tmp_path: Path) -> None:
     for scene in ("000001", "000002"):
         (tmp_path / scene / "rgb").mkdir(parents=True)

@@ -184,7 +184,7 @@ def test_a_stream_goes_on_after_frames_that_do_not_belong_to_it(client: PoseClie
         *["CameraError"] * 2,
         *["ArgumentError"] * 5,
     ]
-    assert "0.9, the frame before was taken at 1" in answers[1].error.message
+    assert "0.900000, 0.1 s before that of the frame before" in answers[1].error.message
     assert "320x200 pixels, those before it 320x240" in answers[3].error.message
     assert last.results[0].detections[0].track.age_s == pytest.approx(0.1)
     assert anew.results[0].detections[0].track.age_s == 0

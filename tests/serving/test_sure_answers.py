@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from curio_proto.v1 import detector_pb2 as messages
 from curio_serve.api.rig_request import refuse_many_pixels
-from curio_serve.errors import ArgumentError
+from curio_serve.errors import ArgumentError, CameraError
 from curio_serve.imaging.camera import PinholeCamera, scaling
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
@@ -124,3 +124,11 @@ def test_several_reads_are_no_surer_than_one(ape: Detector) -> None:
         statuses.append((found.status == SURE, share >= one.min_confidence, found.confidence >= one.min_confidence))
     assert all(is_sure == by_share for is_sure, by_share, _ in statuses)
     assert any(by_confidence and not by_share for _, by_share, by_confidence in statuses), "the two differ in some"
+
+
+def test_what_cannot_be_asked_of_a_detector_is_refused(ape: Detector, pixels: np.ndarray) -> None:
+    for most in (0, -1):
+        with pytest.raises(ArgumentError, match=f"max_detections is {most}"):
+            ape.detect(pixels, CAMERA, max_detections=most)
+    with pytest.raises(CameraError, match="the camera is a ndarray; expected a PinholeCamera"):
+        ape.detect(pixels, CAMERA.matrix)  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ from curio_serve.batch.images.remote_files import is_url
 from curio_serve.batch.images.source_image import SourceImage
 from curio_serve.batch.images.sources import is_recording, names_recordings
 from curio_serve.batch.results.formats import Bop, Csv, JsonLines, ResultFormat, bop_object_ids
-from curio_serve.batch.results.result_file import ResultFile
+from curio_serve.batch.results.result_file import ResultFile, values_of
 from curio_serve.batch.results.result_parts import ResultParts
 from curio_serve.errors import CameraError, UsageError
 
@@ -66,24 +66,25 @@ def open_output(
     if isinstance(form, ResultFormat):
         names = [(estimator.name, estimator.version) for estimator in estimators]
         if arguments.out is not None and is_url(arguments.out):
-            return ResultParts(arguments.out, form, names, overwrite=arguments.overwrite)
+            camera_of = _camera_of(estimators)
+            return ResultParts(arguments.out, form, names, overwrite=arguments.overwrite, camera_of=camera_of)
         path = None if arguments.out is None else Path(arguments.out)
-        return ResultFile(path, form, names, overwrite=arguments.overwrite, matrix_of=_matrix_of(estimators))
+        return ResultFile(path, form, names, overwrite=arguments.overwrite, camera_of=_camera_of(estimators))
     from curio_serve.batch.results.recorded_poses import PoseRecording  # of an extra
 
     assert arguments.out is not None
     return PoseRecording(Path(arguments.out), overwrite=arguments.overwrite)
 
 
-def _matrix_of(estimators: Sequence[Estimator]) -> Callable[[SourceImage], Sequence[float] | None]:
-    """The camera matrix of an image in the camera file of a call; None where it has none, or there is no file."""
+def _camera_of(estimators: Sequence[Estimator]) -> Callable[[SourceImage], Sequence[float]]:
+    """K and distortion of an image in the camera file of a call; none where it has none, or there is no file."""
     cameras = next((estimator.settings.cameras for estimator in estimators), None)
 
-    def matrix(image: SourceImage) -> Sequence[float] | None:
+    def camera(image: SourceImage) -> Sequence[float]:
         if cameras is None:
-            return None
+            return ()
         with suppress(CameraError):  # answering the image reports that
-            return [float(value) for value in cameras.camera_for(image.relative_name).matrix.ravel()]
-        return None
+            return values_of(cameras.camera_for(image.relative_name))
+        return ()
 
-    return matrix
+    return camera

@@ -19,7 +19,7 @@ from curio_serve.batch.images.sources import PassedOver, images
 from curio_serve.batch.instants import Instants, RigImage, refuse_other_images
 from curio_serve.batch.progress import Progress
 from curio_serve.batch.results.formats import ImageLines, ImageResult, JsonLines
-from curio_serve.batch.results.result_file import ResultFile
+from curio_serve.batch.results.result_file import ResultFile, values_of
 from curio_serve.errors import ArgumentError, CameraError, ImageError, InternalError, UsageError
 from curio_serve.imaging import image as decoding
 from curio_serve.models.detector import Detector
@@ -122,7 +122,6 @@ def read_rig(arguments: DetectArguments, models: Sequence[str]) -> list[RigCamer
             f"--rig {arguments.rig} has {len(cameras)} cameras ({names}), found {len(arguments.images)} IMAGES; "
             "expected a folder, glob or video of each camera, in the file's order"
         )
-    refuse_other_images(arguments.images, cameras)
     return cameras
 
 
@@ -141,6 +140,7 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
     cameras = read_rig(arguments, models)
     named_recordings(arguments)
     refuse_images(arguments)
+    refuse_other_images(arguments.images, cameras)
     for model in models:
         ChildCheck()(Path(model))
     runtime = Runtime(read_providers(arguments.provider))
@@ -152,8 +152,8 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
     form, passed_over, topics = JsonLines(), PassedOver(), Topics(arguments.topic, arguments.info_topic)
     names = [(model.name, model.version) for model in opened]
     path = None if arguments.out is None else Path(arguments.out)
-    matrix = cameras[0].camera.matrix.ravel().tolist()
-    with ResultFile(path, form, names, overwrite=arguments.overwrite, matrix_of=lambda _: matrix) as output:
+    first = values_of(cameras[0].camera)
+    with ResultFile(path, form, names, overwrite=arguments.overwrite, camera_of=lambda _: first) as output:
         taken = Instants([images([one], passed_over, topics) for one in arguments.images], arguments.images)
         remaining = output.unanswered(iter(taken))
         results = in_order(partial(answer_instant, estimators, form), remaining, arguments.jobs)

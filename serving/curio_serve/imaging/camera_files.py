@@ -26,6 +26,7 @@ from curio_serve.imaging.camera import PinholeCamera
 MAX_BYTES = 64 << 20
 _DISTORTION = ("distortion", "distortion_coefficients", "dist_coeffs", "dist")
 _OF_SCENE = "scene_camera.json"  # BOP's, in the folder of a scene, whose images lie in folders beside it
+_LENS = re.compile(r"d|.*dist(ort|_?coef|$).*", re.IGNORECASE)  # whatever else says something of the lens
 _COEFFICIENT = re.compile(r"[kp]\d")  # each by itself, as some calibrations write them
 _ROS_MODELS = ("", "plumb_bob", "rational_polynomial")  # OpenCV's own lenses
 
@@ -116,8 +117,8 @@ def camera_of_entry(content: Mapping[str, Any]) -> PinholeCamera:
         CameraError: It is impossible, or has something about its lens that is not read.
         TypeError: A value is of another kind; ValueError and OverflowError: a number cannot be read.
     """
-    size, distortion = _size(content.get("width"), content.get("height")), _known_lens(content)
-    return PinholeCamera(_matrix(content["camera_matrix"]), distortion, size)
+    width, height = (content.get(name, content.get(f"image_{name}")) for name in ("width", "height"))
+    return PinholeCamera(_matrix(content["camera_matrix"]), _known_lens(content), _size(width, height))
 
 
 def _matrix(values: Any) -> np.ndarray:
@@ -131,6 +132,7 @@ def _known_lens(content: Mapping[str, Any]) -> tuple[float, ...]:
     if len(given) > 1:
         raise CameraError(f"found {' and '.join(given)}; expected the distortion once")
     distortion = _distortion(content[given[0]]) if given else ()
+    _refuse_unread_lens(name for name, value in content.items() if isinstance(value, list | dict) and value)
     unread = [name for name in content if _COEFFICIENT.fullmatch(name) and content[name]]
     if unread and not given:
         raise CameraError(f"found {', '.join(sorted(unread))}; expected distortion as a list [k1, k2, p1, p2, k3]")
@@ -186,6 +188,12 @@ def camera_of_images(info: Any, topic: str) -> PinholeCamera:
     return camera_of_info(content, "k")
 
 
+def _refuse_unread_lens(names: Iterable[str]) -> None:
+    """Refuse coefficients under a name that is not read; the names are those of lists and matrices."""
+    if unread := sorted(name for name in names if _LENS.fullmatch(name) and name not in _DISTORTION):
+        raise CameraError(f"found {unread[0]}, which is not read; expected the lens as {' or '.join(_DISTORTION)}")
+
+
 def _refuse_other_lens(model: object, distortion: Iterable[float]) -> None:
     if model not in _ROS_MODELS and any(distortion):
         raise CameraError(f"distortion_model is {model!r}; expected one of {', '.join(filter(None, _ROS_MODELS))}")
@@ -203,6 +211,10 @@ def _from_yaml(text: str) -> PinholeCamera:
         matrix = _yaml_matrix(storage.getNode("camera_matrix"))
         if matrix is None:
             raise CameraError("no matrix camera_matrix; expected a file of OpenCV's or ROS's calibration")
+        names = storage.root().keys()
+        _refuse_unread_lens(name for name in names if _is_nested(storage.getNode(name)))
+        if not (fisheye := storage.getNode("fisheye_model")).empty() and fisheye.real():
+            raise CameraError("fisheye_model is set; expected OpenCV's model of ordinary lenses")
         nodes = [node for name in _DISTORTION if not (node := storage.getNode(name)).empty()]
         distortion = _yaml_matrix(nodes[0]) if nodes else None
         model = storage.getNode("distortion_model")
@@ -220,6 +232,10 @@ def _yaml_matrix(node: cv2.FileNode) -> np.ndarray | None:
         return np.array(_plain(data), float)
     matrix: np.ndarray | None = node.mat()
     return matrix
+
+
+def _is_nested(node: cv2.FileNode) -> bool:
+    return bool(node.isMap() or node.isSeq())
 
 
 def _plain(node: cv2.FileNode) -> Any:

@@ -18,7 +18,7 @@ from curio_serve.errors import ArgumentError, CameraError, CameraMissing, ImageE
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
-from curio_serve.models.instances import MAX_INSTANCES, InstanceSearch, Rows, Values
+from curio_serve.models.instances import InstanceSearch, Rows, Values, check_instances
 from curio_serve.models.model import Model, Outputs, Slot
 from curio_serve.models.object_frames import transformed
 from curio_serve.models.reliability import add_interval, calibrated, region_status, status_of, uncalibrated
@@ -104,7 +104,11 @@ class Detector:
             InternalError: The network failed.
         """
         _check_arguments(pixels, regions, min_confidence)
-        self._check_instances(max_instances)
+        if camera is not None and not isinstance(camera, PinholeCamera):
+            raise CameraError(f"the camera is a {type(camera).__name__}; expected a PinholeCamera, such as of K")
+        if max_detections is not None and max_detections < 1:
+            raise ArgumentError(f"max_detections is {max_detections}; expected at least 1, or None for all")
+        check_instances(self.model, max_instances)
         limits = _Limits(min_confidence, max_detections, max_instances)
         frame = self._frame(pixels, camera, reduction)
         crops = [
@@ -148,16 +152,6 @@ class Detector:
             outputs = self._outputs([search.image for search in going_on], before_run)
             going_on = [search for search, values in zip(going_on, outputs, strict=True) if search.take(values)]
         return [search.found for search in searches]
-
-    def _check_instances(self, max_instances: int | None) -> None:
-        if max_instances is None:
-            return
-        if not 1 <= max_instances <= MAX_INSTANCES:
-            raise ArgumentError(f"max_instances is {max_instances}; expected 1 to {MAX_INSTANCES}")
-        if self.model.camera.matrix is None:
-            raise ArgumentError(
-                f"max_instances is for poses in space; model {self.model.label} is of a flat world, leave it out"
-            )
 
     def _outputs(self, images: list[Array], before_run: Callable[[], None]) -> list[Values]:
         """The network's outputs for each image, computed a few at a time: memory stays flat however many there are."""

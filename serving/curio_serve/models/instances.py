@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from curio_serve.errors import ArgumentError
 from curio_serve.models.model import Model, Slot
 
 Array = np.ndarray
@@ -24,6 +25,22 @@ LEAST_CONFIDENCE = 0.2
 _MARGIN = 1.15  # of a box that hides an object
 _NEAREST_M = 1e-3
 _OF_SCENE = "light"
+
+
+def check_instances(model: Model, max_instances: int | None) -> None:
+    """Refuse a number of instances that cannot be asked of a model; None: it is not asked for.
+
+    Raises:
+        ArgumentError: It is out of range, or the model is of a flat world.
+    """
+    if max_instances is None:
+        return
+    if not 1 <= max_instances <= MAX_INSTANCES:
+        raise ArgumentError(f"max_instances is {max_instances}; expected 1 to {MAX_INSTANCES}")
+    if model.camera.matrix is None:
+        raise ArgumentError(
+            f"max_instances is for poses in space; model {model.label} is of a flat world, leave it out"
+        )
 
 
 class Rows(NamedTuple):

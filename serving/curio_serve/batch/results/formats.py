@@ -11,6 +11,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import PurePath
 
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
@@ -93,8 +94,8 @@ class Line:
     """(name, version), if the format has them."""
     is_error: bool = False
     """Whether the image had no answer."""
-    camera_matrix: tuple[float, ...] = ()
-    """K row after row, where the format has it and the stored pixels were not turned."""
+    camera: tuple[float, ...] = ()
+    """K row after row and then the distortion, where the format has it and the stored pixels were not turned."""
 
 
 class ResultFormat(ABC):
@@ -169,8 +170,9 @@ class JsonLines(ResultFormat):
             model = (record["model"]["name"], record["model"]["version"])
             key = "|".join(record["views"]) if "views" in record else record["image"]
             is_stored = record.get("camera_matrix") and not record.get("exif_rotation") and "error" not in record
-            matrix = tuple(float(value) for row in record["camera_matrix"] for value in row) if is_stored else ()
-            return Line(key, opens_image=True, model=model, is_error="error" in record, camera_matrix=matrix)
+            values = (*chain(*record["camera_matrix"]), *record.get("distortion", ())) if is_stored else ()
+            camera = tuple(float(value) for value in values)
+            return Line(key, opens_image=True, model=model, is_error="error" in record, camera=camera)
         except (KeyError, TypeError) as exc:
             raise ValueError("no image or model in it") from exc
 

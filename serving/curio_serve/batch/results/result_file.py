@@ -17,6 +17,7 @@ from typing import Any, BinaryIO, Protocol, TypeVar
 from curio_serve.batch.results.formats import ImageLines, Line, ResultFormat
 from curio_serve.errors import OutputError, UsageError
 from curio_serve.files import direct
+from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.systems import APPEND_FLAGS, lock
 
 
@@ -28,7 +29,8 @@ class Named(Protocol):
 
 
 NamedT = TypeVar("NamedT", bound=Named)
-_SAME_PX = 0.01  # between entries of K
+_SAME_PX, _SAME_LENS = 0.01, 1e-6  # between entries of K, and coefficients of the lens
+_LONGEST_CAMERA = 9 + 8
 
 
 class ResultFile:
@@ -39,8 +41,8 @@ class ResultFile:
         form: Format of its lines.
         models: Names and versions of those whose results it holds, in the order of an image's lines.
         overwrite: Drop what is in it.
-        matrix_of: K of an image, row after row, by which it would be answered; None: not known. Lines by another one
-            are not gone on with.
+        camera_of: The camera by which an image would be answered, as in :class:`Line`; none: not known. Lines by
+            another one are not gone on with.
 
     Raises:
         OutputError: The file cannot be opened for writing, or another process writes it.
@@ -58,14 +60,14 @@ class ResultFile:
         models: Sequence[tuple[str, int]],
         *,
         overwrite: bool = False,
-        matrix_of: Callable[[Any], Sequence[float] | None] = lambda _: None,
+        camera_of: Callable[[Any], Sequence[float]] = lambda _: (),
     ) -> None:
         self.num_images = 0
         self.num_errors = 0
         self._path = path
         self._form = form
         self._models = tuple(models)
-        self._matrix_of = matrix_of
+        self._camera_of = camera_of
         self._descriptor = os.dup(1) if path is None else _open_locked(path)
         self._is_regular = path is not None and stat.S_ISREG(os.fstat(self._descriptor).st_mode)
         self._overwrites = self._is_regular and overwrite
@@ -181,19 +183,22 @@ class ResultFile:
             self.num_images += 1
             found = self._form.key(image.name)
             if found == last.key:
-                self._refuse_other_camera(last, self._matrix_of(image), number)
+                self._refuse_other_camera(last, self._camera_of(image), number)
                 self.num_errors += last.is_error
                 return
             if self._form.has_line_for_every_image:
                 raise self._mismatch(number, f"image {last.key} where the images given have {found}")
         raise self._mismatch(number, f"image {last.key}, which is not among the images given or not in this order")
 
-    def _refuse_other_camera(self, last: "_Image", matrix: Sequence[float] | None, number: int) -> None:
-        if not last.camera_matrix or matrix is None:
+    def _refuse_other_camera(self, last: "_Image", camera: Sequence[float], number: int) -> None:
+        if not last.camera or not camera:
             return
-        if any(abs(a - b) > _SAME_PX for a, b in zip(last.camera_matrix, matrix, strict=True)):
+        before, now = (list(values) + [0.0] * (_LONGEST_CAMERA - len(values)) for values in (last.camera, camera))
+        pairs = zip(before, now, [_SAME_PX] * 9 + [_SAME_LENS] * (_LONGEST_CAMERA - 9), strict=True)
+        if any(abs(a - b) > tolerance for a, b, tolerance in pairs):
             raise self._mismatch(
-                number, f"poses by another camera (fx {last.camera_matrix[0]:g} px; it is {matrix[0]:g} px now)"
+                number,
+                f"poses by another camera (fx {before[0]:g} px, k1 {before[9]:g}; now {now[0]:g} px, {now[9]:g})",
             )
 
     def _mismatch(self, number: int, found: str) -> UsageError:
@@ -215,14 +220,20 @@ class _Image:
     """The models of its lines, if the format names them."""
     is_error: bool = False
     """Whether a model had no answer."""
-    camera_matrix: tuple[float, ...] = ()
+    camera: tuple[float, ...] = ()
     """See :class:`Line`."""
 
     def add(self, line: Line) -> None:
         if line.model is not None and line.model not in self.models:
             self.models.append(line.model)
         self.is_error |= line.is_error
-        self.camera_matrix = self.camera_matrix or line.camera_matrix
+        self.camera = self.camera or line.camera
+
+
+def values_of(camera: PinholeCamera) -> tuple[float, ...]:
+    """A camera as lines have it: K row after row, then the distortion if there is any."""
+    lens = camera.distortion if any(camera.distortion) else ()
+    return (*map(float, camera.matrix.ravel()), *map(float, lens))
 
 
 def _label(models: Sequence[tuple[str, int]]) -> str:

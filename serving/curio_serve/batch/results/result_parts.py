@@ -9,9 +9,10 @@ last part alone; the next run reads the parts back, checks them as :class:`Resul
 import posixpath
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from curio_serve.batch.images.remote_files import RemoteFiles, is_store
 from curio_serve.batch.results.formats import ImageLines, ResultFormat
@@ -33,6 +34,7 @@ class ResultParts:
         models: As of :class:`ResultFile`.
         overwrite: Remove the parts that are there.
         every_s: Seconds from one part to the next.
+        camera_of: As of :class:`ResultFile`.
 
     Raises:
         UsageError: The URL is of no store, or the folder holds something else.
@@ -48,6 +50,7 @@ class ResultParts:
         *,
         overwrite: bool = False,
         every_s: float = _PART_S,
+        camera_of: Callable[[Any], Sequence[float]] = lambda _: (),
     ) -> None:
         if not is_store(url):
             raise UsageError(f"--out {url}: cannot be written; expected a file, s3://… or gs://…")
@@ -67,7 +70,7 @@ class ResultParts:
                 joined.write(self._read(name))
                 self._starts.append(joined.tell())
         self._path = path
-        self._file = ResultFile(path, form, models)
+        self._file = ResultFile(path, form, models, camera_of=camera_of)
         self._every_s, self._last_put = every_s, time.monotonic()
 
     @property
