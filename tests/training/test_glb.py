@@ -5,10 +5,12 @@ import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from curio_train.drawing.album import scenes_of
 from curio_train.drawing.glb import from_glb, to_glb
 from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Placed, Scene, mesh_world, read_scenes
@@ -103,6 +105,46 @@ def test_another_programs_file_is_refused(tmp_path: Path) -> None:
     path.write_bytes(trimesh.Scene([trimesh.creation.box()]).export(file_type="glb"))
     with pytest.raises(DataError, match="no camera written by curio"):
         from_glb(path)
+
+
+def _edited(file: Path, edit: Callable[[dict[str, Any]], object]) -> Path:
+    """The file after its description was changed, as applications change it."""
+    content = file.read_bytes()
+    length = int.from_bytes(content[12:16], "little")
+    tree = json.loads(content[20 : 20 + length])
+    edit(tree)
+    out = file.with_name("edited.GLB")
+    out.write_bytes(_of_tree(tree))
+    return out
+
+
+def _number(tree: dict[str, Any], name: str) -> int:
+    return next(number for number, node in enumerate(tree["nodes"]) if node.get("name") == name)
+
+
+def test_a_group_that_was_moved_takes_its_objects_along(file: Path) -> None:
+    def group(tree: dict[str, Any]) -> None:
+        child = _number(tree, "02-box")
+        for node in tree["nodes"]:
+            node["children"] = [number for number in node.get("children", ()) if number != child]
+        tree["nodes"].append({"name": "empty", "translation": [0.1, 0.0, 0.0], "children": [child]})
+
+    (found,) = scenes_of(_edited(file, group))
+    before, after = scene().objects[2].pose, found.objects[2].pose
+    assert after.translation_m - before.translation_m == pytest.approx([0.1, 0, 0], abs=1e-5)
+    assert after.rotation == pytest.approx(before.rotation, abs=1e-5)
+    assert found.objects[0].pose.translation_m == pytest.approx(scene().objects[0].pose.translation_m, abs=1e-5)
+
+
+@pytest.mark.parametrize("scale", [[2.0, 2, 2], [-1.0, 1, 1]])
+def test_an_object_that_was_scaled_is_refused(file: Path, scale: list[float]) -> None:
+    def change(tree: dict[str, Any]) -> None:
+        node = tree["nodes"][_number(tree, "02-box")]
+        node.pop("matrix", None)
+        node["scale"] = scale
+
+    with pytest.raises(DataError, match="02-box is scaled or mirrored"):
+        from_glb(_edited(file, change))
 
 
 def _of_tree(tree: object) -> bytes:

@@ -10,6 +10,7 @@ from curio_train.commands.prepare import prepared
 from curio_train.config import RunConfig
 from curio_train.data.photographs import FEWEST_TO_LEARN_FROM, NUM_JUDGED
 from curio_train.errors import MeshError
+from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.meshes.meshes import to_ply
 from curio_train.meshes.shapes import box, painted
 from curio_train.worlds import build
@@ -57,6 +58,17 @@ def test_photographs_that_are_added_never_judge(options: CaptureOptions, tmp_pat
     for name in judged:
         (options.photos / f"{name}.png").unlink()
     assert split(run)[0], "others judge where all of these are gone"
+
+
+def test_a_run_that_goes_on_from_another_keeps_its_photographs(options: CaptureOptions, tmp_path: Path) -> None:
+    photograph(options.photos, *(f"b{number:03}" for number in range(FEWEST_TO_LEARN_FROM)))
+    first = prepared(RunConfig(options), tmp_path, pytest.fail, lambda _: None)
+    RunFolder(tmp_path / "first", first).write_config(new=True)
+    photograph(options.photos, *(f"a{number:03}" for number in range(30)))
+    for init in (tmp_path / "first", tmp_path / "first" / "models" / "part" / "1"):
+        again = prepared(replace(RunConfig(options), init=init), tmp_path, pytest.fail, lambda _: None)
+        assert isinstance(again.world, CaptureOptions)
+        assert split(again.world)[0] == split(first.world)[0]  # type: ignore[arg-type]
 
 
 def test_a_mesh_that_has_changed_is_refused(options: CaptureOptions, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from curio_train.commands.linemod_data import with_linemod
 from curio_train.config import MethodName, NetworkConfig, RunConfig
 from curio_train.errors import DataError, UsageError
-from curio_train.learning.runs.configuration import CONFIG_FILE
+from curio_train.learning.runs.configuration import CONFIG_FILE, load_config
 from curio_train.worlds.options import CaptureOptions, LinemodOptions
 
 
@@ -56,7 +56,7 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
 
         for doubt in refuse_unfit(options, self_training=config.recipe.self_training > 0):
             warn(doubt)
-        options = _with_sha256(_with_judged(_with_paint(options, report)))
+        options = _with_sha256(_with_judged(_with_paint(options, report), config.init))
         return replace(config, world=options, network=_usual_network(config, options))
     return config
 
@@ -144,8 +144,11 @@ def _with_sha256(options: CaptureOptions) -> CaptureOptions:
     return replace(options, mesh_sha256=tuple(mesh.sha256 for mesh in meshes))
 
 
-def _with_judged(options: CaptureOptions) -> CaptureOptions:
-    """In free space, choose the photographs that judge the model, and set their names."""
+def _with_judged(options: CaptureOptions, init: Path | None) -> CaptureOptions:
+    """In free space, choose the photographs that judge the model, and set their names.
+
+    They are those of the run that the network begins with, if that learned from the same folder.
+    """
     from curio_train.camera import load_intrinsics
     from curio_train.worlds.capture import CapturePhotographs
     from curio_train.worlds.single_object.two_stage import frame_camera
@@ -153,8 +156,19 @@ def _with_judged(options: CaptureOptions) -> CaptureOptions:
     if options.plane is not None:
         return options
     camera = load_intrinsics(options.camera)
-    photographs = CapturePhotographs(options.photos, options.background, camera, frame_camera(camera))
+    photographs = CapturePhotographs(
+        options.photos, options.background, camera, frame_camera(camera), _judged_before(options, init)
+    )
     return replace(options, judged=photographs.names_judged())
+
+
+def _judged_before(options: CaptureOptions, init: Path | None) -> tuple[str, ...]:
+    """Names of the photographs in the folder that judged the run, or the model within one, that a network is of."""
+    if init is None:
+        return ()
+    run = next((folder for folder in (init, *init.absolute().parents[:3]) if (folder / CONFIG_FILE).is_file()), None)
+    before = None if run is None else load_config(run).world
+    return before.judged if isinstance(before, CaptureOptions) and before.photos == options.photos else ()
 
 
 def _with_paint(options: CaptureOptions, report: Callable[[str], None]) -> CaptureOptions:

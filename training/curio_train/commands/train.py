@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -238,7 +239,8 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         loss = "" if progress.image_loss is None else f", image loss {progress.image_loss:.4g}"
         print(f"{path}: {outcome.value} after {progress.images:,} images in {progress.seconds / 60:.1f} minutes{loss}")
         if outcome is Outcome.INTERRUPTED:
-            print(f"go on with: curio-train {world_name(config)} --resume {path}", file=sys.stderr)
+            again = shlex.join(["curio-train", world_name(config), "--resume", str(path)])
+            print(f"go on with: {again}", file=sys.stderr)
         else:
             report(end(path, config, session.cache, warn, report))
     if outcome is Outcome.INTERRUPTED and interruption.signum is not None:

@@ -117,7 +117,7 @@ def scenes_of(file: Path) -> Iterator[Scene]:
     Raises:
         DataError: The file cannot be read, or holds no scene.
     """
-    return iter([from_glb(file)]) if file.suffix == ".glb" else read_scenes(file)
+    return iter([from_glb(file)]) if file.suffix.lower() == ".glb" else read_scenes(file)
 
 
 def scene_context(meshes: MeshFiles) -> SceneContext | None:

@@ -8,6 +8,7 @@ What glTF has no field for (K, colour, confidence, the ambient light) is in the 
 import json
 import math
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from curio_train.meshes.meshes import MAX_BYTES, Mesh
 _LUX = math.pi  # of a directional light of strength 1: the irradiance of a surface that faces it
 _CAMERA, _SUN = "camera", "light"
 _EXTRAS = "curio"
+_SHEAR = 1e-3  # of a rotation times its transpose, as applications round it
 
 
 def to_glb(scene: Scene, context: SceneContext) -> bytes:
@@ -70,11 +72,14 @@ def from_glb(path: Path) -> Scene:
 
 
 def _scene(tree: dict[str, Any], path: Path) -> Scene:
-    nodes = {node["name"]: node for node in tree.get("nodes", ()) if _EXTRAS in node.get("extras", {})}
+    every = tree.get("nodes", ())
+    numbers = {node["name"]: number for number, node in enumerate(every) if _EXTRAS in node.get("extras", {})}
+    nodes = {name: every[number] for name, number in numbers.items()}
+    root_from = {name: _root_from(every, number) for name, number in numbers.items()}
     camera = nodes.pop(_CAMERA, None)
     if camera is None:
         raise DataError(f"{path}: found no camera written by curio; expected a file of curio-render --format glb")
-    cam_from_root = np.linalg.inv(_node_matrix(camera) @ embed(GL_FROM_CV))
+    cam_from_root = np.linalg.inv(root_from[_CAMERA] @ embed(GL_FROM_CV))
     sun = nodes.pop(_SUN)
     strength = tree["extensions"]["KHR_lights_punctual"]["lights"][0]["intensity"] / _LUX
     about = camera["extras"][_EXTRAS]
@@ -83,8 +88,8 @@ def _scene(tree: dict[str, Any], path: Path) -> Scene:
         about["width"],
         about["height"],
         np.array(about["camera_matrix"]),
-        tuple(_placed(node, cam_from_root) for node in nodes.values()),
-        strength * (cam_from_root @ _node_matrix(sun))[:3, 2],
+        tuple(_placed(node, cam_from_root @ root_from[name]) for name, node in nodes.items()),
+        strength * (cam_from_root @ root_from[sun["name"]])[:3, 2],
         None if about["photograph"] is None else located(Path(about["photograph"]), path.parent),
         about["world"],
         tuple(map(float, about.get("distortion", ()))),
@@ -165,17 +170,38 @@ def _tree(path: Path) -> dict[str, Any]:
     return tree
 
 
+def _root_from(nodes: Sequence[dict[str, Any]], number: int) -> np.ndarray:
+    """The transform from a node to the scene's root: applications put objects into groups that they move.
+
+    Raises:
+        ValueError: It is not rigid, or nodes are each other's children.
+    """
+    parent_of = {child: parent for parent, node in enumerate(nodes) for child in node.get("children", ())}
+    matrix, name = _node_matrix(nodes[number]), nodes[number]["name"]
+    for _ in nodes:
+        if number not in parent_of:
+            break
+        number = parent_of[number]
+        matrix = _node_matrix(nodes[number]) @ matrix
+    else:
+        raise ValueError(f"{name} is a child of its own")
+    turn = matrix[:3, :3]
+    if np.abs(turn @ turn.T - np.eye(3)).max() > _SHEAR or np.linalg.det(turn) < 0:
+        raise ValueError(f"{name} is scaled or mirrored; poses are rigid, so undo that in the application")
+    return matrix
+
+
 def _node_matrix(node: dict[str, Any]) -> np.ndarray:
-    """A node's transform, as a matrix or as translation, rotation (quaternion xyzw) and scale."""
+    """A node's transform to its parent, as a matrix or as translation, rotation (quaternion xyzw) and scale."""
     if "matrix" in node:
         return np.array(node["matrix"]).reshape(4, 4).T
     x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
     matrix: np.ndarray = trimesh.transformations.quaternion_matrix([w, x, y, z])
     matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    matrix[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)))
     return matrix
 
 
-def _placed(node: dict[str, Any], cam_from_root: np.ndarray) -> Placed:
-    matrix, extras = cam_from_root @ _node_matrix(node), node["extras"][_EXTRAS]
-    pose = Pose(matrix[:3, :3], matrix[:3, 3])
+def _placed(node: dict[str, Any], cam_from_node: np.ndarray) -> Placed:
+    extras, pose = node["extras"][_EXTRAS], Pose(cam_from_node[:3, :3], cam_from_node[:3, 3])
     return Placed(extras["object"], pose, tuple(extras["color"]), extras["confidence"])

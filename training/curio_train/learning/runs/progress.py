@@ -10,6 +10,7 @@
 """
 
 import json
+import shlex
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -52,8 +53,9 @@ class Reporter:
         self._counts: Counter[str] = Counter()
         self._since = (progress.step, progress.images, progress.seconds)
         self._logged_at = progress.seconds
-        viewed = "" if is_flat else f"curio-view {run}, or "
-        console.print(f"{run}: to watch it learn: {viewed}tensorboard --logdir {run}", soft_wrap=True, markup=False)
+        quoted = shlex.quote(str(run))
+        viewed = "" if is_flat else f"curio-view {quoted}, or "
+        console.print(f"{run}: to watch it learn: {viewed}tensorboard --logdir {quoted}", soft_wrap=True, markup=False)
         self._bar: Progress | None = None
         self._task = TaskID(0)
         if console.is_terminal:
