@@ -90,3 +90,19 @@ def test_a_file_of_camera_places_is_a_regular_file(tmp_path: Path) -> None:
     for file, expected in ((pipe, "not a regular file"), (Path("/dev/zero"), "not a regular file"), (large, "at most")):
         with pytest.raises(CameraError, match=f"--plane {file}: cannot be read .*{expected}"):
             CameraPoseFile.read(file)
+
+
+def test_photographs_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
+    for folder in ("around", "photos"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.png").write_bytes(b"")
+    entry = {"cam_from_world": camera(40).tolist()}
+    (tmp_path / "views.json").write_text(json.dumps({"a.png": entry | {"folder": "around"}}))
+    views = CameraPoseFile.read(tmp_path / "views.json")
+    assert views.is_known(tmp_path / "around" / "a.png")
+    assert not views.is_known(tmp_path / "photos" / "a.png")
+    (tmp_path / "around" / "a.png").unlink()
+    (tmp_path / "around").rmdir()
+    assert views.is_known(tmp_path / "photos" / "a.png"), "they may have been moved since"
+    (tmp_path / "views.json").write_text(json.dumps({"a.png": entry}))
+    assert CameraPoseFile.read(tmp_path / "views.json").is_known(tmp_path / "photos" / "a.png")

@@ -28,8 +28,9 @@ _MIN_AREA = 0.002  # fraction of the frame
 class CameraPoseFile:
     """The file of ``--plane`` and ``--views``: ``{"a.png": {"cam_from_world": [4x4], "plate": "plates/a.png"}, …}``.
 
-    Photographs are named by their path from the file's folder, or by their file name. If the camera moves, each may
-    name a background image of its own as "plate"; ``"unit": "m"`` says that the pose is in metres, which ``--views``
+    Photographs are named by their path from the file's folder, or by their file name; ``"folder": "around"`` says where
+    one lies that has only its file name, because others may have the same. If the camera moves, each may name a
+    background image of its own as "plate"; ``"unit": "m"`` says that the pose is in metres, which ``--views``
     requires; ``--plane`` refuses another unit.
     """
 
@@ -146,8 +147,17 @@ class CameraPoseFile:
 
     def _entry(self, photograph: Path) -> Mapping[str, Any]:
         relative = os.path.relpath(photograph, self.file.parent)
-        entry: Mapping[str, Any] = self.entries.get(relative, self.entries.get(photograph.name, {}))
-        return entry
+        named: Mapping[str, Any] = self.entries.get(photograph.name, {})
+        if relative in self.entries:
+            named = self.entries[relative]
+        elif "folder" in named and _is_elsewhere(photograph, self.file.parent / str(named["folder"])):
+            return {}
+        return named
+
+
+def _is_elsewhere(photograph: Path, folder: Path) -> bool:
+    """Whether a photograph lies in another folder than one that is still there."""
+    return folder.is_dir() and photograph.parent.is_dir() and not os.path.samefile(folder, photograph.parent)
 
 
 def _rigid(values: object, where: str) -> np.ndarray:

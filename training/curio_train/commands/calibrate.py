@@ -194,9 +194,21 @@ def _check_scale(command: CalibrateCommand) -> None:
         raise UsageError(f"--objects {command.objects}: give the camera that their networks know, too: --camera")
 
 
+def _from(start: Path, folder: Path) -> str:
+    """The path of a folder from another; the whole path where Windows has them on two drives."""
+    try:
+        return os.path.relpath(folder, start)
+    except ValueError:
+        return str(folder.absolute())
+
+
 def _save_views(path: Path, structure: Structure, unit: str | None) -> None:
     views = {
-        photo.name: {"cam_from_world": matrix.tolist(), "unit": unit}
+        photo.name: {
+            "cam_from_world": matrix.tolist(),
+            "unit": unit,
+            "folder": _from(path.absolute().parent, photo.parent),
+        }
         for photo, matrix in zip(structure.photographs, structure.cam_from_world, strict=True)
     }
     try:
