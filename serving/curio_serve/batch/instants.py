@@ -4,7 +4,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from pathlib import PurePath
 
 from curio_serve.batch.images.source_image import SourceImage
@@ -79,8 +79,7 @@ class Instants:
 
     def _by_order(self, first: Sequence[SourceImage | None]) -> Iterator[RigImage]:
         has_numbers = len({_number(image) for image in first if image is not None}) == 1
-        rest = zip_longest(*self.cameras)
-        for count, found in enumerate(_chained(tuple(first), rest)):
+        for count, found in enumerate(chain((tuple(first),), zip_longest(*self.cameras))):
             there = [image for image in found if image is not None]
             if not there:
                 return
@@ -136,13 +135,6 @@ def refuse_other_images(arguments: Sequence[str], cameras: Sequence[RigCamera]) 
         if len({*counts}) > 1:
             found = ", ".join(f"{argument} has {count}" for argument, count in zip(arguments, counts, strict=True))
             raise UsageError(f"--rig: expected as many images of each camera; {found}")
-
-
-def _chained(
-    first: tuple[SourceImage | None, ...], rest: Iterator[tuple[SourceImage | None, ...]]
-) -> Iterator[tuple[SourceImage | None, ...]]:
-    yield first
-    yield from rest
 
 
 def _time_s(image: SourceImage) -> float | None:
