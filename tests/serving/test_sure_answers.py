@@ -132,3 +132,13 @@ def test_what_cannot_be_asked_of_a_detector_is_refused(ape: Detector, pixels: np
             ape.detect(pixels, CAMERA, max_detections=most)
     with pytest.raises(CameraError, match="the camera is a ndarray; expected a PinholeCamera"):
         ape.detect(pixels, CAMERA.matrix)  # type: ignore[arg-type]
+
+
+def test_models_of_one_stream_give_no_number_twice(ape: Detector, pixels: np.ndarray) -> None:
+    other = Detector(open_model(ROOT / "models" / "lmo-fast").of(["ape"]))
+    stream, results = FollowingStream(), messages.DetectResponse().results
+    for restart in (False, False, True):
+        track = messages.Tracking(restart=restart)
+        stream.follow(track, [ape, other], pixels, CAMERA, min_confidence=0.0, reduction=1, results=results)
+    numbers = [[one.track.track_id for one in result.detections] for result in results]
+    assert numbers == [[1], [2]] * 3

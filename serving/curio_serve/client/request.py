@@ -61,18 +61,21 @@ def detect_request(
         ImageError: The file cannot be read, or the array is no image.
         CameraError: The camera file cannot be read or belongs to images of another size, or the matrix is no K.
     """
-    request = messages.DetectRequest(
-        request_id=request_id,
-        models=[selector(name) for name in ([model] if isinstance(model, str) else model)],
-        objects=_names(objects),
-        regions=[_region(region) for region in regions],
-        min_confidence=min_confidence,
-        max_detections=max_detections,
-        max_instances=max_instances,
-        reads=reads,
-        apply_exif_rotation=apply_exif_rotation,
-        track=track,
-    )
+    try:
+        request = messages.DetectRequest(
+            request_id=request_id,
+            models=[selector(name) for name in ([model] if isinstance(model, str) else model)],
+            objects=_names(objects),
+            regions=[_region(region) for region in regions],
+            min_confidence=min_confidence,
+            max_detections=max_detections,
+            max_instances=max_instances,
+            reads=reads,
+            apply_exif_rotation=apply_exif_rotation,
+            track=track,
+        )
+    except (TypeError, ValueError) as exc:
+        raise ArgumentError(f"a value of the request is of the wrong kind or out of range: {exc}") from exc
     if isinstance(image, np.ndarray):
         request.raw.CopyFrom(_raw(image, color))
         size: tuple[int, int] | None = (request.raw.width, request.raw.height)

@@ -6,7 +6,7 @@ object that is not seen for a while keeps its track and is answered as predicted
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -61,12 +61,14 @@ class Following:
 class Follower:
     """The objects of one model in one stream; not to be shared between threads."""
 
-    last_number: int
-    """The number of the track that was begun last; 0: none was."""
+    def __init__(self, numbers: Iterator[int]) -> None:
+        """Follow nothing yet.
 
-    def __init__(self, last_number: int = 0) -> None:
+        Args:
+            numbers: Of new tracks, each once; those of a stream for all of its models.
+        """
         self._tracks: list[Track] = []
-        self.last_number = last_number
+        self._numbers = numbers
         self._looked_s = self._searched_s = self._time_s = -math.inf
         self._step_s = 0.0
 
@@ -214,8 +216,7 @@ class Follower:
             if (replaced.is_seen and not is_surer) or self._is_taken(replaced, measured.translation_m):
                 return
             self._tracks.remove(replaced)
-        self.last_number += 1
-        self._tracks.append(Track.begin(self.last_number, kind, measured, frame.time_s))
+        self._tracks.append(Track.begin(next(self._numbers), kind, measured, frame.time_s))
 
     def _answer(
         self,

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from itertools import count
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,6 @@ from curio_proto.v1.detector_pb2 import RegionResult, Tracking
 from curio_serve.errors import ArgumentError, CameraError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
-from curio_serve.models.model import Model
 from curio_serve.tracking.follower import Follower, Following
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ class FollowingStream:
     def __init__(self) -> None:
         self.versions = {}
         self._followers: dict[str, Follower] = {}
+        self._numbers = count(1)
         self._time_s: float | None = None
         self._size: tuple[int, int] | None = None
         self._camera: PinholeCamera | None = None
@@ -94,8 +95,9 @@ class FollowingStream:
         if camera is not None:
             camera.check_frame(*size)
         followers = {} if request.restart else dict(self._followers)
+        numbers = count(1) if request.restart else self._numbers
         answers = [
-            _follower(followers, detector.model).follow(
+            followers.setdefault(detector.model.label, Follower(numbers)).follow(
                 detector,
                 pixels,
                 camera,
@@ -109,7 +111,8 @@ class FollowingStream:
             for detector in detectors
         ]
         # Only now: a frame that is refused changes nothing.
-        self._followers, self._time_s, self._size, self._camera = followers, time_s, size, camera
+        self._followers, self._numbers = followers, numbers
+        self._time_s, self._size, self._camera = time_s, size, camera
         return answers
 
     def _check_same_camera(self, size: tuple[int, int], camera: PinholeCamera | None) -> None:
@@ -125,14 +128,6 @@ class FollowingStream:
                 "K or the distortion differ from those of the frames before; objects are followed in the frames of one "
                 "camera: set track.restart to begin anew"
             )
-
-
-def _follower(followers: dict[str, Follower], model: Model) -> Follower:
-    """The follower of a model's version; one that takes the place of another version's goes on with its numbers."""
-    if model.label not in followers:
-        of_name = [one.last_number for label, one in followers.items() if label.rpartition("/")[0] == model.name]
-        followers[model.label] = Follower(max(of_name, default=0))
-    return followers[model.label]
 
 
 def _is_same(one: PinholeCamera | None, other: PinholeCamera | None) -> bool:
