@@ -132,6 +132,7 @@ def _tensor(**changes: Any) -> list[messages.ModelInferRequest.InferInputTensor]
         (_request(raw_input_contents=[]), "INVALID_ARGUMENT", "uint_contents has 0 values"),
         (_request(outputs=[{"name": "pose"}]), "INVALID_ARGUMENT", r"outputs has \['pose'\]"),
         (_request(outputs=[{"name": "color"}] * 99), "INVALID_ARGUMENT", "outputs has 99 names"),
+        (_request(outputs=[{"name": "color"}] * 2), "INVALID_ARGUMENT", "outputs has 2 names"),
     ],
 )
 def test_refusals(

@@ -87,7 +87,7 @@ class InferenceService(GRPCInferenceServiceServicer):
         model = self._repository.get(request.model_name, _version(request.model_version))
         images = _images(request, model)
         names = [output.name for output in request.outputs] or list(model.output_names)
-        if (unknown := set(names) - set(model.output_names)) or len(names) > len(model.output_names):
+        if (unknown := set(names) - set(model.output_names)) or len(names) > len(set(names)):
             found = sorted(unknown)[:4] or f"{len(names)} names"
             raise ArgumentError(f"outputs has {found}; model {model.label} has each of {model.output_names} once")
         return _answer(request.id, model, names, model.run(images))

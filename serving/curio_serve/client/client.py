@@ -216,7 +216,10 @@ class PoseClient(_Client):
 
 
 class AsyncPoseClient(_Client):
-    """Client for asyncio; arguments and errors are those of :class:`PoseClient`."""
+    """Client for asyncio; arguments and errors are those of :class:`PoseClient`.
+
+    It belongs to the event loop in which it is made: make it within a coroutine, and another one for another loop.
+    """
 
     def __init__(
         self, address: str, *, timeout_s: float = 10.0, max_attempts: int = 5, tls: Tls | None = None, token: str = ""
