@@ -7,10 +7,13 @@ import cv2
 import numpy as np
 import torch
 import trimesh
+from curio_train.capture.plane import CameraPoseFile
 from curio_train.doctor.examine import refuse_unfit
+from curio_train.doctor.photographs import examine_photographs
 from curio_train.geometry import camera_looking_at
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.tabletop.files import empty_scenes
 from curio_train.worlds.tabletop.world import TabletopWorld
 
 WIDTH, HEIGHT, NUM = 96, 72, 4
@@ -51,4 +54,7 @@ def test_none_of_them_is_learned_from_judged_or_counted(tmp_path: Path) -> None:
     assert isinstance(world, TabletopWorld)
     assert len(world.photographs.training) == NUM
     assert world.photographs.own.names == [f"{number}.png" for number in range(NUM)]
-    assert any(f"only {NUM}, not counting empty.png and later.png" in doubt for doubt in refuse_unfit(options))
+    cameras = CameraPoseFile.read(tmp_path / "views.json")
+    _, findings = examine_photographs(photos, None, empty_scenes(options, photos / "empty.png", cameras))
+    assert any(f"only {NUM}, not counting empty.png and later.png" in str(finding) for finding in findings)
+    assert not any("does not learn from them" in doubt for doubt in refuse_unfit(options)), "on a plane it does"

@@ -92,9 +92,12 @@ def test_where_photographs_do_not_tell_a_colour_none_is_found(folder: Path) -> N
 
 
 def prepare(options: CaptureOptions, folder: Path) -> tuple[WorldOptions, str]:
+    """The options of a run, but for the names of its photographs and meshes, and what was said."""
     said: list[str] = []
-    config = prepared(RunConfig(options), folder, lambda _: None, said.append)
-    return config.world, "\n".join(said)
+    world = prepared(RunConfig(options), folder, lambda _: None, said.append).world
+    assert isinstance(world, CaptureOptions)
+    assert world.judged
+    return replace(world, judged=(), mesh_sha256=()), "\n".join(said)
 
 
 def test_a_run_keeps_the_colour_that_was_found(folder: Path) -> None:

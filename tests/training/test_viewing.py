@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import trimesh
 import viser
+from curio_serve.models.model_folder import open_model
 from curio_train.commands import view as view_command
 from curio_train.data.clutter import dead_leaves_texture
 from curio_train.drawing.album import MeshFiles
@@ -222,8 +223,10 @@ def test_newer_checkpoints_leave_what_is_not_saved(
 @needs_browser
 def test_a_photograph_with_a_model(files: Path, view: Callable[..., Command], browser: Any) -> None:
     given = ["--model", ROOT / "models" / "ape", "--camera", ROOT / "samples" / "camera.json"]
+    corners_m = np.reshape(open_model(ROOT / "models" / "ape").spec.objects[0].box_corners_m, (8, 3))
+    trimesh.PointCloud(corners_m).convex_hull.export(files / "ape.ply")  # as large as the ape: others are refused
     out = files / "ape.jsonl"
-    command = view(ROOT / "samples" / "00.jpg", *given, "--mesh", files / "chair.ply", "--out", out)
+    command = view(ROOT / "samples" / "00.jpg", *given, "--mesh", files / "ape.ply", "--out", out)
     page = opened(browser, command.url)
     assert page.get_by_text("640x480 pixels").is_visible()
     page.close()
