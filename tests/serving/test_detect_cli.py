@@ -197,8 +197,14 @@ def test_a_file_is_not_gone_on_with_by_another_camera(
     models_dir: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     camera, out = tmp_path / "camera.json", tmp_path / "poses.jsonl"
-    for focal_px, told in ((900.0, None), (300.0, "by another camera .fx 900 px, k1 0; now 300 px, 0"), (900.0, None)):
-        camera.write_text(json.dumps({"camera_matrix": [[focal_px, 0, 160], [0, focal_px, 120], [0, 0, 1]]}))
+    for focal_px, lens, told in (
+        (900.0, 0.0, None),
+        (300.0, 0.0, "by another camera .fx 900 px, k1 0; now 300 px, 0"),
+        (900.0, 0.1, "by another camera .fx 900 px, k1 0; now 900 px, 0.1"),
+        (900.0, 0.0, None),
+    ):
+        matrix = [[focal_px, 0, 160], [0, focal_px, 120], [0, 0, 1]]
+        camera.write_text(json.dumps({"camera_matrix": matrix, "distortion": [lens, 0, 0, 0]}))
         if told is None:
             assert detect(models_dir / "pinhole", frames, camera=camera, out=out) == 0
             cv2.imwrite(str(frames / "000007.png"), cv2.imread(str(frames / "000000.png")))

@@ -12,8 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 from curio_serve.files import read_json
+from scipy.spatial.transform import Rotation
 
 from curio_train.errors import CameraError, DataError
+from curio_train.geometry import is_rotation
 
 _MAX_BYTES = 1 << 26
 _MAX_SHEAR = 1e-3
@@ -131,7 +133,7 @@ class CameraPoseFile:
                 f"by {tilt:.1f} degrees to {background.name}, taken at {heights[1]:.3g} m; a camera that moves has to "
                 f"keep its height within {_SAME_HEIGHT:.0%} and its tilt within {_SAME_TILT_DEG:g} degrees"
             )
-        turned = np.degrees(np.arccos(np.clip((np.trace(one[:3, :3] @ other[:3, :3].T) - 1) / 2, -1, 1)))
+        turned = np.degrees(Rotation.from_matrix(one[:3, :3] @ other[:3, :3].T).magnitude())
         centers = [-matrix[:3, :3].T @ matrix[:3, 3] for matrix in (one, other)]
         moved_m = float(np.linalg.norm(centers[0] - centers[1]))
         is_elsewhere = turned > _SAME_TILT_DEG or moved_m > _SAME_HEIGHT * heights[1]
@@ -167,9 +169,7 @@ def _rigid(values: object, where: str) -> np.ndarray:
         raise CameraError(f"{where}: cam_from_world is no matrix ({exc})") from exc
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise CameraError(f"{where}: cam_from_world has shape {matrix.shape}, expected 4x4 finite numbers")
-    rotation = matrix[:3, :3]
-    shear = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if shear > _MAX_SHEAR or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], [0, 0, 0, 1]):
+    if not is_rotation(matrix[:3, :3], _MAX_SHEAR) or not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise CameraError(f"{where}: cam_from_world is not rigid; expected a rotation, a translation and (0, 0, 0, 1)")
     return matrix
 

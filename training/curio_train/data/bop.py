@@ -21,7 +21,7 @@ from PIL import Image
 from curio_train.camera import Intrinsics, check_matrix, load_intrinsics
 from curio_train.data.bop_json import Record, read_records
 from curio_train.errors import DataError, UsageError, nearest
-from curio_train.geometry import Pose
+from curio_train.geometry import Pose, is_rotation
 from curio_train.meshes.meshes import METRES, Mesh, load_mesh
 
 LINEMOD_CLASSES = tuple(name for name in LINEMOD_IDS if name not in ("bowl", "cup"))
@@ -306,6 +306,5 @@ def _pose(record: Record) -> Pose:
 
 
 def _check_rotation(matrix: np.ndarray, where: str) -> None:
-    error = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    if error > 1e-2 or np.linalg.det(matrix) < 0:
+    if not is_rotation(matrix, 1e-2):
         raise DataError(f"{where}: found {matrix.tolist()}, which is not a rotation")

@@ -21,7 +21,7 @@ from curio_train.drawing.axes import GL_FROM_CV, embed, light_of, linear, pose_m
 from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Placed, Scene, located
 from curio_train.errors import DataError
-from curio_train.geometry import Pose
+from curio_train.geometry import Pose, is_rotation
 from curio_train.meshes.meshes import MAX_BYTES, Mesh
 
 _LUX = math.pi  # of a directional light of strength 1: the irradiance of a surface that faces it
@@ -185,8 +185,7 @@ def _root_from(nodes: Sequence[dict[str, Any]], number: int) -> np.ndarray:
         matrix = _node_matrix(nodes[number]) @ matrix
     else:
         raise ValueError(f"{name} is a child of its own")
-    turn = matrix[:3, :3]
-    if np.abs(turn @ turn.T - np.eye(3)).max() > _SHEAR or np.linalg.det(turn) < 0:
+    if not is_rotation(matrix[:3, :3], _SHEAR):
         raise ValueError(f"{name} is scaled or mirrored; poses are rigid, so undo that in the application")
     return matrix
 

@@ -16,7 +16,7 @@ from curio_serve.files import read_file
 
 from curio_train.camera import check_matrix
 from curio_train.errors import DataError
-from curio_train.geometry import Pose
+from curio_train.geometry import Pose, is_rotation
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, SceneCode
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World
@@ -199,7 +199,7 @@ def _placed(detection: Mapping[str, Any], cam_from_rig: Pose) -> Placed:
 
 def _rotation(values: Any) -> np.ndarray:
     found = _numbers(values, (3, 3), "rotation")
-    if np.abs(found @ found.T - np.eye(3)).max() > _SHEAR or np.linalg.det(found) < 0:
+    if not is_rotation(found, _SHEAR):
         raise ValueError(f"rotation is {_short(values)}, expected rows at right angles of length 1, and no reflection")
     return found
 

@@ -79,8 +79,9 @@ def together(each: Mapping[str, dict[str, Any]], absent: Sequence[float]) -> dic
     }
     for name, least in (("add_recall", 0.0), ("add_recall_visible_80", VISIBLE)):
         if f"{name}_low" in metrics:
-            hits = [_hits(one["targets"], least) for one in each.values()]
-            metrics[f"{name}_low"], metrics[f"{name}_high"] = bootstrap_interval(*hits)
+            seen = [[row for row in one["targets"] if (row["visible_fraction"] or 0) >= least] for one in each.values()]
+            found = (_confidences(rows)[1] for rows in seen)
+            metrics[f"{name}_low"], metrics[f"{name}_high"] = bootstrap_interval(*found)
     confidences, correct = _confidences(rows)
     metrics["confidence_ece"] = calibration_error(confidences, correct)
     if absent:
@@ -93,12 +94,6 @@ def together(each: Mapping[str, dict[str, Any]], absent: Sequence[float]) -> dic
         "reliability": reliability_bins(confidences, correct),
         "objects": dict(each),
     }
-
-
-def _hits(rows: Sequence[Mapping[str, Any]], least_visible: float) -> list[float]:
-    """1 for each target that is found and 0 for the others, of those that are so visible."""
-    seen = [row for row in rows if not least_visible or (row["visible_fraction"] or 0) >= least_visible]
-    return [float(row["add_diameters"] < ADD_THRESHOLD) for row in seen]
 
 
 def _confidences(rows: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[bool]]:
