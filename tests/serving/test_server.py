@@ -19,6 +19,7 @@ import onnx
 import pytest
 from curio_proto.v1 import detector_pb2 as pb
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
+from curio_serve.server.server import _warn_of_little_memory
 from google.rpc import error_details_pb2
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_status import rpc_status
@@ -289,3 +290,11 @@ server.serve_until_stopped()
     )
     assert ended.returncode == 0, ended.stderr
     assert "127.0.0.1:" in ended.stdout
+
+
+def test_a_server_whose_models_leave_little_memory_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    for used, most in ((700 << 20, None), (500 << 20, 1 << 30), (700 << 20, 1 << 30)):
+        _warn_of_little_memory(used, most)
+    (record,) = caplog.records
+    assert "models leave little memory" in record.getMessage()
+    assert vars(record)["values"] == {"used_mb": 700, "limit_mb": 1024}

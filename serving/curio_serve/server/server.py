@@ -87,7 +87,7 @@ class PoseServer:
         self._report(changes)
         if not list(self._repository):
             raise ModelError(f"no model could be loaded from {self.config.models}: {self._why_none(changes)}")
-        self._warn_of_little_memory()
+        _warn_of_little_memory(memory.resident_bytes(), memory_limit())
         self._server = self._build()
         addresses = [self._open_port(self._server)]
         if self.config.metrics_port is not None:
@@ -96,17 +96,6 @@ class PoseServer:
         self._server.start()
         self._announce()
         return addresses
-
-    def _warn_of_little_memory(self) -> None:
-        """Say where the models leave little of a container's memory: requests would be refused for want of it."""
-        most, used = memory_limit(), memory.resident_bytes()
-        if most is not None and used > _MEMORY_OF_MODELS * most:
-            log(
-                logging.WARNING,
-                "models leave little memory; streams are ended when it is short",
-                used_mb=used >> 20,
-                limit_mb=most >> 20,
-            )
 
     def _why_none(self, changes: Sequence[Change]) -> str:
         """What to do about a folder none of whose models serves."""
@@ -228,6 +217,13 @@ class PoseServer:
             log(level, f"model {change.event}", model=change.name, version=change.version, **reason)
             self._metrics.refused_models.inc(refused)
         self._metrics.models.set(sum(len(loaded) for _, loaded in self._repository))
+
+
+def _warn_of_little_memory(used: int, most: int | None) -> None:
+    """Say where the models leave little of a container's memory, bytes: requests would be refused for want of it."""
+    if most is not None and used > _MEMORY_OF_MODELS * most:
+        text = "models leave little memory; streams are ended when it is short"
+        log(logging.WARNING, text, used_mb=used >> 20, limit_mb=most >> 20)
 
 
 def _reception_limits(config: ServeConfig) -> ReceptionLimits:
