@@ -82,7 +82,9 @@ def _consensus(colors: Sequence[np.ndarray]) -> np.ndarray | None:
 
 def _color_of_piece(frame: np.ndarray, background_image: np.ndarray) -> np.ndarray | None:
     """Linear colour [3] of what two uint8 sRGB pictures [height, width, 3] differ in; None if nothing, or all."""
-    photograph, empty = (torch.from_numpy(picture / 255.0).permute(2, 0, 1) for picture in (frame, background_image))
+    photograph, empty = (
+        torch.from_numpy(picture).permute(2, 0, 1).float() / 255 for picture in (frame, background_image)
+    )
     difference, differs, shaded = (found[0].numpy() for found in compare(photograph[None], empty))
     if not differs.any():
         return None
@@ -92,7 +94,7 @@ def _color_of_piece(frame: np.ndarray, background_image: np.ndarray) -> np.ndarr
         part = whole
     if not _LEAST_AREA < part.mean() < _LARGEST_AREA:
         return None
-    pixels = linear_from_srgb(photograph).permute(1, 2, 0).numpy()[part]
+    pixels = linear_from_srgb(photograph[:, torch.from_numpy(part)]).T.numpy()
     bright = pixels.sum(axis=1)
     color: np.ndarray = pixels[bright >= np.median(bright)].mean(axis=0)
     return color

@@ -102,7 +102,8 @@ def simplified(traced: ir.Model, tracing: Tracing) -> onnx.ModelProto:
         traced: By :func:`traced_program`.
         tracing: As it was traced. A caller may leave out the wanted slots, which means all of them in their order.
     """
-    _simplify(traced)
+    with _quiet():
+        _simplify(traced)
     model: onnx.ModelProto = ir.to_proto(traced)
     _strip(model)
     if tracing.num_slots is not None:
@@ -137,17 +138,19 @@ def _simplify(model: ir.Model) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the exporter's remarks about packages that are not needed, and its deprecation warnings."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
+    """Silence remarks about packages that are not needed and constants that stay, and deprecation warnings."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", category=FutureWarning)
             warnings.filterwarnings("ignore", category=DeprecationWarning)
             yield
     finally:
-        logger.setLevel(level)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def _strip(model: onnx.ModelProto) -> None:

@@ -15,6 +15,7 @@ _MIDDLE, _REACH = 0.55, 0.4
 """Coordinates are stored as linear colours from 0.15 to 0.95: never 0, which is where nothing is seen."""
 
 _LEAST_SEEN = 0.5  # of a patch's area
+_ALMOST_DARK = torch.tensor([[0.0, 0.0, -1e-6]])  # surfaces show their own colour, under ambient light alone
 
 
 class ObjectCoordinateMap:
@@ -34,7 +35,6 @@ class ObjectCoordinateMap:
             mesh, vertex_colors_srgb=srgb_from_linear(linear), uv=None, texture=None, sha256=""
         )
         self._renderer = Renderer([painted], [0], side, side, ambient=1.0)
-        self._side = side
 
     @torch.no_grad()
     def __call__(
@@ -51,18 +51,9 @@ class ObjectCoordinateMap:
             Coordinates in half extents from the middle of the box, −1 to 1, of what a patch sees of the object however
             little that is; where it is not seen they mean nothing. And where it fills half of a patch or more.
         """
-        over_black, over_white = (self._draw(rotation, translation_m, matrices, shade) for shade in (0.0, 1.0))
-        alpha = (1 - (over_white - over_black).mean(dim=1, keepdim=True)).clamp(min=1e-3)
-        linear = linear_from_srgb((over_black / alpha).clamp(0, 1))
-        return (linear - _MIDDLE) / _REACH, alpha[:, 0] >= _LEAST_SEEN
-
-    def _draw(self, rotation: Tensor, translation_m: Tensor, matrices: np.ndarray, shade: float) -> Tensor:
-        count = len(rotation)
-        return self._renderer(
-            rotation[:, None],
-            translation_m[:, None],
-            camera_matrix=matrices,
-            backgrounds=translation_m.new_full((count, 3, self._side, self._side), shade),
-            light=translation_m.new_tensor([[0.0, 0.0, -1e-6]]).expand(count, 3),
-            seed=0,  # both pictures have their samples in the same places
+        colors, alpha = self._renderer.cutouts(
+            rotation[:, None], translation_m[:, None], camera_matrix=matrices, lights=_ALMOST_DARK
         )
+        alpha = alpha.clamp(min=1e-3)
+        linear = linear_from_srgb((colors[0] / alpha).clamp(0, 1))
+        return (linear - _MIDDLE) / _REACH, alpha[:, 0] >= _LEAST_SEEN

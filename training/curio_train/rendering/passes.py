@@ -19,8 +19,15 @@ class Pass:
 
     def image(self, values: Any, background: Any) -> Any:
         """The flat [b, c, h, w] image; keeps what was hit."""
+        self.hits = self._trace_pixels(Launch(self.set, self.view, background), self._instances(values))
+        return self.relit(values, background)
+
+    def relit(self, values: Any, background: Any) -> Any:
+        """The image of what was hit before, with values that differ from those in light, colour and confidence alone.
+
+        Objects do not stand in each other's light here unless it is the light of :meth:`image`.
+        """
         dr, instances, launch = self.dr, self._instances(values), Launch(self.set, self.view, background)
-        self.hits = self._trace_pixels(launch, instances)
         out = dr.opaque(background)  # memory of its own: the background's belongs to torch
         if self.hits:
             location, colors = launch.contributions(instances, self.hits)

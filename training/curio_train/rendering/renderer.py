@@ -137,6 +137,40 @@ class Renderer:
         views = self._views(corners_m, intrinsics, Objects(settings.mi, settings.dr), seed, turned)
         return _Render.apply(instances, backgrounds.cpu(), settings, views).to(device)
 
+    @torch.no_grad()
+    def cutouts(
+        self,
+        rotation: Float[Tensor, "batch slots 3 3"],
+        translation_m: Float[Tensor, "batch slots 3"],
+        *,
+        camera_matrix: np.ndarray,
+        lights: Float[Tensor, "lights 3"],
+        seed: int = 0,
+    ) -> tuple[Float[Tensor, "lights batch 3 height width"], Float[Tensor, "batch 1 height width"]]:
+        """Render objects without backgrounds under each of some lights; rays are traced once for all of them.
+
+        Arguments are those of a call, but for the lights, which are the same for all images.
+
+        Returns:
+            sRGB over black under each light, and the fraction of each pixel that objects cover. No gradient flows.
+
+        Raises:
+            RendererError: The camera matrix has skew, or objects stand in each other's light.
+        """
+        settings, device = self.settings, rotation.device
+        if settings.object_shadows:
+            raise RendererError("objects that stand in each other's light are rendered anew for each light")
+        rotation, translation_m, lights = _on_host(rotation, translation_m, lights)
+        count = len(rotation)
+        packed = [self._pack(rotation, translation_m, light.expand(count, 3), None, None) for light in lights]
+        corners_m, intrinsics = self._corners(rotation, translation_m), _intrinsics(camera_matrix, count)
+        parts = [
+            _cutouts_of(Pass(settings, view), packed)
+            for view in self._views(corners_m, intrinsics, Objects(settings.mi, settings.dr), seed)
+        ]
+        colors, alpha = (torch.cat(of_parts, dim=-4) for of_parts in zip(*parts, strict=True))
+        return colors.to(device), alpha.to(device)
+
     def shadows(
         self,
         rotation: Float[Tensor, "batch slots 3 3"],
@@ -245,6 +279,20 @@ class _Render(torch.autograd.Function):
                 through = part.gradient_of_background(values, background, weights)
                 behind.append(_tensor(through, (-1, *adjoint.shape[1:])))
         return torch.cat(gradients).to(instances), torch.cat(behind).to(adjoint) if behind else None, None, None
+
+
+def _cutouts_of(part: Pass, packed: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """One view's colours over black, and coverage, of the instances of all views under each light."""
+    settings, (first, last) = part.set, part.view.images
+    shape = (last - first, 3, settings.height, settings.width)
+    black, full = (torch.full(shape, shade).view(-1) for shade in (0.0, 1.0))
+    background, everything = settings.mi.Float(black), settings.mi.Float(full)
+    n, colors = settings.num_slots, []
+    for number, instances in enumerate(packed):
+        values = settings.mi.Float(instances[first * n : last * n].contiguous().view(-1))
+        colors.append(_tensor((part.relit if number else part.image)(values, background), shape))
+    through = _tensor(part.gradient_of_background(values, background, everything), shape)
+    return torch.stack(colors), 1 - through[:, :1]
 
 
 def _parts(ctx: Any, instances: Tensor, *images: Tensor) -> Iterator[list[Any]]:

@@ -3,6 +3,7 @@
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
+from scipy.linalg import eigh
 from torch import Tensor
 
 
@@ -14,6 +15,7 @@ def mean_cosine(descriptors: Tensor, mask: Float[Tensor, "templates 1 height wid
 def low_rank(templates: Float[Tensor, "templates size height width"], rank: int) -> tuple[Tensor, Tensor]:
     """Filters [rank, size, height, width] and weights [templates, rank] whose products are nearly the templates."""
     rows = templates.flatten(1)
-    _, vectors = torch.linalg.eigh(rows @ rows.T)  # the largest are last
-    weights = vectors[:, -rank:]
+    last = len(rows) - 1  # the largest are last
+    _, vectors = eigh((rows @ rows.T).numpy(), subset_by_index=[last + 1 - rank, last])
+    weights = torch.from_numpy(vectors)
     return (weights.T @ rows).unflatten(1, templates.shape[1:]), weights

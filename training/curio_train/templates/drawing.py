@@ -43,24 +43,17 @@ class TemplateRenderer:
         self._renderer = Renderer([mesh], [0], side, side, ambient=AMBIENT)
         middle = (side - 1) / 2
         self._matrix = np.array([[focal_px, 0, middle], [0, focal_px, middle], [0, 0, 1]])
-        self._position, self._side = torch.tensor([0.0, 0.0, depth_m]), side
+        self._position = torch.tensor([0.0, 0.0, depth_m])
 
     def draw(self, rotations: Float[Tensor, "templates 3 3"], num_lamps: int = 1) -> Drawn:
         """Seen with rotations cam_from_obj, under the first of :data:`APPEARANCES`."""
-        over_black = [self._draw(rotations, lamp, 0.0) for lamp, _ in APPEARANCES[:num_lamps]]
-        over_white = self._draw(rotations, APPEARANCES[0][0], 1.0)
-        alpha = 1 - (over_white - over_black[0]).mean(dim=1, keepdim=True)
-        return Drawn(torch.cat([*over_black, alpha], dim=1))
-
-    def _draw(self, rotations: Tensor, lamp: tuple[float, float, float], shade: float) -> Tensor:
-        count = len(rotations)
-        return self._renderer(
+        colors, alpha = self._renderer.cutouts(
             rotations[:, None],
-            self._position.expand(count, 1, 3),
+            self._position.expand(len(rotations), 1, 3),
             camera_matrix=self._matrix,
-            backgrounds=torch.full((count, 3, self._side, self._side), shade),
-            light=torch.tensor(lamp).expand(count, 3),
+            lights=torch.tensor([lamp for lamp, _ in APPEARANCES[:num_lamps]]),
         )
+        return Drawn(torch.cat([*colors, alpha], dim=1))
 
 
 class CropTemplateRenderer:
