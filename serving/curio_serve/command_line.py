@@ -40,13 +40,16 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     )
 
 
-def parsed(command: type[C], arguments: Sequence[str] | None, prog: str, **options: Any) -> C:
+def parsed(
+    command: type[C], arguments: Sequence[str] | None, prog: str, lists: Sequence[str] = (), **options: Any
+) -> C:
     """A command line as a dataclass.
 
     Args:
         command: Its fields are the arguments.
         arguments: None: those of this process.
         prog: Name of the command, for its help.
+        lists: See :func:`with_lists_joined`.
         options: More of ``tyro.cli``'s, such as ``default`` and ``description``.
 
     Raises:
@@ -58,7 +61,36 @@ def parsed(command: type[C], arguments: Sequence[str] | None, prog: str, **optio
         join_help_lines([command])
         given = ["--help" if word == HELP_ALL else word for word in given]
     with _REGISTRY:
-        return tyro.cli(command, args=given, prog=prog, **options)
+        return tyro.cli(command, args=with_lists_joined(given, lists), prog=prog, **options)
+
+
+def with_lists_joined(given: Sequence[str], lists: Sequence[str]) -> list[str]:
+    """Arguments in which no flag of several values is there twice; of such tyro would keep the last alone.
+
+    Args:
+        given: As typed: ``--mesh a --mesh b`` as well as ``--mesh a b``.
+        lists: The flags, with their dashes.
+    """
+    groups: list[list[str]] = [[]]  # a flag and what follows it
+    for word in given:
+        flag, equals, value = word.partition("=")
+        if flag in lists:
+            groups.append([flag, value] if equals else [flag])
+        elif word.startswith("-"):
+            groups.append([word])
+        else:
+            groups[-1].append(word)
+    first: dict[str, list[str]] = {}
+    kept = []
+    for group in groups:
+        flag = group[0] if group else ""
+        if flag in first:
+            first[flag] += group[1:]
+            continue
+        kept.append(group)
+        if flag in lists:
+            first[flag] = group
+    return [word for group in kept for word in group]
 
 
 def join_help_lines(kinds: Iterable[type]) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-from curio_serve.command_line import parsed
+from curio_serve.command_line import parsed, with_lists_joined
 
 
 @dataclass(frozen=True)
@@ -60,3 +60,10 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
         parsed(Command, ["--version"], "curio-x")
     assert done.value.code == 0
     assert capsys.readouterr().out.startswith("curio-x")
+
+
+def test_a_flag_of_several_values_may_be_there_twice() -> None:
+    given = ["file", "--mesh", "a", "--unit", "mm", "--mesh=b=c", "--mesh", "d", "e", "--count", "-1"]
+    joined = ["file", "--mesh", "a", "b=c", "d", "e", "--unit", "mm", "--count", "-1"]
+    assert with_lists_joined(given, ("--mesh",)) == joined
+    assert with_lists_joined(given, ()) == given

@@ -137,6 +137,8 @@ def test_only_frames_with_the_board_are_kept(tmp_path: Path, capsys: pytest.Capt
     ("flags", "told"),
     [
         (["--count", 0], "--count 0"),
+        (["--marker-mm", 10], "--marker-mm 10.0 has no effect without --board"),
+        (["--dictionary", "DICT_5X5_100"], "--dictionary DICT_5X5_100 has no effect without --board"),
         (["--video", "nowhere.avi"], "--video nowhere.avi"),
         (["--video", "²"], "--video ²: cannot be opened"),
         (["--video", ".", "--background", "empty.heic"], "--background empty.heic: expected a file name that ends in"),

@@ -166,6 +166,16 @@ def test_one_body_by_its_name_in_its_own_frame(folder: Path) -> None:
         load_mesh(folder / "hinge.step", body="nut")
 
 
+def test_bodies_of_one_name_that_differ_are_not_taken_for_one(tmp_path: Path) -> None:
+    two = Assembly()
+    two.add("Solid", box((0, 0, 0), (50, 10, 5)), [(0, 0, 0)], color=(1, 0, 0))
+    two.add("Solid", box((0, 0, 0), (20, 20, 20)), [(90, 0, 0)], color=(1, 0, 0))
+    two.write(tmp_path / "two.step")
+    with pytest.raises(MeshError, match=r"bodies of 20 x 20 x 20 and 50 x 10 x 5 mm are called 'Solid'; give each"):
+        load_mesh(tmp_path / "two.step", body="Solid")
+    assert len(load_mesh(tmp_path / "two.step").bodies) == 2
+
+
 def test_flags_that_a_cad_file_contradicts(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--mesh-unit mm: .* names its own unit"):
         load_mesh(folder / "bracket.step", "mm")

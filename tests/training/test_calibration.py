@@ -50,12 +50,19 @@ def photograph(image: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np.nda
     return cv2.remap(smooth, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderValue=140)
 
 
-def write(folder: Path, board: Board, count: int, largest_tilt_deg: float = 35.0) -> Path:
+def write(
+    folder: Path,
+    board: Board,
+    count: int,
+    largest_tilt_deg: float = 35.0,
+    *,
+    away_m: tuple[float, float] = (0.38, 0.55),
+) -> Path:
     random, image = np.random.default_rng(1), picture(board)
     for number in range(count):
         tilt = random.uniform(-largest_tilt_deg, largest_tilt_deg, 2)
         turn = Rotation.from_euler("xyz", [*tilt, random.uniform(-20, 20)], degrees=True).as_matrix()
-        shift = np.array([*random.uniform(-0.06, 0.06, 2), random.uniform(0.38, 0.55)])
+        shift = np.array([*random.uniform(-0.06, 0.06, 2), random.uniform(*away_m)])
         noise = random.normal(0, 2, (HEIGHT, WIDTH))
         photo = (photograph(image, turn, shift) + noise).clip(0, 255).astype(np.uint8)
         cv2.imwrite(str(folder / f"{number:02}.png"), photo)
@@ -73,6 +80,23 @@ def test_the_camera_is_found(tmp_path: Path, board: Board) -> None:
         for matrix, distortion in ((MATRIX, DISTORTION), (found.camera.matrix, found.camera.distortion))
     ]
     assert np.abs(seen[0] - seen[1]).max() < 2, "towards the corner, where distortion counts"
+
+
+def test_a_lens_is_only_as_complex_as_the_boards_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "middle").mkdir()
+    found = calibrate(write(tmp_path / "middle", PLAIN, 14, away_m=(0.9, 1.0)), PLAIN)
+    assert found.error_px < 0.3
+    assert (found.camera.distortion[1], found.camera.distortion[4]) == (0, 0)
+    corner = [
+        cv2.projectPoints(np.array([[0.5, 0.36, 1.0]]), np.zeros(3), np.zeros(3), matrix, np.array(distortion))[0]
+        for matrix, distortion in ((MATRIX, DISTORTION), (found.camera.matrix, found.camera.distortion))
+    ]
+    assert np.abs(corner[0] - corner[1]).max() < 12, "with k2 and k3 it would be off by far more"
+    assert "photograph the board there, too" in found.doubt
+    flags = ["--images", str(tmp_path / "middle"), "--board", "9", "6", "--camera-out", str(tmp_path / "camera.json")]
+    with pytest.raises(SystemExit):
+        train(["capture", "--calibrate", *flags])
+    assert "towards the frame's border the lens is uncertain by up to" in capsys.readouterr().out
 
 
 def test_views_that_are_too_alike(tmp_path: Path) -> None:
@@ -141,6 +165,11 @@ def _written(folder: Path, other: dict[str, object]) -> Path:
 
 
 def test_photographs_of_a_board_are_no_sequence_and_small_boards_are_read_one_way(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--dictionary DICT_5X5_100 has no effect without --marker-mm"):
+        run(
+            CalibrateCommand(images=tmp_path, board=(6, 4), dictionary="DICT_5X5_100"),
+            lambda *_: pytest.fail("no structure"),
+        )
     with pytest.raises(UsageError, match="--every 3 is for photographs of a scene"):
         run(CalibrateCommand(images=tmp_path, board=(6, 4), every=3), lambda *_: pytest.fail("no structure"))
     assert [(board.columns, board.rows) for board in Board(3, 4, 0.03).readings] == [(4, 5)]

@@ -93,11 +93,12 @@ def test_a_finding_says_how_sure_it_is_and_what_to_do(tmp_path: Path) -> None:
     assert "(likely). Swap cx and cy" in str(finding)
 
 
-def test_symmetries_need_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("flag", ["--symmetries out.json", "--body pin", "--mesh-unit mm"])
+def test_what_is_about_a_mesh_needs_one(flag: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
-        doctor_command.doctor(["--symmetries", str(tmp_path / "out.json"), "--cache", str(tmp_path)])
+        doctor_command.doctor([*flag.split(), "--cache", str(tmp_path)])
     assert exit_.value.code == 2
-    assert "--mesh" in capsys.readouterr().err
+    assert f"{flag}: found no --mesh" in capsys.readouterr().err
 
 
 def test_symmetries_replace_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

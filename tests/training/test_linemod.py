@@ -244,6 +244,12 @@ def test_a_run_without_such_frames_learns_nothing_from_them(data, tmp_path):
         assert prepared(config, tmp_path, print, print).recipe.self_training == fraction
     with pytest.raises(UsageError, match=r"--self-training 0\.5: found no photographs .* expected --photos"):
         prepared(parse([*call, "--self-training", "0.5"]).config, tmp_path, print, print)
+    told: list[str] = []
+    for words in (["--self-training", "0"], ["--preset", "paper", "--method", "sleep"]):
+        prepared(parse([*call, "--photos", str(frames), *words]).config, tmp_path, told.append, print)
+    assert [f"--photos {frames}: with --self-training 0 nothing is learned from them" in one for one in told] == [
+        True
+    ] * 2
     with pytest.raises(UsageError, match="--method hypotheses does not learn from photographs"):
         prepared(parse([*call, "--photos", str(frames), "--method", "hypotheses"]).config, tmp_path, print, print)
 

@@ -85,6 +85,7 @@ def test_the_command_writes_what_serving_reads(tmp_path: Path, capsys: pytest.Ca
     np.testing.assert_allclose(right.cam_from_rig, _second(), atol=0.012)
     said = capsys.readouterr().out
     assert "2 cameras" in said
+    assert "distances are right if squares are 30 mm (--square-mm)" in said
     assert "right: focal length" in said
     with pytest.raises(SystemExit) as ended:
         train(["capture", "--calibrate", "--images", str(folder), "--rig-out", str(out)])

@@ -28,9 +28,9 @@ from curio_train.errors import DataError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import load_mesh
 from curio_train.meshes.shapes import chair
+from curio_train.viewing.comparison import compare
 from curio_train.viewing.fitting import walk
 from curio_train.viewing.pages import Opening, Page, open_pages
-from curio_train.viewing.panel import Panel
 from curio_train.viewing.saving import save
 from curio_train.viewing.space import Space
 from curio_train.worlds.options import SpheresOptions
@@ -279,24 +279,6 @@ def test_the_camera_reaches_to_the_objects_wherever_their_origins_are(files: Pat
         server.stop()
 
 
-def test_values_that_are_shown_and_not_changed_keep_all_their_digits() -> None:
-    server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
-    try:
-        panel = Panel(server.gui)
-        for confidence in (0.004, 0.823746, 0.5):
-            item = Placed("chair", TRUE, (0.64, 0.2, 0.19), confidence)
-            scene = Scene("photograph", WIDTH, HEIGHT, K, (item,), None)
-            panel.show_page(0, 1, scene)
-            panel.show_values(scene, np.zeros(3), 0)
-            kept = panel.edited(item)
-            assert (kept.confidence, kept.color_srgb) == (confidence, item.color_srgb)
-            assert kept.pose.rotation is item.pose.rotation
-            panel.confidence.value = 0.25
-            assert panel.edited(item).confidence == 0.25
-    finally:
-        server.stop()
-
-
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     with pytest.raises(SystemExit) as exit_:
         view_command.view([str(argument) for argument in arguments])
@@ -321,6 +303,20 @@ def test_bad_input_is_one_message(files: Path, tmp_path: Path, capsys: pytest.Ca
 def test_a_code_that_cannot_be_saved(files: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="choose another --out"):
         save(with_far_origin(files), tmp_path)
+
+
+def test_an_object_outside_the_picture_has_no_loss(files: Path) -> None:
+    page = with_far_origin(files)
+    assert compare(page).shows_objects
+    gone = replace(page.scene, objects=(replace(page.scene.objects[0], pose=Pose(np.eye(3), np.array([9.0, 0, 0.6]))),))
+    assert not compare(replace(page, scene=gone)).shows_objects
+
+
+def test_a_saved_edit_is_refused_in_another_unit(files: Path, tmp_path: Path) -> None:
+    (page,) = open_pages(Opening(str(files / "found.jsonl"), MeshFiles((str(files / "chair.ply"),))))
+    save(page, tmp_path / "edited.jsonl")
+    with pytest.raises(DataError, match="the mesh is not the chair that was detected"):
+        list(open_pages(Opening(str(tmp_path / "edited.jsonl"), MeshFiles((str(files / "chair.ply"),), "inch"))))
 
 
 def test_a_scene_of_a_generated_world_is_opened_again(tmp_path: Path) -> None:

@@ -200,7 +200,17 @@ class Recipe:
         ):
             if not 0 < getattr(self, name) < math.inf:
                 raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected more than 0")
-        for name in ("matrix_learning_rate", "critic_learning_rate", "warm_up_steps", "final_learning_rate"):
+        for name in (
+            "matrix_learning_rate",
+            "critic_learning_rate",
+            "warm_up_steps",
+            "final_learning_rate",
+            "image_weight",
+            "critic_weight",
+            "gradient_penalty",
+            "sleep_weight",
+            "sleep_noise",
+        ):
             if not 0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"{_flag(name)} is {getattr(self, name)}, expected 0 or more")
         if not 0 <= self.sleep_drawn <= 1:
@@ -283,6 +293,8 @@ class RunConfig:
             raise UsageError(
                 f"--labels {self.labels} with --method {self.method}, which uses none; expected --method super"
             )
+        if not 0 <= self.stop_below < math.inf:
+            raise UsageError(f"--stop-below is {self.stop_below}, expected 0 or more")
         if self.stop_below and not self.terms.image:
             raise UsageError(f"--stop-below watches the image loss, which --method {self.method} does not have")
         for name in ("minutes", "images"):

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from curio_train.camera import Intrinsics, check_matrix
+from curio_train.capture.lens import LARGEST_UNCERTAINTY_PX, fitted
 from curio_train.data.photographs import Photographs, read_photograph
 from curio_train.errors import CameraError, DataError
 
@@ -109,12 +110,24 @@ class Calibration:
     """Root mean square distance of corners from where the camera should see them."""
     focal_uncertainty: float
     """Standard deviation of the focal length, as a fraction of it."""
+    border_px: float
+    """Standard deviation of where it sees a direction, at the worst place of the frame."""
     num_views: int
     """Photographs in which the board was found."""
     unused: tuple[Path, ...]
     """Photographs in which the board was not found."""
     board: Board
     """The board as it was found: its counts were given in squares, or in inner corners."""
+
+    @property
+    def doubt(self) -> str:
+        """What to do where no board was near the frame's border; empty if the lens is known there."""
+        if self.border_px <= LARGEST_UNCERTAINTY_PX:
+            return ""
+        return (
+            f"; towards the frame's border the lens is uncertain by up to {self.border_px:.0f} pixels: photograph the "
+            "board there, too"
+        )
 
 
 def calibrate(folder: Path, board: Board) -> Calibration:
@@ -140,7 +153,8 @@ def calibrate(folder: Path, board: Board) -> Calibration:
     counts = "nor of as many inner corners " if len(board.readings) > 1 else ""
     raise CameraError(
         f"{folder}: found no board of {board.columns}x{board.rows} squares {counts}in {_FEWEST_VIEWS} or more of "
-        f"{len(greys)} photographs; are the counts right, is the board sharp and wholly in the frame?"
+        f"{len(greys)} photographs; are the counts right, is the board sharp and wholly in the frame, and has "
+        "it markers (ChArUco: --marker-mm)?"
     )
 
 
@@ -153,29 +167,27 @@ def _solve(
 ) -> Calibration:
     points, pixels = zip(*views, strict=True)
     try:
-        error, matrix, distortion, rotation_vectors, _, deviations, _, _ = cv2.calibrateCameraExtended(
-            points, pixels, size, np.zeros((3, 3)), np.zeros(5)
-        )
+        lens = fitted(points, pixels, size)
     except cv2.error as exc:
         raise CameraError(f"{folder}: OpenCV finds no camera that sees the boards so ({exc.err})") from exc
-    uncertainty = float(deviations[0, 0] / matrix[0, 0])
+    error, matrix, uncertainty = lens.error_px, lens.matrix, lens.focal_px / float(lens.matrix[0, 0])
     if error > _LARGEST_ERROR_PX:
         raise CameraError(
             f"{folder}: corners lie {error:.2g} pixels from where the best camera sees them, expected at most "
             f"{_LARGEST_ERROR_PX:g}; is the board flat, the zoom fixed, and all taken with one camera?"
         )
     # Where all boards are parallel the estimate itself is wrong, and its deviation too small.
-    if not uncertainty < _LARGEST_UNCERTAINTY or _spread_deg(rotation_vectors) < _LEAST_SPREAD_DEG:
+    if not uncertainty < _LARGEST_UNCERTAINTY or _spread_deg(lens.rotation_vectors) < _LEAST_SPREAD_DEG:
         raise CameraError(
             f"{folder}: the views are too alike: boards are tilted by "
-            f"{_spread_deg(rotation_vectors):.0f} degrees to each other, "
+            f"{_spread_deg(lens.rotation_vectors):.0f} degrees to each other, "
             f"the focal length is uncertain by {uncertainty:.1%}; tilt the board by 30 degrees to all sides"
         )
     width, height = size
     camera = Intrinsics(
-        check_matrix(matrix, width, height, str(folder)), width, height, tuple(distortion.ravel()[:5].tolist())
+        check_matrix(matrix, width, height, str(folder)), width, height, tuple(lens.distortion.tolist())
     )
-    return Calibration(camera, float(error), uncertainty, len(views), unused, board)
+    return Calibration(camera, error, uncertainty, lens.uncertainty_px, len(views), unused, board)
 
 
 def _spread_deg(rotation_vectors: Sequence[np.ndarray]) -> float:

@@ -102,6 +102,9 @@ def run(command: AssistantCommand, interruption: Interruption, report: Callable[
         CameraError: There is no such board.
     """
     board = None
+    for flag, given in {"--marker-mm": command.marker_mm, "--dictionary": command.dictionary}.items():
+        if command.board is None and given not in (None, AssistantCommand.dictionary):
+            raise UsageError(f"{flag} {given} has no effect without --board; add that, or leave it out")
     if command.board is not None:
         marker_m = None if command.marker_mm is None else command.marker_mm / 1000
         board = Board(*command.board, _SQUARE_M, marker_m, command.dictionary)

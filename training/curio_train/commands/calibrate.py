@@ -20,7 +20,13 @@ from curio_train.errors import CameraError, DataError, UsageError
 
 _CAMERA_FILE = Path("camera.json")
 _NAMED = 3
-_NEEDED = {"--square-mm": "--board", "--marker-mm": "--board", "--data": "--objects", "--camera": "--views-out"}
+_NEEDED = {
+    "--square-mm": "--board",
+    "--marker-mm": "--board",
+    "--dictionary": "--marker-mm",
+    "--data": "--objects",
+    "--camera": "--views-out",
+}
 """Flags that have no effect without another one."""
 
 ByObjects = Callable[[Structure, Path, Path | None], tuple[Structure, str]]
@@ -54,6 +60,7 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
         f"{camera_out}: focal length {found.camera.matrix[0, 0]:.1f} pixels ± {found.focal_uncertainty:.2%}, "
         f"corners off by {found.error_px:.2f} pixels in {found.num_views} photographs{unused}"
         + _reading(board, found.board)
+        + found.doubt
     )
 
 
@@ -67,7 +74,10 @@ def _rig(command: CalibrateCommand, path: Path) -> str:
         raise UsageError("--rig-out needs photographs of a board: say which by --board")
     found = calibrate_rig(command.images, _board(command, command.board))
     save_rig(path, found)
-    lines = [f"{path}: {len(found.names)} cameras, corners off by at most {found.error_px:.2f} pixels"]
+    lines = [
+        f"{path}: {len(found.names)} cameras, corners off by at most {found.error_px:.2f} pixels; distances are right "
+        f"if squares are {command.square_mm:g} mm (--square-mm)"
+    ]
     for name, camera, pose, count in zip(
         found.names, found.cameras, found.cam_from_rig, found.num_instants, strict=True
     ):
@@ -75,7 +85,7 @@ def _rig(command: CalibrateCommand, path: Path) -> str:
         angle = float(np.degrees(np.arccos(np.clip((np.trace(pose[:3, :3]) - 1) / 2, -1, 1))))
         lines.append(
             f"  {name}: focal length {camera.camera.matrix[0, 0]:.1f} pixels, {away_m:.3f} m and {angle:.1f} degrees "
-            f"from {found.names[0]}, by {count} photographs"
+            f"from {found.names[0]}, by {count} photographs{camera.doubt}"
         )
     return "\n".join(lines)
 

@@ -48,8 +48,10 @@ def doctor(arguments: Sequence[str] | None = None) -> None:
 def _examine(command: DoctorCommand) -> int:
     from curio_train.doctor.examine import Subjects, examine, save_symmetries
 
-    if command.symmetries is not None and command.mesh is None:
-        raise UsageError(f"--symmetries {command.symmetries}: found no --mesh to find them from")
+    for flag in ("symmetries", "mesh_unit", "body"):
+        if getattr(command, flag) is not None and command.mesh is None:
+            name = f"--{flag.replace('_', '-')}"
+            raise UsageError(f"{name} {getattr(command, flag)}: found no --mesh that it is about; add that")
     if command.symmetries is not None and os.path.lexists(command.symmetries):
         raise UsageError(
             f"--symmetries {command.symmetries}: there is such a file already, and other objects may be in it; name "

@@ -50,8 +50,10 @@ def evaluate(arguments: Sequence[str] | None = None) -> None:
 def _evaluate(command: EvaluateCommand) -> int:
     from curio_train.evaluation.evaluate import evaluate
     from curio_train.evaluation.reporting.tables import print_evaluation
+    from curio_train.evaluation.subject import refuse_without_frames
 
     if command.download and command.data is None:
+        refuse_without_frames(command.path)  # before gigabytes are fetched
         command = replace(command, data=fetched_linemod(command.cache, report, ask=False, frames=True))
     names = ("split", "num_images", "data", "bop_results", "refine", "reads", "cache")
     given = {name: getattr(command, name) for name in names}

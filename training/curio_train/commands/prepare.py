@@ -43,6 +43,8 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
             raise UsageError(
                 f"--photos {options.photos}: --method {config.method} does not learn from photographs; leave it out"
             )
+        if options.photos is not None and not config.recipe.self_training:
+            warn(f"--photos {options.photos}: with --self-training 0 nothing is learned from them; give a fraction")
         options = with_linemod(_with_stages(options, config.method), cache, report)
         config = replace(config, world=options)
         _refuse_unreadable(options)

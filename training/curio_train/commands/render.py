@@ -45,7 +45,7 @@ class RenderCommand:
 
 def render(arguments: Sequence[str] | None = None) -> None:
     """``curio-render SCENES --out DIR …``; exit status as of :func:`~curio_train.commands.train.train`."""
-    command = parsed(RenderCommand, arguments, "curio-render")
+    command = parsed(RenderCommand, arguments, "curio-render", lists=("--mesh",))
     sys.exit(answer(lambda _: _render(command)))
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NoReturn, get_type_hints
 
 import tyro
-from curio_serve.command_line import HELP_ALL, join_help_lines, parsed
+from curio_serve.command_line import HELP_ALL, join_help_lines, parsed, with_lists_joined
 from curio_serve.version import answer_version
 from tyro.conf import OmitArgPrefixes
 
@@ -25,7 +25,7 @@ from curio_train.errors import UsageError, nearest
 from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.worlds import WORLDS
-from curio_train.worlds.options import LOCATOR_RECIPE, CaptureOptions
+from curio_train.worlds.options import LOCATOR_RECIPE, CaptureOptions, LinemodOptions
 
 if TYPE_CHECKING:
     from curio_train.capture.structure import Structure
@@ -107,6 +107,7 @@ def parse(arguments: list[str]) -> TrainCommand:
     if world not in WORLDS:
         return _refuse_world(arguments)
     kind = WORLDS[world]
+    arguments = with_lists_joined(arguments, ("--mesh", "--counts"))
     typed = [_dashed(word) for word in with_project(arguments, _path_flags())[1:]]
     default, stored = _defaults(world, typed)
     prog, about = f"curio-train {world}", (kind.__doc__ or "").partition("\n\n")[0]
@@ -197,6 +198,13 @@ def _traced_ahead(config: RunConfig, num_threads: int) -> "AbstractContextManage
     return TracingAhead(config) if num_threads > 1 and isinstance(config.world, CaptureOptions) else nullcontext()
 
 
+def _draws_templates(options: WorldOptions) -> bool:
+    """Whether poses are told by templates, which are drawn before a locator is trained."""
+    if isinstance(options, LinemodOptions):
+        return options.gaze and not options.two_stage
+    return isinstance(options, CaptureOptions) and options.names_several
+
+
 def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_serve.files import direct
 
@@ -225,7 +233,11 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
             print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
             report(end(path, config, session.cache, warn, report, ahead))
         return 0
-    report(f"{path}: preparing images and renderer, which takes a minute or so where it was not done before")
+    report(
+        f"{path}: drawing the objects' templates, which takes a minute or two for each"
+        if _draws_templates(config.world) and not session.resume
+        else f"{path}: preparing images and renderer, which takes a minute or so where it was not done before"
+    )
     outcome, progress = learn(
         config,
         path,

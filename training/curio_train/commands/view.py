@@ -45,7 +45,7 @@ class ViewCommand:
 
 def view(arguments: Sequence[str] | None = None) -> None:
     """``curio-view WHAT …``; exit status as of :func:`~curio_train.commands.train.train`."""
-    command = parsed(ViewCommand, arguments, "curio-view")
+    command = parsed(ViewCommand, arguments, "curio-view", lists=("--mesh",))
     sys.exit(answer(lambda _: _view(command)))
 
 

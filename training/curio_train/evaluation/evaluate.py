@@ -1,6 +1,6 @@
 """Score a run or a model on held-out images of its world, beside the same network untrained, and on real frames."""
 
-from collections.abc import Callable, Mapping, Sized
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from curio_train.errors import DataError, ReportError, UsageError
-from curio_train.evaluation.real_frames import evaluate_real_frames, refuse_unscorable
+from curio_train.evaluation.real_frames import bop_file, evaluate_real_frames, refuse_unscorable
 from curio_train.evaluation.repeated import reading_repeatedly
 from curio_train.evaluation.reporting.report import write_report
 from curio_train.evaluation.results import keep
@@ -34,6 +34,7 @@ QUICK, ALL = 100, 500
 
 _BATCH_SIZE = 50
 _NUM_EMPTY = 100
+_REFINED = "-refined"  # ends the method in the name of a file of refined poses
 _SEED = 0  # of the images: the same for every run, so that figures can be compared
 
 
@@ -94,10 +95,8 @@ def evaluate(
         raise UsageError("--bop-results needs the real frames: give --data DIR")
     subject = load_subject(path, data)
     has_whole_frames = isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld)
-    if data is not None and not has_whole_frames:
-        raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
-    if data is not None:
-        refuse_unscorable(subject.world, data)  # before minutes are spent on renderings
+    if data is not None:  # before minutes are spent on renderings
+        _refuse_unscorable(subject, data, bop_results, ("", _REFINED) if refine else ("",))
     subject = subject if reads == 1 else reading_repeatedly(subject, reads)
     num_images = num_images or (QUICK if has_whole_frames else ALL)
     better = _refining(subject) if refine else None
@@ -118,7 +117,7 @@ def evaluate(
         progress("refined poses")
         result["refined"] = {"metrics": _scored(better.world, better.predict, held_out).metrics}
         if data is not None:
-            result["refined"]["real"] = evaluate_real_frames(better, data, bop_results, "-refined")
+            result["refined"]["real"] = evaluate_real_frames(better, data, bop_results, _REFINED)
     if (judgement := _judged(subject, warn)) is not None:
         result["photographs"] = judgement.summary
     if reads == 1 and (path / CONFIG_FILE).exists():  # cards and reports are of the model as it answers by itself
@@ -129,6 +128,15 @@ def evaluate(
         except ReportError as exc:
             warn(str(exc))
     return result
+
+
+def _refuse_unscorable(subject: Subject, data: Path, bop_results: Path | None, suffixes: Sequence[str]) -> None:
+    if not isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld):
+        raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
+    refuse_unscorable(subject.world, data)
+    if bop_results is not None:
+        for suffix in suffixes:
+            bop_file(bop_results, subject, data, suffix)
 
 
 def _keep_held_out(run: Path, result: Mapping[str, Any]) -> None:

@@ -38,7 +38,7 @@ def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None,
         suffix: Of the method's name in that file's.
 
     Raises:
-        UsageError: The world has no camera, or the data set does not know the object.
+        UsageError: The world has no camera, the data set does not know the object, or the results file is there.
         DataError: The data set is incomplete or has no frame of it.
     """
     dataset, kinds = BopDataset(data), subject.world.objects
@@ -47,7 +47,7 @@ def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None,
     chosen = [[found[_key(target)][slot] for target in frames.targets] for slot, frames in enumerate(wanted)]
     if bop_results is not None:
         by_object = {dataset.object_id(kind.name): one for kind, one in zip(kinds, chosen, strict=True)}
-        _write_bop(bop_results, subject.config.method + suffix, data.resolve().name, by_object)
+        _write_bop(bop_file(bop_results, subject, data, suffix), by_object)
     each = {
         kind.name: scored(kind, list(zip(one, frames.targets, strict=True)), dataset)
         for kind, one, frames in zip(kinds, chosen, wanted, strict=True)
@@ -56,6 +56,19 @@ def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None,
     if len(each) == 1:
         return about | next(iter(each.values()))
     return about | together(each, _absent(dataset, [kind.name for kind in kinds], found))
+
+
+def bop_file(folder: Path, subject: Subject, data: Path, suffix: str = "") -> Path:
+    """METHOD_DATASET-SPLIT.csv in a folder, as BOP's tools want it: the first underscore ends the method's name.
+
+    Raises:
+        UsageError: It is there already, perhaps of another model.
+    """
+    method = (subject.config.method + suffix).replace("_", "-")
+    path = folder / f"{method}_{data.resolve().name}-{SPLIT}.csv"
+    if path.exists():
+        raise UsageError(f"--bop-results: {path} is there already; remove it, or give another folder")
+    return path
 
 
 def refuse_unscorable(world: World, data: Path) -> None:
@@ -152,8 +165,8 @@ def _whole_frame(frame: Frame, camera: Camera) -> PinholeCrop:
         raise DataError(f"{frame.path}: {exc}") from exc
 
 
-def _write_bop(folder: Path, method: str, dataset: str, by_object: Mapping[int, Sequence[Estimate]]) -> None:
-    """METHOD_DATASET-SPLIT.csv: rotations row by row, millimetres, seconds an image."""
+def _write_bop(path: Path, by_object: Mapping[int, Sequence[Estimate]]) -> None:
+    """Rotations row by row, millimetres, seconds an image."""
     lines = ["scene_id,im_id,obj_id,score,R,t,time"]
     for object_id, estimates in by_object.items():
         for e in estimates:
@@ -161,9 +174,8 @@ def _write_bop(folder: Path, method: str, dataset: str, by_object: Mapping[int, 
             translation = " ".join(f"{value * 1000:.9g}" for value in e.pose.translation_m)
             frame = f"{e.frame.scene_id},{e.frame.image_id},{object_id}"
             lines.append(f"{frame},{e.confidence:.6g},{rotation},{translation},{e.seconds:.4f}")
-    path = folder / f"{method.replace('_', '-')}_{dataset}-{SPLIT}.csv"  # the first underscore ends the method's name
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as exc:
         raise UsageError(f"--bop-results: cannot write {path}: {exc.strerror}") from exc

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from curio_train.data.bop import Annotation, BopDataset, Frame, ModelInfo
-from curio_train.evaluation.scores import add_errors, pose_scores, rotation_errors_deg
+from curio_train.evaluation.scores import add_errors, mean_of_objects, pose_scores, rotation_errors_deg
 from curio_train.geometry import Pose
 from curio_train.metrics.calibration import auroc, calibration_error, reliability_bins
 from curio_train.metrics.poses import (
@@ -72,11 +72,7 @@ def together(each: Mapping[str, dict[str, Any]], absent: Sequence[float]) -> dic
         absent: Confidences of objects in frames that do not show them.
     """
     rows = [row for one in each.values() for row in one["targets"]]
-    metrics = {
-        name: float(np.mean([one["metrics"][name] for one in each.values()]))
-        for name in next(iter(each.values()))["metrics"]
-        if all(name in one["metrics"] for one in each.values())
-    }
+    metrics = mean_of_objects([one["metrics"] for one in each.values()])
     for name, least in (("add_recall", 0.0), ("add_recall_visible_80", VISIBLE)):
         if f"{name}_low" in metrics:
             seen = [[row for row in one["targets"] if (row["visible_fraction"] or 0) >= least] for one in each.values()]

@@ -1,6 +1,6 @@
 """Metrics of predicted scene codes against true ones, each under a name that carries its unit."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -68,6 +68,15 @@ def novel_view_dssim(world: World, predicted: SceneCode, true: SceneCode) -> Flo
     starts = range(0, len(true[TRANSLATION]), _BATCH_SIZE)
     batches = [[index(code, slice(start, start + _BATCH_SIZE)) for code in (predicted, true)] for start in starts]
     return torch.cat([dssim(*(novel_view(world, code).clamp(0, 1) for code in pair)) for pair in batches])
+
+
+def mean_of_objects(each: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Means over objects of the scores that all have; the mean of medians is no median, and named apart."""
+    shared = [name for name in each[0] if all(name in scores for scores in each)]
+    return {
+        f"{name}_mean" if name.endswith("_median") else name: float(np.mean([scores[name] for scores in each]))
+        for name in shared
+    }
 
 
 def accuracy(world: World, predicted: SceneCode, true: SceneCode) -> float:

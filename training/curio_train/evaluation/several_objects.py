@@ -1,9 +1,7 @@
 """Scores of a detector for several objects on renderings that show some of them."""
 
-import numpy as np
-
 from curio_train.errors import UsageError
-from curio_train.evaluation.scores import add_errors, pose_scores
+from curio_train.evaluation.scores import add_errors, mean_of_objects, pose_scores
 from curio_train.metrics.calibration import auroc, calibration_error
 from curio_train.metrics.poses import ADD_THRESHOLD
 from curio_train.scene_code import CONFIDENCE, SceneCode, index, poses
@@ -36,7 +34,7 @@ def several_objects_scores(world: SeveralObjectsWorld, predicted: SceneCode, tru
         correct += [error < ADD_THRESHOLD for error in errors]
     if not each:
         raise UsageError(f"--num-images {len(there)}: none of them shows an object; expected more")
-    scores = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+    scores = mean_of_objects(each)
     scores["confidence_ece"] = calibration_error(confidences, correct)
     if not there.all():
         scores["present_auroc"] = auroc(confidences, predicted[CONFIDENCE][..., 0][~there].tolist())

@@ -2,29 +2,33 @@
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from curio_proto.v1.model_spec_pb2 import ModelSpec
 from torch import Tensor, nn
 
 from curio_train.config import RunConfig
 from curio_train.errors import ExportError, UsageError
 from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
-from curio_train.learning.runs.configuration import CONFIG_FILE, from_json
+from curio_train.learning.runs.configuration import CONFIG_FILE, from_json, world_name
 from curio_train.learning.runs.provenance import run_sessions
 from curio_train.learning.state import TrainState
 from curio_train.networks.templates.quick_trunk import with_quick_trunk
 from curio_train.scene_code import joined
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World
+from curio_train.worlds.options import LinemodOptions
 
 Predict = Callable[[Tensor], dict[str, Tensor]]
 """Any number of uint8 images [num, 3, height, width] to their scene codes."""
 
+_MISSING = "{path}: there is no such file or folder; expected a run folder or an exported model"
+_OTHER_RECIPE = "{file}: its recipe is no configuration of this version ({exc}); export it again"
 _PIXELS_AT_ONCE = 1 << 20  # three frames of 640x480
 
 
@@ -55,24 +59,46 @@ def load_subject(path: Path, data: Path | None = None) -> Subject:
 
     Args:
         path: A run folder, a model folder (its latest version), a version's folder, or an .onnx file.
-        data: Data folder, for models of worlds that need one: an exported model doesn't name its maker's.
+        data: Data folder, for models of worlds that need one: an exported model doesn't name its maker's; and for runs
+            whose own is gone.
 
     Raises:
-        UsageError: It is neither, or ``data`` is missing.
+        UsageError: It is neither, ``data`` is missing, or its meshes are not those that a model was trained with.
         CheckpointError: The run is damaged or has no checkpoint.
         ExportError: The model cannot be used.
         DataError: What the world needs cannot be read.
     """
     if not path.exists():
-        raise UsageError(f"{path}: there is no such file or folder; expected a run folder or an exported model")
+        raise UsageError(_MISSING.format(path=path))
     if (path / CONFIG_FILE).exists():
-        return _from_run(path)
+        return _from_run(path, data)
     return _from_model(find_model(path), data)
 
 
-def _from_run(path: Path) -> Subject:
+def refuse_without_frames(path: Path) -> None:
+    """Refuse what has no real frames to be scored on: all but LineMOD.
+
+    Raises:
+        UsageError: It is of another world, or there is nothing at the path.
+        CheckpointError: The run is damaged.
+        ExportError: The model cannot be used.
+    """
+    if not path.exists():
+        raise UsageError(_MISSING.format(path=path))
+    if (path / CONFIG_FILE).exists():
+        name = world_name(RunFolder.open(path).config)
+    else:
+        name = _recipe_of(ExportedModel.open(find_model(path)), path)["world"]["name"]
+    if WORLDS[name] is not LinemodOptions:
+        raise UsageError(f"--download: world {name} has no real frames; leave it out")
+
+
+def _from_run(path: Path, data: Path | None) -> Subject:
     run = RunFolder.open(path)
-    world = build(run.config.world)
+    options = run.config.world
+    if isinstance(options, LinemodOptions) and data is not None and options.data is not None:
+        options = options if options.data.exists() else dataclasses.replace(options, data=data)
+    world = build(options)
     state = run.trained(world)
     progress = state.progress
     return Subject(
@@ -111,7 +137,17 @@ def _from_model(file: Path, data: Path | None) -> Subject:
     config = _config_of(model, file, data)
     world = build(config.world)
     spec = model.spec
+    _refuse_other_meshes(world, spec, f"--data {data}", file)
     return Subject(config, world, model_reader(model, world), spec.images_seen, spec.training_seconds, spec.commit)
+
+
+def _refuse_other_meshes(world: World, spec: ModelSpec, given: str, file: Path) -> None:
+    for kind, learned in zip(world.objects, spec.objects, strict=True):
+        if learned.mesh_sha256 and kind.mesh_sha256 != learned.mesh_sha256:
+            raise UsageError(
+                f"{given}: its mesh of {kind.name} is not the one that {file} was trained with (SHA-256 "
+                f"{kind.mesh_sha256[:12]}…, expected {learned.mesh_sha256[:12]}…); give the data set of that mesh"
+            )
 
 
 def model_reader(model: ExportedModel, world: World) -> Predict:
@@ -125,17 +161,30 @@ def model_reader(model: ExportedModel, world: World) -> Predict:
 
 def _config_of(model: ExportedModel, file: Path, data: Path | None) -> RunConfig:
     """The configuration in a model's specification, with this machine's data folder."""
+    recipe = _recipe_of(model, file)
+    options = recipe["world"]
+    names = [one.name for one in model.spec.objects]
+    recipe["world"] = options | _data_options(WORLDS[options["name"]], options, data, file, names)
     try:
-        recipe = json.loads(model.spec.recipe)
-        options = recipe["world"]
-        kind = WORLDS[options["name"]]
-        recipe["world"] = options | _data_option(kind, options, data, file)
         return from_json(recipe)
     except (ValueError, TypeError, KeyError) as exc:
-        raise ExportError(f"{file}: its recipe is no configuration of this version ({exc}); export it again") from exc
+        raise ExportError(_OTHER_RECIPE.format(file=file, exc=exc)) from exc
 
 
-def _data_option(kind: type[Any], options: Mapping[str, Any], data: Path | None, file: Path) -> dict[str, str]:
+def _recipe_of(model: ExportedModel, file: Path) -> dict[str, Any]:
+    """The configuration as it is stored, of a world that this version has."""
+    try:
+        recipe: dict[str, Any] = json.loads(model.spec.recipe)
+        WORLDS[recipe["world"]["name"]]
+    except (ValueError, TypeError, KeyError) as exc:
+        raise ExportError(_OTHER_RECIPE.format(file=file, exc=exc)) from exc
+    return recipe
+
+
+def _data_options(
+    kind: type[Any], options: Mapping[str, Any], data: Path | None, file: Path, names: Sequence[str]
+) -> dict[str, str]:
+    """Where the data are, and which of its classes are the model's: "all" would be those of this data set."""
     needed = {field.name for field in dataclasses.fields(kind) if field.default is field.default_factory}
     if missing := sorted(needed - options.keys()):
         raise UsageError(
@@ -146,4 +195,4 @@ def _data_option(kind: type[Any], options: Mapping[str, Any], data: Path | None,
         return {}
     if data is None:
         raise UsageError(f"{file} is a model of world {options['name']}, which needs its data: --data DIR")
-    return {"data": str(data)}
+    return {"data": str(data)} | ({"class_name": ",".join(names)} if len(names) > 1 else {})

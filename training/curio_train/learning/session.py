@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 
 from curio_train.config import RunConfig
+from curio_train.errors import UsageError
 from curio_train.learning.explaining import Found, search_of
 from curio_train.learning.hardware import choose_threads, one_thread
 from curio_train.learning.loop import Outcome, train
@@ -41,6 +42,15 @@ def _draw(trainer: Trainer, cache: Path) -> None:
         return
     network.to(trainer.ranks.device)
     trainer.state.progress.seconds += time.monotonic() - begin
+
+
+def _refuse_spent(config: RunConfig, seconds: float, path: Path) -> None:
+    """Drawing counts as training; a budget that ends with it would leave a network that has learned nothing."""
+    if config.progress(0, seconds) >= 1:
+        raise UsageError(
+            f"--minutes {config.minutes:g}: drawing what {path} reads poses by took {seconds / 60:.1f} minutes, which "
+            "leaves nothing to learn in; give more, and another --out"
+        )
 
 
 def _forget_photographs(trainer: Trainer, cache: Path) -> None:
@@ -91,6 +101,7 @@ def learn(
         Why training ended, and the run's progress.
 
     Raises:
+        UsageError: The budget is spent before anything is learned.
         CurioError: Any of this package's errors; checkpoints that were written stay.
     """
     with ranks(device) as here, ExitStack() as own:
@@ -117,6 +128,7 @@ def learn(
                 begin_with(trainer.state, config.init)
             trainer.state.progress.seconds_before += found.seconds
             _draw(trainer, cache)
+            _refuse_spent(config, trainer.state.progress.seconds, path)
 
         told = reporting(path, trainer.state.progress, is_flat=config.world.is_flat) if here.leads else nullcontext()
         with told as reporter:

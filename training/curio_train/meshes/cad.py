@@ -175,9 +175,23 @@ def _chosen(path: Path, bodies: list[_Body], name: str | None) -> list[_Body]:
     if name is None:
         return bodies
     chosen = _named(bodies, name)
+    if len(sizes := _sizes_mm([one for one in bodies if one.name == name])) > 1:
+        raise MeshError(
+            f"{path}: bodies of {' and '.join(sizes)} mm are called {name!r}; give each a name of its own in the CAD "
+            "application, and export it again"
+        )
     if not chosen:
         raise MeshError(f"{path}: found no body {name!r}, expected one of: {named(_names(bodies))}")
     return chosen
+
+
+def _sizes_mm(bodies: Sequence[_Body]) -> list[str]:
+    """The different sizes of bodies in their own frames."""
+    by_number: dict[int, list[np.ndarray]] = {}
+    for one in bodies:
+        by_number.setdefault(one.number, []).append(one.vertices_mm)
+    extents = [np.ptp(np.concatenate(parts), axis=0) for parts in by_number.values()]
+    return sorted({" x ".join(f"{length:.4g}" for length in extent) for extent in extents})
 
 
 def _named(bodies: list[_Body], name: str) -> list[_Body]:

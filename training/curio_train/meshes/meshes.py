@@ -146,7 +146,10 @@ def to_ply(mesh: Mesh) -> bytes:
 
 def _from_cad(path: Path, content: bytes, unit: Unit | None, body: str | None) -> Mesh:
     if unit is not None:
-        raise UsageError(f"--mesh-unit {unit}: {path} is a CAD file, which names its own unit; leave it out")
+        raise UsageError(
+            f"--mesh-unit {unit}: {path} is a CAD file, which names its own unit; leave it out, and write "
+            "other meshes beside it in metres"
+        )
     try:
         merged, bodies = read_cad(path, content, body)
     except _READER_ERRORS as exc:

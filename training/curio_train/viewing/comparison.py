@@ -26,6 +26,8 @@ class Comparison(NamedTuple):
     """Grey where both agree."""
     loss: float
     """The paper's image loss: squared difference, summed over pixels and channels."""
+    shows_objects: bool = True
+    """False where all of them are outside the picture or behind the camera: the loss then says nothing."""
 
 
 def compare(page: Page) -> Comparison:
@@ -42,7 +44,7 @@ def compare(page: Page) -> Comparison:
     signed = image.astype(np.float32) - rendering.astype(np.float32)
     difference = np.clip(128 + _CONTRAST * signed / 2, 0, 255).astype(np.uint8)
     loss = image_loss(_tensor(rendering), _tensor(image))
-    return Comparison(image, rendering, difference, float(loss))
+    return Comparison(image, rendering, difference, float(loss), not page.over_image or bool(np.any(signed)))
 
 
 def _tensor(image: np.ndarray) -> torch.Tensor:

@@ -11,7 +11,7 @@ from curio_train.drawing.scenes import Placed, Scene
 from curio_train.geometry import Pose
 from curio_train.viewing.comparison import Comparison
 
-_UNCHANGED = 1e-3  # of rotation matrices: what a control rounds off
+_ROUNDED_DEG = 0.051  # of rotation vectors: what a control of this step rounds off
 
 
 class Panel:
@@ -61,15 +61,15 @@ class Panel:
         item = scene.objects[selected]
         self.objects.value = self.objects.options[selected]
         self.position.value = _triple(1000 * item.pose.translation_m)
-        self.rotation.value = _triple(Rotation.from_matrix(item.pose.rotation).as_rotvec(degrees=True))
+        self.rotation.value = _rotation_vector_deg(item.pose.rotation)
         self.color.value = tuple(round(255 * value) for value in item.color_srgb)
         self.confidence.value = _shown(item.confidence)
 
     def edited(self, item: Placed) -> Placed:
         """An object with the fields that the controls show; a field that is as it was keeps all its digits."""
-        rotation = Rotation.from_rotvec(self.rotation.value, degrees=True).as_matrix()
-        if np.allclose(rotation, item.pose.rotation, atol=_UNCHANGED):
-            rotation = item.pose.rotation
+        rotation = item.pose.rotation
+        if not np.allclose(self.rotation.value, _rotation_vector_deg(rotation), rtol=0, atol=_ROUNDED_DEG):
+            rotation = Rotation.from_rotvec(self.rotation.value, degrees=True).as_matrix()
         confidence = float(self.confidence.value)
         if confidence == _shown(item.confidence):
             confidence = item.confidence
@@ -82,6 +82,9 @@ class Panel:
         """Show photograph, re-rendering, difference and loss."""
         self._pair.image = np.hstack([drawn.image, drawn.rendering])
         self._difference.image = drawn.difference
+        if not drawn.shows_objects:
+            self._loss.content = "no image loss: no object is in the picture"
+            return
         self._loss.content = f"image loss **{drawn.loss:.4g}** (squared difference, summed over pixels and channels)"
 
     def show_photograph(self, image: np.ndarray) -> None:
@@ -97,6 +100,10 @@ class Panel:
 def _shown(confidence: float) -> float:
     """A confidence as its control shows it."""
     return round(confidence, 2)
+
+
+def _rotation_vector_deg(rotation: np.ndarray) -> tuple[float, float, float]:
+    return _triple(Rotation.from_matrix(rotation).as_rotvec(degrees=True))
 
 
 def _triple(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:

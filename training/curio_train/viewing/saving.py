@@ -7,8 +7,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from curio_serve.imaging.camera import PinholeCamera
 
-from curio_train.drawing.scenes import Scene
+from curio_train.drawing.pictures import SceneContext
+from curio_train.drawing.scenes import Placed, Scene
 from curio_train.errors import DataError
 from curio_train.viewing.pages import Page
 
@@ -24,7 +26,7 @@ def save(page: Page, file: Path) -> None:
     """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        line = json.dumps(_record(_with_file(page, file)))
+        line = json.dumps(_record(_with_file(page, file), page.context))
         with file.open("a", encoding="utf-8") as out:
             out.write(line + "\n")
     except OSError as exc:
@@ -42,7 +44,8 @@ def _with_file(page: Page, file: Path) -> Scene:
     return replace(page.scene, photograph=image)
 
 
-def _record(scene: Scene) -> dict[str, object]:
+def _record(scene: Scene, context: SceneContext) -> dict[str, object]:
+    camera = PinholeCamera(scene.camera_matrix, scene.distortion)
     return {
         "image": _image(scene),
         "width": scene.width,
@@ -57,12 +60,19 @@ def _record(scene: Scene) -> dict[str, object]:
                 "translation_m": item.pose.translation_m.tolist(),
                 "rotation": item.pose.rotation.tolist(),
                 "color": list(item.color_srgb),
+                **({} if scene.world is not None else _box(item, context, camera)),
             }
             for item in scene.objects
         ],
         "light": None if scene.light is None else scene.light.tolist(),
         **({} if scene.world is None else {"world": scene.world}),
     }
+
+
+def _box(item: Placed, context: SceneContext, camera: PinholeCamera) -> dict[str, object]:
+    """``box_px``, by which a mesh in another unit is refused; nothing where a corner is behind the camera."""
+    corners_m = item.pose.apply(context.mesh(item.kind).box_corners_m)
+    return {"box_px": camera.project(corners_m).tolist()} if corners_m[:, 2].min() > 0 else {}
 
 
 def _image(scene: Scene) -> str | None:

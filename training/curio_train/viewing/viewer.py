@@ -145,6 +145,7 @@ class Viewer:
     def _replace_scene(self, scene: Scene) -> None:
         self._pages[self._number] = replace(self.page, scene=scene)
         self._unsaved.add(self._number)
+        self._panel.message("edited, not saved yet")
         self._changed.set()
 
     # The thread that draws.
@@ -205,4 +206,4 @@ class Viewer:
             self._panel.message(f"fit: step {count}, robust residual {first:.3f} → {step.loss:.3f}")
             if count % _STEPS_SHOWN == 0:
                 self._draw()
-        self._panel.message(f"fit: done, robust residual {first:.3f} → {step.loss:.3f}")
+        self._panel.message(f"fit: done, robust residual {first:.3f} → {step.loss:.3f}, not saved yet")
