@@ -25,7 +25,7 @@ class Progress:
         self._bar = _bar(num_before, num_errors_before) if is_shown and sys.stderr.isatty() else None
         self._num_before = num_before
         self._num_new = 0
-        self._num_errors = self._num_errors_before = num_errors_before
+        self._num_errors = num_errors_before
         self._num_turned, self._first_turned = 0, ""
         self._problems: list[str] = []
         self._start_s = time.perf_counter()
@@ -57,6 +57,8 @@ class Progress:
         _say(
             f"{_counted(self._num_new)}{before} in {seconds:.1f} s ({self._num_new / seconds:.1f} images/s) to {label}"
         )
+        if self._num_before:
+            _say("answers of earlier runs stay as they are, whatever flags they had; --overwrite answers all again")
         if self._num_turned:
             have = "has" if self._num_turned == 1 else "have"
             _say(
@@ -69,8 +71,6 @@ class Progress:
             _say(f"{_counted(self._num_errors)} {have} no answer{':' if self._problems else ''}")
         for problem in self._problems:
             print(f"  {problem}", file=sys.stderr)
-        if self._num_errors_before:
-            _say("images without an answer of earlier runs stay so; --overwrite answers all again")
         if len(self._problems) < self._num_errors and self._problems:
             print(f"  ... and {self._num_errors - len(self._problems)} more", file=sys.stderr)
 

@@ -16,6 +16,8 @@ LARGEST_UNCERTAINTY_PX = 1.0
 """Of a lens that is known, see :class:`Lens`."""
 
 _GRID = 9  # places a side of the frame
+_MISFIT = 1.1  # of the corners' distances, by a model without coefficients that the lens has
+_K2 = 1
 
 
 class Lens(NamedTuple):
@@ -37,7 +39,7 @@ class Lens(NamedTuple):
 
 
 def fitted(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]) -> Lens:
-    """The first model that the corners determine up to the frame's border, or else the smallest, without k2 and k3.
+    """The first model that the corners determine up to the frame's border, or else the smallest that fits them.
 
     Where no board comes near the border, a polynomial of three coefficients fits the middle, and beyond it is off by
     tens of pixels.
@@ -50,18 +52,23 @@ def fitted(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tup
     Raises:
         cv2.error: No camera sees boards so.
     """
-    uncertain: list[float] = []
+    chosen: Lens | None = None
     for flags, free in zip(_MODELS, _COEFFICIENTS, strict=True):
         error, matrix, distortion, rotations, shifts, deviations, _, _ = cv2.calibrateCameraExtended(
             points, pixels, size, np.zeros((3, 3)), np.zeros(5), flags=flags
         )
+        if chosen is not None and error > _MISFIT * chosen.error_px:
+            break  # the lens has what this model has not
         distortion = np.asarray(distortion).ravel()[:5]
         covariance = error**2 / 2 * _inverse_information(points, rotations, shifts, matrix, distortion, free)
-        uncertain.append(_uncertainty_px(covariance, size, matrix, distortion, free))
-        if uncertain[-1] <= LARGEST_UNCERTAINTY_PX:
+        uncertain_px = _uncertainty_px(covariance, size, matrix, distortion, free)
+        if chosen is not None and _K2 not in free:
+            uncertain_px = chosen.uncertainty_px
+        chosen = Lens(float(error), matrix, distortion, rotations, float(deviations[0, 0]), uncertain_px)
+        if uncertain_px <= LARGEST_UNCERTAINTY_PX:
             break
-    known_px = uncertain[1] if len(uncertain) == len(_MODELS) else uncertain[-1]
-    return Lens(float(error), matrix, distortion, rotations, float(deviations[0, 0]), known_px)
+    assert chosen is not None  # there are models
+    return chosen
 
 
 def _columns(free: Sequence[int]) -> list[int]:
