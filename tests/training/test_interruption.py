@@ -1,6 +1,11 @@
 """Signals: training finishes its step first, everything else stops at once and in one line."""
 
+import re
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 from curio_train.commands.command_line.running import answer
@@ -34,3 +39,17 @@ def test_a_signal_that_a_library_makes_an_error_of_is_still_a_signal(capsys: pyt
 
     assert answer(trace) == 128 + signal.SIGTERM
     assert "stopped by SIGTERM" in capsys.readouterr().err
+
+
+def test_what_is_stopped_before_its_first_step_says_how_to_go_on(tmp_path: Path) -> None:
+    command = [Path(sys.executable).with_name("curio-train"), "spheres", "--out", "run", "--cache", "cache"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as training:
+        deadline = time.monotonic() + 240
+        while not (tmp_path / "run" / "config.json").exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        training.send_signal(signal.SIGTERM)
+        assert training.stderr is not None
+        told = training.stderr.read()
+    assert training.returncode == 128 + signal.SIGTERM
+    assert "stopped by SIGTERM" in told
+    assert re.search(r"go on with: curio-train spheres --resume \S*run\n", told)

@@ -5,8 +5,8 @@ import dataclasses
 import os
 import shlex
 import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NoReturn, get_type_hints
@@ -22,7 +22,7 @@ from curio_train.commands.command_line.running import CACHE, answer, report, war
 from curio_train.commands.command_line.short_help import print_short_help
 from curio_train.config import NetworkConfig, Preset, Recipe, RunConfig, WorldOptions, preset_recipe
 from curio_train.errors import UsageError, nearest
-from curio_train.learning.runs.configuration import load_config, refuse_other, world_name
+from curio_train.learning.runs.configuration import CONFIG_FILE, load_config, refuse_other, world_name
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.worlds import WORLDS
 from curio_train.worlds.options import LOCATOR_RECIPE, CaptureOptions, LinemodOptions
@@ -205,6 +205,21 @@ def _draws_templates(options: WorldOptions) -> bool:
     return isinstance(options, CaptureOptions) and options.names_several
 
 
+def _how_to_go_on(config: RunConfig, path: Path) -> str:
+    return f"go on with: {shlex.join(['curio-train', world_name(config), '--resume', str(path)])}"
+
+
+@contextmanager
+def _saying_how_to_go_on(config: RunConfig, path: Path) -> Iterator[None]:
+    """Say it where a signal stops what comes before the first step, if the run folder is written already."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if (path / CONFIG_FILE).exists():
+            report(_how_to_go_on(config, path))
+        raise
+
+
 def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_serve.files import direct
 
@@ -229,7 +244,8 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
             raise UsageError("--device cuda: --method templates runs on the CPU; leave it out")
         with one_thread() as num_threads, _traced_ahead(config, num_threads) as ahead:
             is_old = session.resume is not None
-            seconds = draw_templates(config, path, session.cache, num_threads, resume=is_old).seconds
+            with _saying_how_to_go_on(config, path):
+                seconds = draw_templates(config, path, session.cache, num_threads, resume=is_old).seconds
             print(f"{path}: templates drawn and calibrated in {seconds:.0f} s")
             report(end(path, config, session.cache, warn, report, ahead))
         return 0
@@ -238,21 +254,21 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         if _draws_templates(config.world) and not session.resume
         else f"{path}: preparing images and renderer, which takes a minute or so where it was not done before"
     )
-    outcome, progress = learn(
-        config,
-        path,
-        interruption,
-        resume=session.resume is not None,
-        cache=session.cache,
-        device=session.device,
-        checkpoint_minutes=session.checkpoint_minutes,
-    )
+    with _saying_how_to_go_on(config, path):
+        outcome, progress = learn(
+            config,
+            path,
+            interruption,
+            resume=session.resume is not None,
+            cache=session.cache,
+            device=session.device,
+            checkpoint_minutes=session.checkpoint_minutes,
+        )
     if int(os.environ.get("RANK", "0")) == 0:
         loss = "" if progress.image_loss is None else f", image loss {progress.image_loss:.4g}"
         print(f"{path}: {outcome.value} after {progress.images:,} images in {progress.seconds / 60:.1f} minutes{loss}")
         if outcome is Outcome.INTERRUPTED:
-            again = shlex.join(["curio-train", world_name(config), "--resume", str(path)])
-            print(f"go on with: {again}", file=sys.stderr)
+            report(_how_to_go_on(config, path))
         else:
             report(end(path, config, session.cache, warn, report))
     if outcome is Outcome.INTERRUPTED and interruption.signum is not None:
