@@ -1,5 +1,6 @@
 """Command lines as dataclasses, and their help."""
 
+import argparse
 import inspect
 import sys
 import types
@@ -65,32 +66,17 @@ def parsed(
 
 
 def with_lists_joined(given: Sequence[str], lists: Sequence[str]) -> list[str]:
-    """Arguments in which no flag of several values is there twice; of such tyro would keep the last alone.
+    """Arguments in which no flag of several values is there twice, such flags last; tyro would keep the last alone.
 
     Args:
         given: As typed: ``--mesh a --mesh b`` as well as ``--mesh a b``.
         lists: The flags, with their dashes.
     """
-    groups: list[list[str]] = [[]]  # a flag and what follows it
-    for word in given:
-        flag, equals, value = word.partition("=")
-        if flag in lists:
-            groups.append([flag, value] if equals else [flag])
-        elif word.startswith("-"):
-            groups.append([word])
-        else:
-            groups[-1].append(word)
-    first: dict[str, list[str]] = {}
-    kept = []
-    for group in groups:
-        flag = group[0] if group else ""
-        if flag in first:
-            first[flag] += group[1:]
-            continue
-        kept.append(group)
-        if flag in lists:
-            first[flag] = group
-    return [word for group in kept for word in group]
+    repeated = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for flag in lists:
+        repeated.add_argument(flag, dest=flag, nargs="*", action="extend")
+    values, others = repeated.parse_known_args(given)
+    return [*others, *(word for flag, typed in vars(values).items() if typed is not None for word in (flag, *typed))]
 
 
 def join_help_lines(kinds: Iterable[type]) -> None:

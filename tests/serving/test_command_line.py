@@ -64,6 +64,6 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_flag_of_several_values_may_be_there_twice() -> None:
     given = ["file", "--mesh", "a", "--unit", "mm", "--mesh=b=c", "--mesh", "d", "e", "--count", "-1"]
-    joined = ["file", "--mesh", "a", "b=c", "d", "e", "--unit", "mm", "--count", "-1"]
+    joined = ["file", "--unit", "mm", "--count", "-1", "--mesh", "a", "b=c", "d", "e"]
     assert with_lists_joined(given, ("--mesh",)) == joined
     assert with_lists_joined(given, ()) == given

@@ -170,7 +170,7 @@ def _solve(
         lens = fitted(points, pixels, size)
     except cv2.error as exc:
         raise CameraError(f"{folder}: OpenCV finds no camera that sees the boards so ({exc.err})") from exc
-    error, matrix, uncertainty = lens.error_px, lens.matrix, lens.focal_px / float(lens.matrix[0, 0])
+    error, matrix, uncertainty = lens.error_px, lens.matrix, lens.focal_deviation_px / float(lens.matrix[0, 0])
     if error > _LARGEST_ERROR_PX:
         raise CameraError(
             f"{folder}: corners lie {error:.2g} pixels from where the best camera sees them, expected at most "

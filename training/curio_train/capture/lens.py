@@ -6,11 +6,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-_MODELS = (0, cv2.CALIB_FIX_K3, cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_K2)
-"""Flags of cv2.calibrateCamera: k1, k2, k3 and the tangential terms; without k3; without k2 and k3."""
-
-_COEFFICIENTS = ((0, 1, 2, 3, 4), (0, 1, 2, 3), (0, 2, 3))
-"""Those that are free in each of them."""
+_MODELS = (
+    (0, (0, 1, 2, 3, 4)),
+    (cv2.CALIB_FIX_K3, (0, 1, 2, 3)),
+    (cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_K2, (0, 2, 3)),
+)
+"""Flags of cv2.calibrateCamera, and which of (k1, k2, p1, p2, k3) are free with them."""
 
 LARGEST_UNCERTAINTY_PX = 1.0
 """Of a lens that is known, see :class:`Lens`."""
@@ -31,7 +32,7 @@ class Lens(NamedTuple):
     """(k1, k2, p1, p2, k3), [5]."""
     rotation_vectors: Sequence[np.ndarray]
     """Of each board, [3, 1]."""
-    focal_px: float
+    focal_deviation_px: float
     """Standard deviation of fx."""
     uncertainty_px: float
     """Standard deviation of where the camera sees a direction, at the worst place of the frame; of a lens without k2
@@ -53,7 +54,7 @@ def fitted(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tup
         cv2.error: No camera sees boards so.
     """
     chosen: Lens | None = None
-    for flags, free in zip(_MODELS, _COEFFICIENTS, strict=True):
+    for flags, free in _MODELS:
         error, matrix, distortion, rotations, shifts, deviations, _, _ = cv2.calibrateCameraExtended(
             points, pixels, size, np.zeros((3, 3)), np.zeros(5), flags=flags
         )

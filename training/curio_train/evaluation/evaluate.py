@@ -94,11 +94,10 @@ def evaluate(
     if bop_results is not None and data is None:
         raise UsageError("--bop-results needs the real frames: give --data DIR")
     subject = load_subject(path, data)
-    has_whole_frames = isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld)
     if data is not None:  # before minutes are spent on renderings
         _refuse_unscorable(subject, data, bop_results, ("", _REFINED) if refine else ("",))
     subject = subject if reads == 1 else reading_repeatedly(subject, reads)
-    num_images = num_images or (QUICK if has_whole_frames else ALL)
+    num_images = num_images or (QUICK if _has_whole_frames(subject.world) else ALL)
     better = _refining(subject) if refine else None
     progress(f"{num_images} images of the {split} split")
     held_out = draw(subject.world, split, num_images, cache)
@@ -130,8 +129,12 @@ def evaluate(
     return result
 
 
+def _has_whole_frames(world: World) -> bool:
+    return isinstance(world, SingleObjectWorld | SeveralObjectsWorld)
+
+
 def _refuse_unscorable(subject: Subject, data: Path, bop_results: Path | None, suffixes: Sequence[str]) -> None:
-    if not isinstance(subject.world, SingleObjectWorld | SeveralObjectsWorld):
+    if not _has_whole_frames(subject.world):
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
     refuse_unscorable(subject.world, data)
     if bop_results is not None:

@@ -96,8 +96,8 @@ def refuse_without_frames(path: Path) -> None:
 def _from_run(path: Path, data: Path | None) -> Subject:
     run = RunFolder.open(path)
     options = run.config.world
-    if isinstance(options, LinemodOptions) and data is not None and options.data is not None:
-        options = options if options.data.exists() else dataclasses.replace(options, data=data)
+    if data is not None and isinstance(options, LinemodOptions) and options.data and not options.data.exists():
+        options = dataclasses.replace(options, data=data)
     world = build(options)
     state = run.trained(world)
     progress = state.progress

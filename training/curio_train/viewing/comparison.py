@@ -26,7 +26,7 @@ class Comparison(NamedTuple):
     """Grey where both agree."""
     loss: float
     """The paper's image loss: squared difference, summed over pixels and channels."""
-    shows_objects: bool = True
+    shows_objects: bool
     """False where all of them are outside the picture or behind the camera: the loss then says nothing."""
 
 
