@@ -83,15 +83,10 @@ def _exported(
 ) -> str:
     from curio_train.export.write_model import export
 
-    def model(graph: "Graph") -> "ModelProto | None":
-        found = traced(graph)
-        verdict()  # the model's card, which is written next, quotes the report
-        return found
-
     models = run / MODELS_FOLDER
     again = shlex.join(["curio-export", str(run), "--out", str(models)])
     try:
-        done = export(run, models, ahead=model)
+        done = export(run, models, ahead=traced, report=verdict)
     except CurioError as exc:
         raise ExportError(
             f"{run} is trained and whole, but no model could be made of it ({exc}). Once that is put right: {again}"

