@@ -21,7 +21,7 @@ from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, QUARTER_TURNS, Geometry, num_views, viewpoints
 from curio_train.networks.templates.localiser import RANK, Localiser
 from curio_train.networks.templates.network import STEPS, TemplateNetwork
-from curio_train.networks.templates.quick_trunk import QuickTrunk, with_quick_trunk
+from curio_train.networks.templates.quick_trunk import quicken
 from curio_train.networks.templates.rolls import ROLLS_DEG, upright_rolls
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
 from curio_train.scene_code import COLOR
@@ -29,6 +29,7 @@ from curio_train.templates.build import template_network
 from curio_train.templates.drawing import row_sampling
 from curio_train.worlds import build
 from curio_train.worlds.options import CirclesOptions
+from torch import nn
 
 MATRIX = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
 GEOMETRY = Geometry(MATRIX, 640, 480, 0.2, 0.5, 1.5)
@@ -48,13 +49,15 @@ def test_the_quick_trunk_says_the_same() -> None:
     trunk, images = Trunk.pretrained(), torch.rand(5, 3, 160, 128, generator=torch.Generator().manual_seed(0))
     folded = copy.deepcopy(trunk)
     fold_batch_norm(folded)
-    for quick in (QuickTrunk(trunk), copy.deepcopy(QuickTrunk(folded))):
-        for found, expected in zip(quick(images), trunk(images), strict=True):
+    for of_torch in (trunk, folded):
+        network = nn.Sequential(copy.deepcopy(of_torch))
+        quicken(network)
+        for found, expected in zip(copy.deepcopy(network)(images), trunk(images), strict=True):
             torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
-    network = TemplateNetwork(GEOMETRY)
-    assert isinstance(with_quick_trunk(network).trunk, QuickTrunk)
-    assert not isinstance(network.trunk, QuickTrunk)
-    assert with_quick_trunk(network.localiser) is network.localiser
+        assert network.state_dict().keys() == nn.Sequential(of_torch).state_dict().keys()
+        for weights in network.parameters():
+            weights.zero_()
+        assert network(images)[1].any()  # torch's weights are not asked any more
 
 
 @pytest.mark.parametrize("scale", [0.4, 0.73, 1.0])

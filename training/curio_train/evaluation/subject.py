@@ -18,7 +18,7 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, from_json, world_name
 from curio_train.learning.runs.provenance import run_sessions
 from curio_train.learning.state import TrainState
-from curio_train.networks.templates.quick_trunk import with_quick_trunk
+from curio_train.networks.templates.quick_trunk import quicken
 from curio_train.scene_code import joined
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World
@@ -112,7 +112,7 @@ def _from_run(path: Path, data: Path | None) -> Subject:
 
 
 def _reader(network: nn.Module) -> Predict:
-    network = with_quick_trunk(network)
+    quicken(network)
 
     @torch.no_grad()
     def predict(images: Tensor) -> dict[str, Tensor]:

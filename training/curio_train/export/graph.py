@@ -14,7 +14,7 @@ from curio_train.errors import ExportError
 from curio_train.export.parity import LARGEST_PARITY_ERROR
 from curio_train.export.stages import stage_tensors
 from curio_train.networks.layers import fold_batch_norm
-from curio_train.networks.templates.quick_trunk import QuickTrunk
+from curio_train.networks.templates.trunk import Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.scene_code import CONFIDENCE, TRANSLATION, joined
 from curio_train.threads import in_threads
@@ -178,12 +178,13 @@ def _with_jittered_layers(graph: Graph, generator: torch.Generator) -> Graph:
         return torch.addcmul(output, output, repeated.as_strided(output.shape, ordered, first), value=deviation)
 
     def off(layer: nn.Module, _given: object, output: Any) -> object:
-        if isinstance(layer, QuickTrunk):
+        if isinstance(layer, Trunk):  # which onnxruntime computes
             return tuple(jittered(features, _TRUNK_JITTER) for features in output)
         # What is no tensor are poses, which are no layer's.
         return jittered(output, _LAYER_JITTER) if isinstance(output, Tensor) else output
 
     for layer in graph.network.modules():
-        if layer is not graph.network and not list(layer.children()):
+        in_one = isinstance(layer, Trunk) and layer.quick is not None
+        if layer is not graph.network and (in_one or not list(layer.children())):
             layer.register_forward_hook(off)
     return graph

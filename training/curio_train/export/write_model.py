@@ -1,5 +1,6 @@
 """From a run to a model that any runtime can serve: encoder and heads alone, checked against the trained network."""
 
+import copy
 import io
 import json
 from collections.abc import Callable, Mapping
@@ -32,7 +33,7 @@ from curio_train.learning.runs.initial import method_before, weights_file
 from curio_train.learning.runs.provenance import run_sessions
 from curio_train.learning.state import TrainingProgress
 from curio_train.networks.several_objects.network import ObjectsNetwork
-from curio_train.networks.templates.quick_trunk import with_quick_trunk
+from curio_train.networks.templates.quick_trunk import quicken
 from curio_train.networks.templates.trunk import Trunk
 from curio_train.worlds import build
 from curio_train.worlds.base import World
@@ -118,7 +119,8 @@ def export(
     shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
     config = triton_config(target.path.name, tuple(images.shape[1:]), shapes)
     target.refuse_other_tensors(config)
-    checked = with_quick_trunk(deployed.network if half else trained.network)
+    checked = copy.deepcopy(deployed.network if half else trained.network)
+    quicken(checked)
     stable = numerically_stable(Graph(checked, world), images)
 
     model = ahead(deployed) or traced(deployed, deployed.network, world.camera, list(expected))

@@ -22,6 +22,7 @@ from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress, TrainState
 from curio_train.learning.trainer import Trainer
 from curio_train.networks.several_objects.network import ObjectsNetwork
+from curio_train.networks.templates.quick_trunk import quicken
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.templates.build import fill_objects, fill_outline
 from curio_train.worlds import build
@@ -117,9 +118,6 @@ def learn(
             record_session(path)
         found = training_images(path)
         trainer = Trainer(config, world, found.sources, here)
-        if here.device.type == "cpu":
-            # The thread that renders synthetic batches ahead needs a core of its own.
-            choose_threads(trainer.warm_up, reserved=int(not config.terms.reads_images))
         if resume and run.checkpoints():
             run.restore(trainer.state)
             _forget_photographs(trainer, cache)
@@ -129,6 +127,10 @@ def learn(
             trainer.state.progress.seconds_before += found.seconds
             _draw(trainer, cache)
             _refuse_spent(config, trainer.state.progress.seconds, path)
+        quicken(trainer.state.pose.network)
+        if here.device.type == "cpu":
+            # The thread that renders synthetic batches ahead needs a core of its own.
+            choose_threads(trainer.warm_up, reserved=int(not config.terms.reads_images))
 
         told = reporting(path, trainer.state.progress, is_flat=config.world.is_flat) if here.leads else nullcontext()
         with told as reporter:

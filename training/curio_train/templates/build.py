@@ -22,7 +22,7 @@ from curio_train.networks.templates.geometry import (
 )
 from curio_train.networks.templates.localiser import Localiser
 from curio_train.networks.templates.network import TemplateNetwork
-from curio_train.networks.templates.quick_trunk import QuickTrunk
+from curio_train.networks.templates.quick_trunk import quicken
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
 from curio_train.networks.two_stage.network import TwoStageNetwork
 from curio_train.templates.describe import low_rank, mean_cosine
@@ -92,7 +92,8 @@ def fill(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, num_th
     if world.object.unpainted:
         mesh = replace(mesh, vertex_colors_srgb=np.broadcast_to(color, mesh.vertices_m.shape))
         network.color.copy_(torch.tensor(color))
-    trunk = QuickTrunk(network.trunk)
+    trunk = network.trunk
+    quicken(trunk)
     _fill_localiser(network.localiser, trunk, geometry, mesh, frames, num_threads)
     network.reader.banks.put(0, filled_bank(trunk, geometry, mesh, _crops(backgrounds, geometry), num_threads))
     fill_outline(network, world)
@@ -114,7 +115,8 @@ def fill_objects(network: ObjectsNetwork, world: SeveralObjectsWorld, cache: Pat
         DataError: The backgrounds cannot be read.
     """
     network.locator.trunk.load_state_dict(Trunk.pretrained().state_dict())
-    trunk = QuickTrunk(network.locator.trunk)
+    trunk = network.locator.trunk
+    quicken(trunk)
     backgrounds = world.members[0].backgrounds(cache).split(True)
     for number, (member, geometry) in enumerate(zip(world.members, network.geometries, strict=True)):
         crops = _crops(backgrounds, geometry)
@@ -147,7 +149,7 @@ def _crops(backgrounds: Backgrounds, geometry: Geometry) -> Float[Tensor, "num 3
 
 
 def _fill_localiser(
-    localiser: Localiser, trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, frames: Tensor, num_threads: int
+    localiser: Localiser, trunk: Trunk, geometry: Geometry, mesh: Mesh, frames: Tensor, num_threads: int
 ) -> None:
     """Templates over grey at every distance, whitened by the backgrounds, then their scores there."""
     background = trunk(F.avg_pool2d(frames, FRAME_STRIDE))[1]

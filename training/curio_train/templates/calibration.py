@@ -15,7 +15,6 @@ from curio_train.geometry import Pose
 from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.networks.templates.network import TemplateNetwork
-from curio_train.networks.templates.quick_trunk import with_quick_trunk
 from curio_train.scene_code import poses
 from curio_train.threads import in_threads
 from curio_train.worlds.single_object.world import SingleObjectWorld
@@ -33,7 +32,6 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, n
     Raises:
         DataError: The backgrounds cannot be read.
     """
-    reader = with_quick_trunk(network)
     source, kind = world.source("validation", 0, with_code=True, cache=cache), world.object.kind
     points = world.object.mesh.vertices_m[:: max(1, len(world.object.mesh.vertices_m) // _NUM_POINTS)]
     steps = _NUM_FRAMES // _BATCH_SIZE
@@ -49,7 +47,7 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, n
             yield world.augment(batch.images, (0, step)).clamp(0, 1)
             yield world.augment(behind, (1, step)).clamp(0, 1)
 
-    answers = list(in_threads(reader.read, frames(), num_threads))
+    answers = list(in_threads(network.read, frames(), num_threads))
     found = [pose for code, _ in answers[::2] for pose in poses(code)]
     full, empty = ([features for _, features in some] for some in (answers[::2], answers[1::2]))
     errors_m = map(add_or_add_s_m, found, true, repeat(points), repeat(kind.info))

@@ -12,8 +12,7 @@ from curio_train.meshes.meshes import Mesh
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
-from curio_train.networks.templates.quick_trunk import QuickTrunk
-from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_STRIDE, FINE_WIDTH
+from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_STRIDE, FINE_WIDTH, Trunk
 from curio_train.rendering.object_coordinates import ObjectCoordinateMap
 from curio_train.templates.describe import low_rank, mean_cosine
 from curio_train.templates.drawing import APPEARANCES, CropTemplateRenderer
@@ -25,7 +24,7 @@ _BATCH = 64  # of drawings
 _INSIDE = 0.98  # of the pixels around a surface point show the object
 
 
-def filled_bank(trunk: QuickTrunk, geometry: Geometry, mesh: Mesh, crops: Tensor, num_threads: int) -> Bank:
+def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor, num_threads: int) -> Bank:
     """The templates of an object: descriptors averaged over lamps and backgrounds, because what changes counts less.
 
     Args:

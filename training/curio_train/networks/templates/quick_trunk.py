@@ -1,8 +1,7 @@
-"""The frozen trunk as onnxruntime computes it on a CPU, for networks that are neither trained nor traced."""
+"""The frozen trunk as onnxruntime computes it on a CPU, in a tenth of torch's time."""
 
 import copy
-from collections.abc import Sequence
-from typing import Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -11,43 +10,24 @@ from onnx import NodeProto, TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from curio_train.networks.layers import fold_batch_norm
-from curio_train.networks.templates.trunk import MEAN, SPREAD, Trunk
+from curio_train.networks.templates.trunk import MEAN, SPREAD, Block, Trunk
 
-N = TypeVar("N", bound=nn.Module)
 _PIXELS_AT_ONCE = 1 << 16  # two crops: feature maps then stay in a core's cache, which saves a third of the time of 48
 _OPSET = 18
 _IMAGES, _FINE, _COARSE = "images", "fine", "coarse"
 
 
-class QuickTrunk(nn.Module):
-    """A trunk of the same features up to rounding, on a CPU, in a third of the time. Each call takes one thread."""
+def quicken(network: nn.Module) -> None:
+    """Let onnxruntime compute the features of a network's trunks from now on, wherever images are on the CPU.
 
-    def __init__(self, trunk: Trunk) -> None:
-        """Copy a trunk.
+    They are the same up to rounding, and take a tenth of the time in batches. Each call takes one thread.
 
-        Args:
-            trunk: With its weights; batch norm may be folded already.
-        """
-        super().__init__()
-        self._session = _Session(_Graph(trunk).content)
-
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """As the trunk does, a few images at a time."""
-        num = max(1, _PIXELS_AT_ONCE // (images.shape[2] * images.shape[3]))
-        fine, coarse = zip(*(self._session(part) for part in images.split(num)), strict=True)
-        return torch.cat(fine), torch.cat(coarse)
-
-
-def with_quick_trunk(network: N) -> N:
-    """A copy of a network whose trunks are quick; the network itself where it has none."""
-    if not any(isinstance(module, Trunk) for module in network.modules()):
-        return network
-    network = copy.deepcopy(network)
-    for module in list(network.modules()):
-        for name, child in module.named_children():
-            if isinstance(child, Trunk):
-                setattr(module, name, QuickTrunk(child))
-    return network
+    Args:
+        network: With its trunks' weights. It cannot be traced any more, and copies of it share what is prepared here.
+    """
+    for module in network.modules():
+        if isinstance(module, Trunk):
+            module.quick = _Session(_Graph(module).content)
 
 
 class _Session:
@@ -57,6 +37,12 @@ class _Session:
         self._session = open_session(content, "the pretrained features", (CPU,))
 
     def __call__(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """As the trunk does, a few images at a time."""
+        num = max(1, _PIXELS_AT_ONCE // (images.shape[2] * images.shape[3]))
+        fine, coarse = zip(*(self._few(part) for part in images.detach().split(num)), strict=True)
+        return torch.cat(fine), torch.cat(coarse)
+
+    def _few(self, images: Tensor) -> tuple[Tensor, Tensor]:
         fine, coarse = self._session.run([_FINE, _COARSE], {_IMAGES: images.contiguous().numpy()})
         return torch.from_numpy(fine), torch.from_numpy(coarse)
 
@@ -68,7 +54,7 @@ class _Graph:
     """A trunk written down as an ONNX graph: it is simple, and tracing it takes seconds at each start."""
 
     def __init__(self, trunk: Trunk) -> None:
-        trunk = copy.deepcopy(trunk).eval()
+        trunk = copy.deepcopy(trunk).cpu().eval()
         fold_batch_norm(trunk)
         self._nodes: list[NodeProto] = []
         self._constants: list[TensorProto] = []
@@ -78,6 +64,7 @@ class _Graph:
         features = self._layers(trunk.stem, scaled)
         ends = []
         for block in trunk.blocks:
+            assert isinstance(block, Block)
             changed = self._layers(block.layers, features)
             features = self._add("Add", features, changed) if block.is_residual else changed
             ends.append(features)
@@ -98,7 +85,7 @@ class _Graph:
         content: bytes = model.SerializeToString()
         return content
 
-    def _layers(self, layers: Sequence[nn.Module], values: str) -> str:
+    def _layers(self, layers: nn.Sequential, values: str) -> str:
         for layer in layers:
             if isinstance(layer, nn.Conv2d):
                 assert layer.bias is not None  # batch norm's
@@ -109,7 +96,7 @@ class _Graph:
                 values = self._add("Clip", values, *self._limits)
         return values
 
-    def _add(self, kind: str, *inputs: str, **attributes: object) -> str:
+    def _add(self, kind: str, *inputs: str, **attributes: Any) -> str:
         output = f"values_{len(self._nodes)}"
         self._nodes.append(helper.make_node(kind, inputs, [output], **attributes))
         return output

@@ -2,6 +2,7 @@
 
 import importlib.util
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -34,21 +35,29 @@ _BLOCKS = (  # inputs, outputs, expansion, kernel, stride
 )
 
 
+Features = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""sRGB images in [0, 1] to features, as :meth:`Trunk.forward`."""
+
+
 class Trunk(nn.Module):
     """Images to local features at strides 4 and 8 (Tan and Le 2019, "EfficientNet"; its variant Lite0)."""
 
     NUM_FINE: Final = 3
     """Blocks up to the finer map."""
+    quick: Features | None = None
+    """What computes the features of images on the CPU instead: see :mod:`~.quick_trunk`."""
 
     def __init__(self) -> None:
         super().__init__()
         self.stem = nn.Sequential(*_convolution(3, _STEM_WIDTH, 3, 2), nn.ReLU6())
-        self.blocks = nn.ModuleList(_Block(*sizes) for sizes in _BLOCKS)
+        self.blocks = nn.ModuleList(Block(*sizes) for sizes in _BLOCKS)
 
     def forward(
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> tuple[Float[Tensor, "batch 24 fine_rows fine_columns"], Float[Tensor, "batch 40 rows columns"]]:
         """Features of sRGB images in [0, 1], at stride 4 and at stride 8."""
+        if self.quick is not None and images.device.type == "cpu":
+            return self.quick(images)
         fine = self.stem((255 * images - MEAN) / SPREAD)
         for block in self.blocks[: self.NUM_FINE]:
             fine = block(fine)
@@ -80,7 +89,7 @@ class Trunk(nn.Module):
         return trunk
 
 
-class _Block(nn.Module):
+class Block(nn.Module):
     """An inverted residual block: expand, convolve each channel by itself, project (Sandler et al. 2018)."""
 
     def __init__(self, inputs: int, outputs: int, expansion: int, kernel: int, stride: int) -> None:
@@ -92,6 +101,7 @@ class _Block(nn.Module):
         self.is_residual = inputs == outputs and stride == 1
 
     def forward(self, features: Tensor) -> Tensor:
+        """Features of ``outputs`` channels, of a ``stride``-th of the size."""
         changed: Tensor = self.layers(features)
         return features + changed if self.is_residual else changed
 
