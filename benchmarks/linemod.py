@@ -21,7 +21,7 @@ from curio_train.evaluation.unlabelled.candidates import Candidate, candidates
 from curio_train.refinement.predictions import with_refinement
 from paper.linemod_markdown import markdown
 from paper.linemod_sheet import write_sheet
-from paper.linemod_table import REFINED, is_current, load_table, make_row
+from paper.linemod_table import REFINED, is_current, is_of_one_class, load_table, make_row
 from paper.results import Results, Row, save_results
 
 COMMAND = "python benchmarks/linemod.py"
@@ -97,7 +97,7 @@ def draw(settings: Settings, candidate: Candidate) -> None:
 def main(settings: Settings) -> int:
     """Score what is left."""
     table: Results = load_table(settings.results)
-    for candidate in filter(Candidate.is_of_one_class, candidates(settings.runs)):
+    for candidate in filter(is_of_one_class, candidates(settings.runs)):
         methods = [candidate.method, candidate.method + REFINED] if settings.refine else [candidate.method]
         rows = [table.get(method, {}).get(candidate.name) for method in methods]
         if all(is_current(row, candidate, settings.num_images, settings.data) for row in rows):

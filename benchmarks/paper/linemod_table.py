@@ -10,11 +10,14 @@ Beside each method stands the same followed by ``, refined``: its poses after re
 row is kept as long as weights, number of renderings and real labels are those that it was made of.
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from curio_train.evaluation.unlabelled.candidates import Candidate, files_sha256
+from curio_train.errors import DataError
+from curio_train.evaluation.unlabelled.candidates import Candidate
+from curio_train.worlds.options import ALL_CLASSES
 
 from paper.results import Results, Row, load_rows
 
@@ -24,6 +27,26 @@ REFINED = ", refined"
 _KEPT = ("labels_real", "labels_synthetic", "images_seen", "training_seconds", "preset", "seed", "commit", "machine")
 _RENDERED = ("add_recall", "rotation_deg_median", "translation_mm_median", "confidence_ece", "present_auroc")
 _REQUIRED = {"weights_sha256", "num_images", "real_sha256", "rendered", "real", *_KEPT}
+
+
+def is_of_one_class(candidate: Candidate) -> bool:
+    """Whether it finds one class, as rows of the table do."""
+    return candidate.name != ALL_CLASSES and "," not in candidate.name
+
+
+def files_sha256(*files: Path) -> str:
+    """SHA-256 of the contents of some files, one after the other.
+
+    Raises:
+        DataError: One cannot be read.
+    """
+    digest = hashlib.sha256()
+    for file in files:
+        try:
+            digest.update(file.read_bytes())
+        except OSError as exc:
+            raise DataError(f"{file}: cannot be read ({exc.strerror})") from exc
+    return digest.hexdigest()
 
 
 def labels_sha256(data: Path) -> str:
@@ -42,7 +65,7 @@ def make_row(result: Mapping[str, Any], candidate: Candidate, data: Path, frames
     """
     real = result["real"]
     return {
-        "weights_sha256": candidate.weights_sha256,
+        "weights_sha256": files_sha256(candidate.weights),
         "num_images": result["num_images"],
         "real_sha256": labels_sha256(data),
         **{name: result[name] for name in _KEPT},
@@ -54,7 +77,7 @@ def make_row(result: Mapping[str, Any], candidate: Candidate, data: Path, frames
 
 def is_current(row: Row | None, candidate: Candidate, num_images: int, data: Path) -> bool:
     """Whether a stored row is of these weights, as many renderings and these real frames."""
-    made_of = (candidate.weights_sha256, num_images, labels_sha256(data))
+    made_of = (files_sha256(candidate.weights), num_images, labels_sha256(data))
     return row is not None and made_of == (row["weights_sha256"], row["num_images"], row["real_sha256"])
 
 

@@ -156,10 +156,7 @@ def error_from_status(status: str, reason: str, text: str) -> CurioError:
         reason: Name of the server's exception; empty if it gave none.
         text: The server's message.
     """
-    for kind, name in STATUS_OF.items():
-        if name == status and reason in ("", kind.__name__):
-            return kind(text)
-    for kind, name in STATUS_OF.items():
-        if name == status:
-            return kind(text)
-    return InternalError(f"{status}: {text}")
+    kinds = {kind.__name__: kind for kind, name in STATUS_OF.items() if name == status}
+    if not kinds:
+        return InternalError(f"{status}: {text}")
+    return kinds.get(reason, next(iter(kinds.values())))(text)

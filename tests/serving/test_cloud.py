@@ -52,10 +52,10 @@ def environment(endpoint: str) -> dict[str, str]:
 
 def forget_connections() -> None:
     import s3fs
-    from curio_serve.batch.images.remote_files import remote_files
+    from curio_serve.batch.images.remote_files import _opened
 
     s3fs.S3FileSystem.clear_instance_cache()
-    remote_files.cache_clear()
+    _opened.cache_clear()
 
 
 @pytest.fixture

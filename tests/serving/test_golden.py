@@ -44,14 +44,14 @@ def test_what_rounding_decides_is_not_compared(folder: Path) -> None:
 
 
 def test_another_networks_answer_is_refused_and_the_old_version_serves(folder: Path) -> None:
-    repository = Repository(folder.parent)
+    repository = Repository(folder.parent, check=ChildCheck())
     repository.refresh()
     golden = _golden(folder)
     golden["translation_m"] = golden["translation_m"] + 0.01
     (folder / "SHA256SUMS").unlink()
     shutil.copytree(folder / "1", folder / "2")
     np.savez(folder / "2" / "golden.npz", **golden)
-    refused = [change for change in repository.refresh(ChildCheck()) if change.event == "refused"]
+    refused = [change for change in repository.refresh() if change.event == "refused"]
     assert [change.version for change in refused] == [2]
     assert "translation_m is 0.01 off for the golden image" in refused[0].reason
     assert repository.get("pinhole").version == 1

@@ -103,7 +103,7 @@ def test_a_followed_object_that_fades_becomes_unsure(measured: Path, spot_image:
     for number in range(30):
         answer = messages.DetectResponse()
         pixels = _frame(spot_image, 12) if number < 3 else np.zeros((240, 320, 3), np.uint8)
-        (result,) = stream.follow(
+        stream.follow(
             messages.Tracking(time_s=number / 30, keep_s=1.0),
             [detector],
             pixels,
@@ -112,6 +112,7 @@ def test_a_followed_object_that_fades_becomes_unsure(measured: Path, spot_image:
             reduction=1,
             results=answer.results,
         )
+        [result] = answer.results
         statuses.append((result.status, result.detections[0].status))
     assert statuses[0] == (messages.REGION_STATUS_DETECTED, messages.DETECTION_STATUS_SURE)
     assert statuses[-1] == (messages.REGION_STATUS_UNSURE, messages.DETECTION_STATUS_UNSURE)

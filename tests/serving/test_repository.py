@@ -26,8 +26,8 @@ def root(models_dir: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(models_dir, tmp_path / "models"))
 
 
-def _events(repository: Repository, check: ChildCheck | None = None) -> set[tuple[str, str, int]]:
-    return {(change.event, change.name, change.version) for change in repository.refresh(check)}
+def _events(repository: Repository) -> set[tuple[str, str, int]]:
+    return {(change.event, change.name, change.version) for change in repository.refresh()}
 
 
 def test_models_are_found_and_named(root: Path) -> None:
@@ -120,11 +120,11 @@ def test_folders_that_are_no_versions_are_passed_over(root: Path) -> None:
 
 
 def test_new_versions_come_and_old_ones_go(root: Path, spot_onnx: MakeOnnx, write_folder: WriteFolder) -> None:
-    repository = Repository(root, num_versions=2)
+    repository = Repository(root, num_versions=2, check=ChildCheck())
     repository.refresh()
     first = repository.get("flat")
     write_folder(root / "flat", spot_onnx(False), 2)
-    assert _events(repository, ChildCheck()) == {("loaded", "flat", 1), ("loaded", "flat", 2)}
+    assert _events(repository) == {("loaded", "flat", 1), ("loaded", "flat", 2)}
     assert repository.get("flat").version == 2
     write_folder(root / "flat", spot_onnx(False), 3)
     events = _events(repository)
@@ -138,35 +138,35 @@ def test_new_versions_come_and_old_ones_go(root: Path, spot_onnx: MakeOnnx, writ
 
 
 def test_a_broken_version_changes_nothing(root: Path, spot_onnx: MakeOnnx, write_folder: WriteFolder) -> None:
-    repository = Repository(root, num_versions=1)
+    repository = Repository(root, num_versions=1, check=ChildCheck())
     repository.refresh()
     (root / "flat" / "2").mkdir()
     (root / "flat" / "2" / "model.onnx").write_bytes(b"half a file")
-    [refused] = repository.refresh(ChildCheck())
+    [refused] = repository.refresh()
     assert (refused.event, refused.version) == ("refused", 2)
     assert "is not an ONNX file" in refused.reason
     assert repository.get("flat").version == 1
-    assert repository.refresh(ChildCheck()) == [], "a refused file is not tried again until it changes"
+    assert repository.refresh() == [], "a refused file is not tried again until it changes"
     # A server that starts now serves the same.
     late = Repository(root, num_versions=1)
     assert _events(late) == {("refused", "flat", 2), ("loaded", "flat", 1), ("loaded", "pinhole", 1)}
     write_folder(root / "flat", spot_onnx(False), 2)
-    assert ("loaded", "flat", 2) in _events(repository, ChildCheck())
+    assert ("loaded", "flat", 2) in _events(repository)
     assert repository.get("flat").version == 2
 
 
 def test_a_file_replaced_in_place_is_checked_before_it_serves(root: Path, spot_onnx: MakeOnnx) -> None:
-    repository = Repository(root)
+    repository = Repository(root, check=ChildCheck())
     repository.refresh()
     before = repository.get("pinhole")
     path = root / "pinhole" / "1" / "model.onnx"
     good = path.read_bytes()
     path.write_bytes(good[: len(good) // 2])
-    assert _events(repository, ChildCheck()) == {("refused", "pinhole", 1)}
+    assert _events(repository) == {("refused", "pinhole", 1)}
     assert repository.get("pinhole") is before
     path.write_bytes(good)
     os.utime(path, ns=(1, 1))
-    assert _events(repository, ChildCheck()) == {("loaded", "pinhole", 1)}
+    assert _events(repository) == {("loaded", "pinhole", 1)}
     assert repository.get("pinhole") is not before
 
 
@@ -208,10 +208,10 @@ def test_a_check_that_was_not_done_is_tried_again(root: Path, monkeypatch: pytes
             if len(checked) < 4:
                 raise CheckNotDone("no memory")
 
-    repository = Repository(root)
+    repository = Repository(root, check=check)
     for second in range(60):
         clock[0] = float(second)
-        repository.refresh(check)
+        repository.refresh()
     assert checked == [0, 5, 15, 35], "after ever longer pauses, and no more once it loaded"
     assert repository.get("flat").version == 1
 

@@ -15,8 +15,8 @@ from curio_train.geometry import (
     rotation_angle_deg,
     rotation_between,
 )
+from curio_train.metrics.poses import project
 from curio_train.networks.base import StageNetwork
-from curio_train.networks.crop_camera import project
 from curio_train.networks.two_stage.crop_pose import OBJECT_COORDINATES
 from curio_train.networks.two_stage.localise import (
     HEAT_MAP,
@@ -112,7 +112,7 @@ def test_objects_of_the_second_look_lie_where_its_code_says(brick_world: TwoStag
     )
     drawn = second.render(code).amax(dim=1) > 0.02
     place = code[TRANSLATION][:, 0]
-    pixels = project(place[:, None], torch.from_numpy(second.camera.matrix).float()[None])[:, 0]
+    pixels = torch.from_numpy(project(place.numpy(), second.camera.matrix))
     rows, columns = torch.meshgrid(torch.arange(CROP_PX), torch.arange(CROP_PX), indexing="ij")
     for mask, pixel in zip(drawn, pixels, strict=True):
         middle = torch.stack([columns[mask].float().mean(), rows[mask].float().mean()])
@@ -132,7 +132,7 @@ def test_surface_points_project_to_the_patches_that_see_them(brick_world: TwoSta
         v, u = torch.nonzero(seen[image], as_tuple=True)  # those at the rim, too
         metres = points[image][:, v, u].T * surface_map.half_extent_m + torch.from_numpy(surface_map.center_m).float()
         camera = Pose(rotation[image], place[image]).apply(metres)
-        pixels = project(camera[None], torch.from_numpy(matrices[image]).float()[None])[0]
+        pixels = torch.from_numpy(project(camera.numpy(), matrices[image]))
         assert (pixels - torch.stack([u, v], dim=1)).abs().mean() < 0.3
 
 
@@ -154,7 +154,7 @@ def test_localisation_gives_the_likeliest_position(brick_world: TwoStageWorld) -
         found = network(spot)
     assert found[PROPOSALS].shape == (1, 20 * 15, 3)
     assert found[HEAT_MAP].shape == (1, 20 * 15)
-    pixel = project(found[TRANSLATION][0], torch.from_numpy(first.camera.matrix).float())[0]
+    pixel = torch.from_numpy(project(found[TRANSLATION][0, 0].numpy(), first.camera.matrix))
     assert (pixel - torch.tensor([104.0, 64.0])).abs().max() < 8.1
     assert 0.5 <= found[TRANSLATION][0, 0, 2] <= 1.5
 
@@ -166,9 +166,8 @@ def test_first_look_sees_several_under_one_light(brick_world: TwoStageWorld) -> 
     assert code[LIGHT].shape == (4, 3)
     background = torch.zeros(4, 3, first.camera.height, first.camera.width)
     seen = first.render(code, background).sum(1) > 0
-    matrix = torch.from_numpy(first.camera.matrix).float()
-    pixels = project(code[TRANSLATION].flatten(0, 1), matrix)
-    for number, (u, v) in enumerate(pixels.round().int().tolist()):
+    pixels = project(code[TRANSLATION].flatten(0, 1).numpy(), first.camera.matrix)
+    for number, (u, v) in enumerate(pixels.round().astype(int).tolist()):
         patch = seen[number // first.num_instances, max(v - 4, 0) : v + 5, max(u - 4, 0) : u + 5]
         assert patch.any(), (number, u, v)
 
@@ -204,7 +203,7 @@ def test_of_several_candidates_the_likeliest_is_answered(brick_world: TwoStageWo
     """Two frames, each bright at another of three candidates; then a localisation stage that knows better than the
     second."""
     candidates = torch.tensor([[0.2, 0.1, 1.0], [-0.2, -0.1, 0.8], [0.0, 0.2, 1.2]]).expand(2, 3, 3)
-    pixels = project(candidates, torch.from_numpy(brick_world.camera.matrix).float()[None]).round().int()
+    pixels = project(candidates.numpy(), brick_world.camera.matrix).round().astype(int)
     frames = torch.zeros(2, 3, 480, 640)
     for image, chosen in enumerate((2, 0)):
         u, v = pixels[image, chosen].tolist()

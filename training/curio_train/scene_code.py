@@ -137,11 +137,6 @@ class Layout:
                 raise ValueError(f"{field.name} has shape {found}, expected {self.shape(field, found[0])}")
 
 
-def detach(code: SceneCode) -> dict[str, Tensor]:
-    """The values of a scene code, detached from the graph."""
-    return {name: value.detach() for name, value in code.items()}
-
-
 def index(code: SceneCode, rows: Tensor | slice) -> dict[str, Tensor]:
     """The code of some images of the batch."""
     return {name: value[rows] for name, value in code.items()}

@@ -37,7 +37,15 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item], num_th
             torch.set_num_threads(allowed)  # the other threads' calls changed the whole process
 
 
-def _begin() -> None:
+def compute_alone() -> None:
+    """Keep torch from starting further threads for what the calling one computes.
+
+    That changes the number of the whole process, which another thread has to set again.
+    """
     torch.set_num_threads(1)
     torch.get_num_threads()  # a thread takes up the process's number when it first asks, and keeps it
+
+
+def _begin() -> None:
+    compute_alone()
     torch.set_grad_enabled(False)

@@ -19,7 +19,7 @@ from curio_serve.telemetry import Metrics
 
 _RESERVATION_S = 1.0
 # How much longer a call is assumed to wait than the mean says. Without it a fifth or more of the answered calls come
-# late; a larger factor only shortens a queue that need not be long to be never empty (docs/experiments.md).
+# late; a larger factor only shortens a queue that need not be long to be never empty (docs/experiments/serving.md).
 _MARGIN = 1.5
 _IS_FULL = "which is the limit (--workers, --queue)"
 _COMES_TOO_LATE = "which takes longer than the call's deadline leaves"

@@ -14,7 +14,7 @@ from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer
 from curio_serve.api.admission import WorkQueue, check_is_wanted
 from curio_serve.api.messages import camera_from_message, frame_from_raw, region_from_message
 from curio_serve.api.registration import only_message
-from curio_serve.api.rig_request import check_views, refuse_many_pixels, rig_view, view_camera
+from curio_serve.api.rig_request import check_views, refuse_many_pixels, rig_view
 from curio_serve.api.status import CallLog, frame_error
 from curio_serve.api.streams import Streams
 from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, ModelNotFound
@@ -124,7 +124,6 @@ class PoseService(PoseDetectorServicer):
         """
         begun = time.perf_counter()
         limits = self._limits
-        camera = camera_from_message(request.camera) if request.HasField("camera") else None
         regions = list(map(region_from_message, request.regions))
         min_confidence = request.min_confidence if request.HasField("min_confidence") else limits.min_confidence
         check_min_confidence(min_confidence)
@@ -132,7 +131,7 @@ class PoseService(PoseDetectorServicer):
             return self._detect_views(request, detectors, waited_s, context)
         if request.HasField("track"):
             _check_following(request, following).check(request.track)
-        frame, camera = _decode(request, camera, detectors, limits, apply_exif_rotation=request.apply_exif_rotation)
+        frame, camera = _decode(request, detectors, limits, apply_exif_rotation=request.apply_exif_rotation)
         decoded = time.perf_counter()
         answer, before_run = messages.DetectResponse(), partial(check_is_wanted, context)
         if request.HasField("track"):
@@ -174,7 +173,7 @@ class PoseService(PoseDetectorServicer):
         check_views(request, len(detectors), max(limits.max_models, limits.max_regions))
         views, frames = [], []
         for number, view in enumerate(request.views):
-            frame, camera = _decode(view, view_camera(request, number), detectors, limits)
+            frame, camera = _decode(view, detectors, limits)
             views.append(rig_view(request, number, frame, camera, detectors))
             frames.append(frame)
             refuse_many_pixels(views, limits.max_pixels)
@@ -271,12 +270,12 @@ def new_request_id() -> str:
 
 def _decode(
     request: messages.DetectRequest | messages.View,
-    camera: PinholeCamera | None,
     detectors: list[Detector],
     limits: Limits,
     *,
     apply_exif_rotation: bool = False,
 ) -> tuple[image.Frame, PinholeCamera | None]:
+    camera = camera_from_message(request.camera) if request.HasField("camera") else None
     kind = request.WhichOneof("image")
     if kind is None:
         raise ImageError("the request, or one of its views, has no image; set encoded (JPEG, PNG, WebP) or raw")

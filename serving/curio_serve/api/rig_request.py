@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from curio_proto.v1.detector_pb2 import DetectRequest
 
-from curio_serve.api.messages import camera_from_message
 from curio_serve.errors import ArgumentError, CameraMissing
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.image import Frame
@@ -54,16 +53,6 @@ def refuse_many_pixels(views: Sequence[RigView], most: int) -> None:
             f"views up to views[{len(views) - 1}] have {num_pixels} pixels together; at most {most} are accepted for "
             "all views of a request (max-pixels): send smaller images, or JPEGs"
         )
-
-
-def view_camera(request: DetectRequest, number: int) -> PinholeCamera | None:
-    """The camera of a view.
-
-    Raises:
-        CameraError: It is impossible.
-    """
-    view = request.views[number]
-    return camera_from_message(view.camera) if view.HasField("camera") else None
 
 
 def rig_view(

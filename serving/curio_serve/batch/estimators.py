@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 _OF_ONE_IMAGE = (ImageError, CameraError, ArgumentError, InternalError)
 _DRAWN_SUFFIXES = (".jpg", ".jpeg", ".png")
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+_FIRST_S = 5.0  # for the first question to a server: a wrong address is reported soon
 
 
 @dataclass(frozen=True)
@@ -95,10 +96,6 @@ class Estimator(ABC):
         self.surfaces: Mapping[str, Surface] = {}
         """Surfaces of objects by name, where they are known: drawings show their contours."""
         self.canonical = canonical_camera(spec, name)
-
-    def __call__(self, image: SourceImage) -> ImageResult:
-        """The answer to an image by this model alone; see :func:`answers`."""
-        return answers([self], image)[0]
 
     def look(self, image: SourceImage, data: bytes) -> Seen:
         """Detect in an image.
@@ -299,11 +296,10 @@ class RemoteEstimator(Estimator):
         client: Connected to the server.
         model: ``name`` (the latest version now) or ``name/version``.
         settings: For all images.
-        timeout_s: For the first question, about the version: a wrong address is reported soon.
     """
 
-    def __init__(self, client: "PoseClient", model: str, settings: Settings, *, timeout_s: float = 5.0) -> None:
-        found = client.get_model(model, timeout_s=timeout_s)
+    def __init__(self, client: "PoseClient", model: str, settings: Settings) -> None:
+        found = client.get_model(model, timeout_s=_FIRST_S)
         super().__init__(model.partition("/")[0], found.version, found.spec, settings)
         self._client = client
         # Of several models each is asked for those of the wanted objects that it knows.

@@ -13,7 +13,7 @@ import time
 from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import grpc
 import numpy as np
@@ -54,7 +54,10 @@ class Tls:
 
 
 class _Client:
-    """The part that both clients share: the server's address, deadlines and credentials."""
+    """The part that both clients share: the channel to the server, deadlines and credentials."""
+
+    _grpc: ClassVar[Any] = grpc
+    """The functions that open a channel: gRPC's blocking or its asynchronous ones."""
 
     def __init__(
         self, address: str, *, timeout_s: float = 10.0, max_attempts: int = 5, tls: Tls | None = None, token: str = ""
@@ -71,11 +74,15 @@ class _Client:
         self.address = address
         self._timeout_s = timeout_s
         self._max_attempts = max_attempts
-        self._tls = tls
         token = token.strip()  # files end with a line feed
         if not (token.isascii() and (token.isprintable())):
             raise UsageError("token: expected printable ASCII text in one line, as in the server's --token-file")
         self._metadata = (("authorization", f"Bearer {token}"),) if token else ()
+        if tls is None:
+            self._channel = self._grpc.insecure_channel(address, _CHANNEL_OPTIONS)
+        else:
+            self._channel = self._grpc.secure_channel(address, tls.credentials(), _CHANNEL_OPTIONS)
+        self._stub = PoseDetectorStub(self._channel)
 
     def _attempts(self, timeout_s: float | None) -> Attempts:
         return Attempts(self.address, self._timeout_s if timeout_s is None else timeout_s, self._max_attempts)
@@ -83,16 +90,6 @@ class _Client:
 
 class PoseClient(_Client):
     """Blocking client; safe to share between threads."""
-
-    def __init__(
-        self, address: str, *, timeout_s: float = 10.0, max_attempts: int = 5, tls: Tls | None = None, token: str = ""
-    ) -> None:
-        super().__init__(address, timeout_s=timeout_s, max_attempts=max_attempts, tls=tls, token=token)
-        if tls is None:
-            self._channel = grpc.insecure_channel(address, _CHANNEL_OPTIONS)
-        else:
-            self._channel = grpc.secure_channel(address, tls.credentials(), _CHANNEL_OPTIONS)
-        self._stub = PoseDetectorStub(self._channel)
 
     def __enter__(self) -> Self:
         return self
@@ -121,25 +118,7 @@ class PoseClient(_Client):
         request_id: str = "",
         timeout_s: float | None = None,
     ) -> messages.DetectResponse:
-        """Poses in one image.
-
-        Args:
-            model: Name, or ``name/version``; several for several objects in one call.
-            image: Path of a JPEG, PNG or WebP file, its bytes, or pixels uint8 [height, width, 3] or grey
-                [height, width].
-            camera: Camera file, :class:`~curio_serve.imaging.camera.PinholeCamera` or K [3, 3] in pixels; None for
-                models that need none.
-            objects: Kinds of objects to look for, as the models name them; none: all that they know.
-            regions: Rectangles to search, each (x, y, width, height) in pixels; none: the whole frame.
-            min_confidence: Detections below it are left out; None: the server's own threshold.
-            max_detections: Largest number a region and model, the most confident; None: no limit.
-            max_instances: Most of each kind of object and region, 1 to 16, by further runs of a network that reads one
-                pose; None: what one run gives.
-            reads: How often the image is read, 1 to 9, by as many runs of the network; None: once.
-            apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
-            color: Order of the channels of pixels; OpenCV reads images as ``bgr``.
-            request_id: Comes back with the answer; empty: the server makes one up.
-            timeout_s: Deadline of this call.
+        """Poses in one image, within ``timeout_s``; other arguments are those of :func:`detect_request`.
 
         Raises:
             CurioError: The server raised it, or is out of reach.
@@ -221,15 +200,7 @@ class AsyncPoseClient(_Client):
     It belongs to the event loop in which it is made: make it within a coroutine, and another one for another loop.
     """
 
-    def __init__(
-        self, address: str, *, timeout_s: float = 10.0, max_attempts: int = 5, tls: Tls | None = None, token: str = ""
-    ) -> None:
-        super().__init__(address, timeout_s=timeout_s, max_attempts=max_attempts, tls=tls, token=token)
-        if tls is None:
-            self._channel = grpc.aio.insecure_channel(address, _CHANNEL_OPTIONS)
-        else:
-            self._channel = grpc.aio.secure_channel(address, tls.credentials(), _CHANNEL_OPTIONS)
-        self._stub = PoseDetectorStub(self._channel)
+    _grpc: ClassVar[Any] = grpc.aio
 
     async def __aenter__(self) -> Self:
         return self

@@ -44,13 +44,15 @@ def detect_request(
     Args:
         model: Name, or ``name/version``; several for several objects in one call.
         image: Path of a JPEG, PNG or WebP file, its bytes, or pixels uint8 [height, width, 3] or grey [height, width].
-        camera: Camera file, camera, or K [3, 3] in pixels.
-        objects: Kinds of objects to look for; none: all that the models know.
-        regions: Each (x, y, width, height) in pixels.
-        min_confidence: None: the server's own threshold.
-        max_detections: None: no limit.
-        max_instances: Most of each kind of object and region, 1 to 16; None: what one run of the network gives.
-        reads: How often the image is read, 1 to 9; None: once.
+        camera: Camera file, :class:`~curio_serve.imaging.camera.PinholeCamera` or K [3, 3] in pixels; None for models
+            that need none.
+        objects: Kinds of objects to look for, as the models name them; none: all that they know.
+        regions: Rectangles to search, each (x, y, width, height) in pixels; none: the whole frame.
+        min_confidence: Detections below it are left out; None: the server's own threshold.
+        max_detections: Largest number a region and model, the most confident; None: no limit.
+        max_instances: Most of each kind of object and region, 1 to 16, by further runs of a network that reads one
+            pose; None: what one run gives.
+        reads: How often the image is read, 1 to 9, by as many runs of the network; None: once.
         apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
         color: Order of the channels of pixels; OpenCV reads images as ``bgr``.
         request_id: Comes back with the answer; empty: the server makes one up.

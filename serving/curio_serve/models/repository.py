@@ -41,15 +41,22 @@ class Change:
 class Repository:
     """Models under one folder."""
 
-    def __init__(self, root: Path, num_versions: int = 2, runtime: Runtime = DEFAULT_RUNTIME) -> None:
+    def __init__(
+        self,
+        root: Path,
+        num_versions: int = 2,
+        runtime: Runtime = DEFAULT_RUNTIME,
+        check: Callable[[Path, int], None] | None = None,
+    ) -> None:
         """Nothing is loaded yet: see :meth:`refresh`.
 
         Args:
             root: Folder of models.
             num_versions: Newest versions of each model to keep.
             runtime: How networks are run.
+            check: Called with a model's folder and a version before this process opens the file; raises ModelError.
         """
-        self._root, self._num_versions, self._runtime = root, num_versions, runtime
+        self._root, self._num_versions, self._runtime, self._check = root, num_versions, runtime, check
         self._models: Mapping[str, Mapping[int, Model]] = {}
         self._seen: dict[Key, Signature] = {}
         self._put_off: dict[Key, tuple[int, float]] = {}  # how many checks were not done, and when the next is
@@ -71,11 +78,8 @@ class Repository:
         """Name and versions of each model, by name."""
         return iter(sorted(self._models.items()))
 
-    def refresh(self, check: Callable[[Path, int], None] | None = None) -> list[Change]:
+    def refresh(self) -> list[Change]:
         """Scan the folder, load versions that are new or changed, and drop those that are gone.
-
-        Args:
-            check: Called with the model's folder and the version before this process opens the file; raises ModelError.
 
         Returns:
             The changes. A refused candidate is not tried again until its files change; one whose check was not done is
@@ -88,25 +92,18 @@ class Repository:
         models: dict[str, Mapping[int, Model]] = {}
         seen: dict[Key, Signature] = {}
         for folder in self._folders():
-            if loaded := self._versions(folder, check, seen, changes):
+            if loaded := self._versions(folder, seen, changes):
                 models[folder.name] = loaded
         for name, previous in self._models.items():
             changes += [Change(name, v, "unloaded") for v in previous if v not in models.get(name, {})]
         self._seen, self._models = seen, models
         return changes
 
-    def _versions(
-        self,
-        folder: Path,
-        check: Callable[[Path, int], None] | None,
-        seen: dict[Key, Signature],
-        changes: list[Change],
-    ) -> Mapping[int, Model]:
+    def _versions(self, folder: Path, seen: dict[Key, Signature], changes: list[Change]) -> Mapping[int, Model]:
         """The versions of a model to serve: the newest ones that load; if its folder cannot be read, the present ones.
 
         Args:
             folder: Of the model.
-            check: See :meth:`refresh`.
             seen: Signatures of the versions found are added to it.
             changes: Changes are added to it.
         """
@@ -124,27 +121,20 @@ class Repository:
             if len(loaded) == self._num_versions:
                 break
             seen[name, version] = _signature(folder, version)
-            model = self._current(folder, version, seen[name, version], check, changes)
+            model = self._current(folder, version, seen[name, version], changes)
             if model is not None:
                 loaded[version] = model
         return loaded
 
-    def _current(
-        self,
-        folder: Path,
-        version: int,
-        signature: Signature,
-        check: Callable[[Path, int], None] | None,
-        changes: list[Change],
-    ) -> Model | None:
+    def _current(self, folder: Path, version: int, signature: Signature, changes: list[Change]) -> Model | None:
         """A version's model: loaded anew if its files changed; else, or if that fails, the present one."""
         key, present = (folder.name, version), self._models.get(folder.name, {}).get(version)
         failed, next_s = self._put_off.get(key, (0, math.inf))
         if self._seen.get(key) == signature and time.monotonic() < next_s:
             return present
         try:
-            if check is not None:
-                check(folder, version)
+            if self._check is not None:
+                self._check(folder, version)
             model = load_version(folder, version, self._runtime)
         except ModelError as exc:
             self._put_off.pop(key, None)

@@ -56,7 +56,8 @@ class PoseServer:
         self._metrics = Metrics(registry)
         providers = read_providers(config.provider)
         batch = config.batch or (1 if on_processor(providers) else _DEVICE_BATCH)
-        self._repository = Repository(Path(config.models), config.versions, Runtime(providers, batch))
+        self._check = ChildCheck()
+        self._repository = Repository(Path(config.models), config.versions, Runtime(providers, batch), self._check)
         # Calls that wait for a batch leave their core to others, which decode meanwhile.
         workers = config.workers or num_cores() + (batch if batch > 1 else 0)
         self._reception = Reception(_reception_limits(config))
@@ -65,7 +66,6 @@ class PoseServer:
         watchers = ThreadPoolExecutor(1)
         self._health = health.HealthServicer(experimental_non_blocking=True, experimental_thread_pool=watchers)
         self._inference = InferenceService(self._repository, self._work, self._metrics)
-        self._check = ChildCheck()
         self._server: grpc.Server | None = None
         self._stopped = threading.Event()
 
@@ -83,7 +83,7 @@ class PoseServer:
         # Frames run in parallel already, one a core; OpenCV's own threads would only get in their way.
         cv2.setNumThreads(1)
         memory.bound_heaps()
-        changes = self._repository.refresh(self._check)
+        changes = self._repository.refresh()
         self._report(changes)
         if not list(self._repository):
             raise ModelError(f"no model could be loaded from {self.config.models}: {self._why_none(changes)}")
@@ -201,7 +201,7 @@ class PoseServer:
         while self.config.refresh_s and not self._stopped.wait(self.config.refresh_s):
             before = {name for name, _ in self._repository}
             try:
-                self._report(self._repository.refresh(self._check))
+                self._report(self._repository.refresh())
             except ModelError as exc:
                 log(logging.ERROR, "models folder unreadable; serving what is loaded", reason=str(exc))
                 continue

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from curio_proto.v1.detector_pb2 import DETECTION_STATUS_SURE, DETECTION_STATUS_UNSURE, RegionResult
+from curio_proto.v1.detector_pb2 import DETECTION_STATUS_SURE, DETECTION_STATUS_UNSURE
 
 from curio_serve.errors import ArgumentError
 from curio_serve.imaging.camera import PinholeCamera
@@ -84,7 +84,7 @@ class Follower:
         reduction: int = 1,
         results: "Results",
         before_run: Callable[[], None] = lambda: None,
-    ) -> RegionResult:
+    ) -> None:
         """Add the result of one frame to those of a response.
 
         Args:
@@ -120,7 +120,7 @@ class Follower:
             light = self._look(frame, following) or light
         kept = [track for track in self._tracks if time_s - track.seen_s <= following.keep_s]
         self._tracks = _most_of_each(without_doubles(kept), following.num_objects)
-        return self._answer(frame, light, following, min_confidence, results)
+        self._answer(frame, light, following, min_confidence, results)
 
     def _read_crops(self, frame: StreamFrame) -> Sequence[float]:
         """Read each object from crops at its expected position; return the light."""
@@ -225,7 +225,7 @@ class Follower:
         following: Following,
         min_confidence: float,
         results: "Results",
-    ) -> RegionResult:
+    ) -> None:
         model = frame.detector.model
         result = results.add(model=model.name, model_version=model.version)
         result.light.extend(light)
@@ -246,7 +246,6 @@ class Follower:
             if raw is None and detection.status == DETECTION_STATUS_SURE:  # this frame does not show it
                 detection.status = DETECTION_STATUS_UNSURE
         result.status = region_status(result.detections)
-        return result
 
 
 def _most_of_each(tracks: Sequence[Track], num: int) -> list[Track]:

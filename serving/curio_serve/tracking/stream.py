@@ -6,7 +6,7 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 import numpy as np
-from curio_proto.v1.detector_pb2 import RegionResult, Tracking
+from curio_proto.v1.detector_pb2 import Tracking
 
 from curio_serve.errors import ArgumentError, CameraError
 from curio_serve.imaging.camera import PinholeCamera
@@ -64,7 +64,7 @@ class FollowingStream:
         reduction: int,
         results: "Results",
         before_run: Callable[[], None] = lambda: None,
-    ) -> list[RegionResult]:
+    ) -> None:
         """Add each model's result of one frame to those of a response.
 
         Args:
@@ -96,7 +96,7 @@ class FollowingStream:
             camera.check_frame(*size)
         followers = {} if request.restart else dict(self._followers)
         numbers = count(1) if request.restart else self._numbers
-        answers = [
+        for detector in detectors:
             followers.setdefault(detector.model.label, Follower(numbers)).follow(
                 detector,
                 pixels,
@@ -108,12 +108,9 @@ class FollowingStream:
                 results=results,
                 before_run=before_run,
             )
-            for detector in detectors
-        ]
         # Only now: a frame that is refused changes nothing.
         self._followers, self._numbers = followers, numbers
         self._time_s, self._size, self._camera = time_s, size, camera
-        return answers
 
     def _check_same_camera(self, size: tuple[int, int], camera: PinholeCamera | None) -> None:
         if self._size is None:

@@ -11,8 +11,7 @@ from torch import Tensor
 from curio_train.errors import DataError, ReportError, UsageError
 from curio_train.evaluation.real_frames import bop_file, evaluate_real_frames, refuse_unscorable
 from curio_train.evaluation.repeated import reading_repeatedly
-from curio_train.evaluation.reporting.report import write_report
-from curio_train.evaluation.results import keep
+from curio_train.evaluation.reporting.report import keep, write_report
 from curio_train.evaluation.scores import add_errors, pose_scores, scene_errors, scene_scores
 from curio_train.evaluation.several_objects import several_objects_scores
 from curio_train.evaluation.subject import Predict, Subject, load_subject

@@ -1,12 +1,12 @@
 """Measures how far a model's answers may be trusted, on renderings: when they are sure, and how far off they are."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from curio_proto.v1.model_spec_pb2 import ObjectReliability, PoseBounds, Reliability
+from curio_proto.v1.model_spec_pb2 import ObjectReliability, Reliability
 from curio_serve.models.reliability import bounds_of
 
 from curio_train.errors import ExportError, UsageError
@@ -15,7 +15,7 @@ from curio_train.evaluation.subject import Predict
 from curio_train.geometry import Pose
 from curio_train.metrics.conformal import LEVEL, error_bounds, sure_from
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
-from curio_train.worlds.base import AugmentedWorld, ObjectKind, Split, World
+from curio_train.worlds.base import ObjectKind, Split, World
 
 NUM_IMAGES = 2000
 """Renderings that bounds are measured on, and as many backgrounds where each shows all objects: four minutes."""
@@ -128,9 +128,7 @@ def _answers(kind: ObjectKind, seen: Sequence[tuple[float, Pose, Pose]], without
 
 def _photographed(world: World, images: torch.Tensor, seed: tuple[int, ...]) -> torch.Tensor:
     """Renderings as a camera gives them: changed as those of training are, if they are, and in bytes."""
-    if isinstance(world, AugmentedWorld):
-        images = world.augment(images, seed)
-    return (images.clamp(0, 1) * 255).round().byte()
+    return (world.augment(images, seed).clamp(0, 1) * 255).round().byte()
 
 
 def fit_reliability(answers: Sequence[Answers]) -> Reliability:
@@ -152,13 +150,7 @@ def fit_reliability(answers: Sequence[Answers]) -> Reliability:
                 f"--intervals: of {len(one.confidences)} answers about {one.kind.name} too few are sure ({exc}): train "
                 "it longer, or leave --intervals out"
             ) from exc
-        found.objects.append(
-            ObjectReliability(
-                object=one.kind.name,
-                min_confidence=sure,
-                bounds=[PoseBounds(**asdict(part)) for part in bounds],
-            )
-        )
+        found.objects.append(ObjectReliability(object=one.kind.name, min_confidence=sure, bounds=bounds))
     return found
 
 

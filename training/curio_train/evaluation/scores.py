@@ -13,7 +13,7 @@ from curio_train.metrics.assignment import each_parameter_error, nearest_alike, 
 from curio_train.metrics.images import dssim
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m, recall, symmetry_poses, turned_alike
 from curio_train.scene_code import TRANSLATION, SceneCode, index, poses
-from curio_train.worlds.base import World, novel_view
+from curio_train.worlds.base import World
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _MM = 1000.0
@@ -67,7 +67,7 @@ def novel_view_dssim(world: World, predicted: SceneCode, true: SceneCode) -> Flo
     """The paper's image error: both scenes seen from a view that the network has not, compared by DSSIM."""
     starts = range(0, len(true[TRANSLATION]), _BATCH_SIZE)
     batches = [[index(code, slice(start, start + _BATCH_SIZE)) for code in (predicted, true)] for start in starts]
-    return torch.cat([dssim(*(novel_view(world, code).clamp(0, 1) for code in pair)) for pair in batches])
+    return torch.cat([dssim(*(world.novel_view(code).clamp(0, 1) for code in pair)) for pair in batches])
 
 
 def mean_of_objects(each: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -71,7 +71,7 @@ def card(
         objects: Of the world, for their attribution.
         made: Where it comes from.
     """
-    evaluation = read_evaluation(made.run, made.progress.all_images)
+    evaluation = _read(made.run / EVALUATION_FILE, made.progress.all_images)
     unscored = "curio-eval had not scored it on renderings when it was exported.\n"
     parts = [
         f"## Version {version}\n",
@@ -87,12 +87,8 @@ def card(
     return "\n".join(parts)
 
 
-def read_evaluation(run: Path, images: int) -> dict[str, Any] | None:
-    """The result that curio-eval left in a run folder, if it is of the network that has seen ``images`` images."""
-    return _read(run / EVALUATION_FILE, images)
-
-
 def _read(file: Path, images: int) -> dict[str, Any] | None:
+    """The result that a file of a run folder holds, if it is of the network that has seen ``images`` images."""
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):

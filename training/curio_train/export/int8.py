@@ -6,10 +6,8 @@ input of no activation and no other convolution give the answer itself and stay 
 all else.
 """
 
-import logging
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +19,7 @@ from torch import Tensor
 
 from curio_train.errors import ExportError
 from curio_train.export.image_by_image import image_by_image, inner_graph, of_one_image
+from curio_train.export.onnx import quiet
 
 _ACTIVATIONS = ("Relu", "Clip")
 _BETWEEN = (*_ACTIVATIONS, "Add")  # that stay in int8 after a convolution
@@ -55,7 +54,8 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
             batch = next(self._feeds, None)
             return None if batch is None else {INPUT: batch}
 
-    with tempfile.TemporaryDirectory() as folder, _quiet():
+    # The quantiser advises to preprocess, which folded graphs do not need.
+    with tempfile.TemporaryDirectory() as folder, quiet(""):
         source, target = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
         onnx.save(single, source)  # of a model in memory the quantiser takes the weights away
         quantization.quantize_static(
@@ -127,15 +127,3 @@ def _kept(graph: onnx.GraphProto) -> set[str]:
         if node.op_type == "Conv" or (node.op_type in _BETWEEN and not convolved.isdisjoint(node.input)):
             convolved.add(node.output[0])
     return kept
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence the quantiser's advice to preprocess, which folded graphs do not need."""
-    logger = logging.getLogger()
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)

@@ -23,6 +23,7 @@ from torch import nn
 from curio_train.export.image_by_image import image_by_image, inner_graph
 
 OPSET = 18
+_TALKATIVE = "torch.onnx", "onnx_ir"  # loggers: of packages that are not needed and constants that stay
 _LARGEST_REPEATED = 1 << 20  # values; larger constants are weights, which are there once
 _SMALLEST_HALF = 256  # values; below, a Cast costs more than it saves
 
@@ -78,7 +79,7 @@ def traced_program(
     free: tuple[dict[int, Any], ...] = ({} if tracing.one_image else {0: torch.export.Dim("batch")},)
     if tracing.num_slots is not None:
         examples, free = (*examples, torch.arange(tracing.num_slots)), (*free, {0: torch.export.Dim("wanted")})
-    with _quiet():
+    with quiet(*_TALKATIVE):
         program = torch.onnx.export(
             network,
             examples,
@@ -102,7 +103,7 @@ def simplified(traced: ir.Model, tracing: Tracing) -> onnx.ModelProto:
         traced: By :func:`traced_program`.
         tracing: As it was traced. A caller may leave out the wanted slots, which means all of them in their order.
     """
-    with _quiet():
+    with quiet(*_TALKATIVE):
         _simplify(traced)
     model: onnx.ModelProto = ir.to_proto(traced)
     _strip(model)
@@ -137,9 +138,9 @@ def _simplify(model: ir.Model) -> None:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence remarks about packages that are not needed and constants that stay, and deprecation warnings."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir")]
+def quiet(*names: str) -> Iterator[None]:
+    """Silence what these loggers say below an error ("" is the root), and deprecation warnings."""
+    loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.ERROR)

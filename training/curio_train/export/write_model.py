@@ -115,14 +115,10 @@ def export(
         learned = trained.in_parts(pixels_of(images))
         expected = deployed.in_parts(pixels_of(images)) if half else learned
     rounding_error = largest_difference(learned, expected) if half else 0.0
-
     shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
     config = triton_config(target.path.name, tuple(images.shape[1:]), shapes)
     target.refuse_other_tensors(config)
-    checked = copy.deepcopy(deployed.network if half else trained.network)
-    quicken(checked)
-    stable = numerically_stable(Graph(checked, world), images)
-
+    stable = _stable(deployed.network if half else trained.network, world, images)
     model = ahead(deployed) or traced(deployed, deployed.network, world.camera, list(expected))
     if half and reduce is None:
         store_half(model)
@@ -157,6 +153,13 @@ def export(
         WEIGHTS_FILE: weights_file(state, folder.config, half=half),
     }
     return Exported(target.add(version, files, config, text), parity_error, rounding_error, model.ByteSize(), weights)
+
+
+def _stable(network: nn.Module, world: World, images: Tensor) -> Bool[Tensor, "batch slots"]:
+    """Which answers of a network are stable; its copy reads quickly, and the network itself can still be traced."""
+    network = copy.deepcopy(network)
+    quicken(network)
+    return numerically_stable(Graph(network, world), images)
 
 
 def _unmoved_by_rounding(graph: Graph, model: onnx.ModelProto, images: Tensor, found: Mapping[str, Tensor]) -> Tensor:

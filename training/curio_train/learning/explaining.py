@@ -20,14 +20,12 @@ from curio_train.config import DecoderKind
 from curio_train.errors import CheckpointError, UsageError
 from curio_train.refinement.found_frames import FrameExplainer, TrainingFrames, stage_sources, template_reader
 from curio_train.scene_code import joined
-from curio_train.worlds.base import Explainer, HypothesisWorld, ImageSource, World
+from curio_train.worlds.base import Explainer, ImageSource, World
 from curio_train.worlds.image_sets import StoredImages, load_arrays, save_arrays
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 _FOLDER = "found"
 _A_FILE = 100  # images
-
-
 _SECONDS = "seconds"
 
 
@@ -71,7 +69,7 @@ def search_of(world: World, reading: DecoderKind | None, seed: int, cache: Path)
             return Found(stage_sources(world, frames, code, seed), seconds)
 
         return search_frames
-    explainer = explainer_of(world)
+    explainer = world.explainer()
     if reading != "cells":
         raise UsageError("--method hypotheses teaches the dense decoder alone; add --reading cells")
     source = world.source("train", seed, with_code=False, cache=cache)
@@ -82,20 +80,6 @@ def search_of(world: World, reading: DecoderKind | None, seed: int, cache: Path)
         return Found([source.with_code(code)], seconds)
 
     return search_images
-
-
-def explainer_of(world: World) -> Explainer:
-    """A search for the scenes of a generated world's images.
-
-    Raises:
-        UsageError: The world has no hypotheses, or scenes of this world cannot be found so.
-    """
-    if not isinstance(world, HypothesisWorld):
-        raise UsageError(
-            f"--method hypotheses: {world.name} has no hypotheses here; expected chairs, multi, light, or linemod with "
-            "one class in two stages"
-        )
-    return world.explainer()
 
 
 def explained(explainer: Explainer, images: Images, run: Path) -> tuple[dict[str, Tensor], float]:

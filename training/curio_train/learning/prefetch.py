@@ -7,6 +7,8 @@ from typing import Generic, TypeVar
 
 import torch
 
+from curio_train.threads import compute_alone
+
 Item = TypeVar("Item")
 
 
@@ -48,15 +50,9 @@ def prefetching(make: Callable[[int], Item], stride: int) -> Iterator[Prefetcher
     """
     allowed = torch.get_num_threads()
     thread = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
-    thread.submit(_compute_with_one_thread).result()
+    thread.submit(compute_alone).result()  # the other cores belong to the training step
     torch.set_num_threads(allowed)  # the other thread's call changed the whole process
     try:
         yield Prefetcher(make, stride, thread)
     finally:
         thread.shutdown(cancel_futures=True)
-
-
-def _compute_with_one_thread() -> None:
-    """Keep torch from starting more threads here: the other cores belong to the training step."""
-    torch.set_num_threads(1)
-    torch.get_num_threads()  # a thread takes up the process's number when it first asks, and keeps it

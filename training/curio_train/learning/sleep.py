@@ -19,7 +19,7 @@ from curio_train.learning.prefetch import Prefetcher, prefetching
 from curio_train.learning.self_training import SelfTraining
 from curio_train.metrics.assignment import canonical
 from curio_train.scene_code import SceneCode
-from curio_train.worlds.base import AugmentedWorld, ImageSource, StagedWorld, World, stages_of
+from curio_train.worlds.base import ImageSource, StagedWorld, World, stages_of
 
 _SYNTHETIC = 1  # keeps these draws apart from those of the training images
 
@@ -98,7 +98,7 @@ class SyntheticBatches:
         recipe, seed = self._config.recipe, (self._config.seed, number)
         code = sleep_codes(self._world, raw, recipe.sleep_noise, recipe.sleep_drawn, seed)
         with torch.no_grad():
-            return code, _augmented(self._world, self._world.render(code, backgrounds), seed)
+            return code, self._world.augment(self._world.render(code, backgrounds), seed)
 
     @torch.no_grad()
     def _draw(self, number: int) -> SyntheticBatch:
@@ -109,14 +109,10 @@ class SyntheticBatches:
         backgrounds = self._sources[stage].backgrounds(number, size)
         code = {name: value.to(device) for name, value in world.sample(size, (*seed, _SYNTHETIC)).items()}
         images = world.render(code, None if backgrounds is None else backgrounds.to(device))
-        images = _augmented(world, images, seed)
+        images = world.augment(images, seed)
         if stage == len(stages_of(self._world)) - 1:
             return self._self_training.mix_in(code, images, (*seed, _SYNTHETIC))
         return code, images
-
-
-def _augmented(world: World, images: Tensor, seed: tuple[int, ...]) -> Tensor:
-    return world.augment(images, seed) if isinstance(world, AugmentedWorld) else images
 
 
 def sleep_codes(world: World, raw: SceneCode, noise: float, drawn: float, seed: tuple[int, ...]) -> dict[str, Tensor]:

@@ -24,8 +24,7 @@ from curio_train.learning.state import TrainState
 from curio_train.metrics.images import blurred
 from curio_train.networks.base import StageNetwork
 from curio_train.refinement.own_crops import OwnCrops
-from curio_train.scene_code import SceneCode
-from curio_train.worlds.base import Batch, ImageSource, StagedWorld, UnlikeWorld, World, stages_of
+from curio_train.worlds.base import Batch, ImageSource, StagedWorld, World, stages_of
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
 _SMOOTHING = 0.98  # of the image loss that convergence is judged by: a memory of about 50 steps
@@ -132,9 +131,7 @@ class Trainer:
                 batch = self._training_batch(stage, number)
                 raw, code = self._predict(network, batch.images)
             if terms.renders_predictions:
-                shown: SceneCode = {**batch.given, **code}
-                if isinstance(world, UnlikeWorld):
-                    shown = world.comparable(shown, batch.images)
+                shown = world.comparable({**batch.given, **code}, batch.images)
                 rendered = blurred(world.render(shown, batch.backgrounds), world.comparison_blur_px)
                 images = blurred(batch.images, world.comparison_blur_px)
             if terms.image:

@@ -7,9 +7,9 @@ new answers come from the same.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from curio_proto.v1.model_spec_pb2 import PoseBounds
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
@@ -20,20 +20,6 @@ MOST_FALSE = 0.05
 """Largest fraction of frames without the object whose answer is sure."""
 
 _MIN_IN_BIN, _MAX_BINS = 200, 4  # answers of one confidence: fewer would leave their quantile too uncertain
-
-
-@dataclass(frozen=True)
-class ErrorBounds:
-    """Bounds for answers from a confidence on, up to the next bounds' confidence."""
-
-    min_confidence: float
-    """Least confidence of the answers that these bounds are for."""
-    lateral_m: float
-    """Across the line of sight; together with ``depth_fraction`` it holds the position."""
-    depth_fraction: float
-    """Along the line of sight, of the distance."""
-    rotation_deg: float
-    """Angle of the rotation."""
 
 
 def conformal_quantile(errors: ArrayLike, level: float) -> float:
@@ -66,7 +52,7 @@ def sure_from(confidences_without: Sequence[float]) -> float:
     return float(np.nextafter(conformal_quantile(confidences_without, 1 - MOST_FALSE), np.inf))
 
 
-def error_bounds(confidences: ArrayLike, errors: Float[np.ndarray, "n 3"], sure: float) -> list[ErrorBounds]:
+def error_bounds(confidences: ArrayLike, errors: Float[np.ndarray, "n 3"], sure: float) -> list[PoseBounds]:
     """Bounds for sure answers, by confidence, ascending.
 
     Args:
@@ -87,9 +73,14 @@ def error_bounds(confidences: ArrayLike, errors: Float[np.ndarray, "n 3"], sure:
     return [_bounds(float(start), errors[bins == number]) for number, start in enumerate(starts)]
 
 
-def _bounds(start: float, errors: Float[np.ndarray, "n 3"]) -> ErrorBounds:
+def _bounds(start: float, errors: Float[np.ndarray, "n 3"]) -> PoseBounds:
     lateral, depth, rotation = (conformal_quantile(column, LEVEL) for column in errors.T)
     # Both parts of the position have to hold at once: the two bounds grow together until they do.
     units = np.maximum([lateral, depth], 1e-9)
     together = conformal_quantile((errors[:, :2] / units).max(axis=1), LEVEL)
-    return ErrorBounds(start, units[0] * together, units[1] * together, max(rotation, 1e-6))
+    return PoseBounds(
+        min_confidence=start,
+        lateral_m=units[0] * together,
+        depth_fraction=units[1] * together,
+        rotation_deg=max(rotation, 1e-6),
+    )

@@ -21,6 +21,8 @@ from curio_train.geometry import Pose, rotation_angle_deg
 ADD_THRESHOLD = 0.1
 """A pose counts as correct where ADD is below this fraction of the diameter."""
 
+_LEVEL, _NUM_RESAMPLES = 0.95, 2000  # of bootstrap intervals
+
 
 def rotation_error_deg(estimate: Pose, truth: Pose) -> float:
     """Angle between the two rotations, in [0, 180]."""
@@ -142,16 +144,11 @@ def recall(errors: Sequence[float], threshold: float) -> float:
     return float((np.asarray(errors) < threshold).mean())
 
 
-def bootstrap_interval(
-    *groups: Sequence[float], seed: int = 0, level: float = 0.95, num_resamples: int = 2000
-) -> tuple[float, float]:
-    """Percentile bootstrap interval of a mean (for a recall: of zeros and ones), or of the mean of several means.
+def bootstrap_interval(*groups: Sequence[float]) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of a mean (for a recall: of zeros and ones), or of the mean of several means.
 
     Args:
         groups: Values; of several objects those of each, which are drawn anew by themselves.
-        seed: Of the draws.
-        level: Of the interval.
-        num_resamples: How often all are drawn anew.
 
     Raises:
         ValueError: There are no values.
@@ -159,8 +156,8 @@ def bootstrap_interval(
     if not groups or any(len(group) == 0 for group in groups):
         raise ValueError("an interval of no values: there must be at least one")
     found = [np.asarray(group, dtype=np.float64) for group in groups]
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     # One resample at a time: a table of all of them would be gigabytes for a whole data set.
-    means = [np.mean([rng.choice(group, size=len(group)).mean() for group in found]) for _ in range(num_resamples)]
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    means = [np.mean([rng.choice(group, size=len(group)).mean() for group in found]) for _ in range(_NUM_RESAMPLES)]
+    low, high = np.quantile(means, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
     return float(low), float(high)

@@ -16,12 +16,6 @@ from curio_train.geometry import rotation_between
 _ROWS_AT_ONCE = 10
 
 
-def project(points: Float[Tensor, "*#batch n 3"], matrix: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "... n 2"]:
-    """Pixels of points in the camera frame (metres). Points must lie in front: z > 0."""
-    homogeneous = points @ matrix.transpose(-1, -2)
-    return homogeneous[..., :2] / homogeneous[..., 2:]
-
-
 def inverse(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """K⁻¹, written out: exact for K's triangle, and without a solver in an exported graph."""
     fx, skew, cx = matrix[..., 0, :].unbind(-1)
@@ -55,31 +49,22 @@ class CropCamera(NamedTuple):
     """crop_from_cam, [batch, 3, 3]; its transpose turns a pose back into the frame's camera."""
     matrix: Tensor
     """K of the crop, [batch, 3, 3]; the principal point is the crop's centre."""
-    homography: Tensor
-    """From frame pixels to crop pixels, K_crop R K⁻¹, [batch, 3, 3]."""
 
 
-def crop_camera_at(
-    direction: Float[Tensor, "batch 3"],
-    focal_px: Float[Tensor, " batch"],
-    size: int,
-    matrix: Float[Tensor, "batch 3 3"],
-) -> CropCamera:
+def crop_camera_at(direction: Float[Tensor, "batch 3"], focal_px: Float[Tensor, " batch"], size: int) -> CropCamera:
     """The camera that looks along ``direction`` with the smallest turn from the frame's optical axis.
 
     Args:
         direction: Towards the crop's centre, camera frame, any length, in front (z > 0).
         focal_px: Of the crop. An object of diameter d at distance z then covers focal_px * d / z pixels.
         size: Width and height of the crop, pixels.
-        matrix: K of the frame.
     """
     axis = direction.new_tensor([0.0, 0.0, 1.0]).expand_as(direction)
     rotation = rotation_between(direction, axis)
     zero, one = torch.zeros_like(focal_px), torch.ones_like(focal_px)
     centre = torch.full_like(focal_px, (size - 1) / 2)
     rows = [focal_px, zero, centre, zero, focal_px, centre, zero, zero, one]
-    crop = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
-    return CropCamera(rotation, crop, crop @ rotation @ inverse(matrix))
+    return CropCamera(rotation, torch.stack(rows, dim=-1).unflatten(-1, (3, 3)))
 
 
 def sampling_grid(
@@ -88,11 +73,11 @@ def sampling_grid(
     """The grid with which ``grid_sample(frame, grid, align_corners=False)`` makes the crop.
 
     No place is outside the frame: ``padding_mode="border"`` would do that, too, but takes onnxruntime twice as long.
-    ``align_corners=False`` puts -1 and 1 at the image's borders, which lie half a pixel outside the pixel centres. The
-    inverse homography K Rᵀ K_crop⁻¹ is written out: no solver then enters an exported graph.
+    ``align_corners=False`` puts -1 and 1 at the image's borders, which lie half a pixel outside the pixel centres.
     """
     pixels = _pixel_centres(matrix, size, size).T
-    # From crop pixels to the grid at once: with few pixels' arithmetic left, an exported graph is fast.
+    # K Rᵀ K_crop⁻¹ takes crop pixels to frame pixels, and ``border`` takes those to the grid. The matrices are
+    # multiplied first: with few pixels' arithmetic left, an exported graph is fast.
     border = matrix.new_tensor(
         [[2 / frame_width, 0, 1 / frame_width - 1], [0, 2 / frame_height, 1 / frame_height - 1], [0, 0, 1]]
     )
@@ -129,7 +114,7 @@ def cut_crops(
     """
     num, fine_side = position_m.shape[1], oversampling * side
     matrices = matrix.expand(focal_px.shape[0], 3, 3)
-    camera = crop_camera_at(position_m.flatten(0, 1), oversampling * focal_px, fine_side, matrices)
+    camera = crop_camera_at(position_m.flatten(0, 1), oversampling * focal_px, fine_side)
     if roll is not None:
         camera = camera._replace(rotation=roll @ camera.rotation)
     grid = sampling_grid(camera, matrices, fine_side, images.shape[3], images.shape[2])

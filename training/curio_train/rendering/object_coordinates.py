@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from curio_train.color import linear_from_srgb
 from curio_train.meshes.gltf import srgb_from_linear
 from curio_train.meshes.meshes import Mesh
-from curio_train.rendering.renderer import Renderer, linear_from_srgb
+from curio_train.rendering.renderer import Renderer
 
 _MIDDLE, _REACH = 0.55, 0.4
 """Coordinates are stored as linear colours from 0.15 to 0.95: never 0, which is where nothing is seen."""

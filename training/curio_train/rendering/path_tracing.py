@@ -10,7 +10,7 @@ from curio_train.meshes.gltf import srgb_from_linear
 from curio_train.rendering.ground import Ground
 from curio_train.rendering.parts import linear_from_srgb
 from curio_train.rendering.stock import PosedMesh, emitters, load_scene, sensor
-from curio_train.rendering.variant import Variant, load_mitsuba
+from curio_train.rendering.variant import load_mitsuba
 
 MAX_BOUNCES = 8
 GROUND_RADIUS_M = 50.0
@@ -26,7 +26,6 @@ def path_traced(
     light: np.ndarray,
     ground: Ground | None,
     samples_per_pixel: int,
-    variant: Variant | None = None,
 ) -> np.ndarray:
     """Trace a picture.
 
@@ -39,7 +38,6 @@ def path_traced(
         light: Camera frame, towards the light; its length is the strength.
         ground: Plane below, or None.
         samples_per_pixel: Paths a pixel.
-        variant: See variant.py.
 
     Returns:
         [height, width, 4] float32: colour in sRGB, not premultiplied, and alpha, which is 0 where nothing was hit.
@@ -47,7 +45,7 @@ def path_traced(
     Raises:
         RendererError: No usable libLLVM.
     """
-    mitsuba = load_mitsuba(variant)
+    mitsuba = load_mitsuba()
     # Mitsuba's pixels are square: the film gets as many lines as square pixels need, and is squeezed afterwards.
     stretch = camera_matrix[0, 0] / camera_matrix[1, 1]
     square = np.array(camera_matrix, dtype=np.float64)

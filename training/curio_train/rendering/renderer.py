@@ -22,7 +22,7 @@ from curio_train.rendering.parts import build_scene
 from curio_train.rendering.passes import Pass
 from curio_train.rendering.shadows import GroundShadows, fallen
 from curio_train.rendering.tracing import LayerTracer, Objects, RayQuery
-from curio_train.rendering.variant import Variant, load_mitsuba
+from curio_train.rendering.variant import load_mitsuba
 
 MAX_RAYS = 4_000_000
 """Rays traced at once; larger batches are split, with the same result."""
@@ -48,7 +48,6 @@ class Renderer:
         samples_per_pixel: int = 4,
         outline_samples: int = 512,
         object_shadows: bool = False,
-        variant: Variant | None = None,
     ) -> None:
         """Build the static scene.
 
@@ -61,14 +60,13 @@ class Renderer:
             samples_per_pixel: Rays a pixel.
             outline_samples: Points on each object's outline, for the gradient.
             object_shadows: Objects stand in each other's light; the moving border of these shadows has no gradient.
-            variant: Of Mitsuba; None: chosen for this machine, see variant.py.
 
         Raises:
             RendererError: No usable libLLVM, or a mesh that cannot be rendered.
         """
         import drjit
 
-        mitsuba = load_mitsuba(variant)
+        mitsuba = load_mitsuba()
         static = build_scene(mitsuba, [simplified(mesh, max(MIN_FACES, width * height)) for mesh in meshes])
         if not kind_of_slot or not all(0 <= k < len(meshes) for k in kind_of_slot):
             raise RendererError(f"kind_of_slot is {list(kind_of_slot)}; every slot needs one of {len(meshes)} meshes")

@@ -32,7 +32,7 @@ from curio_train.templates.outline import outlines
 from curio_train.threads import in_threads
 from curio_train.worlds.base import World
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
-from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.two_stage import TwoStageWorld, template_geometry
 from curio_train.worlds.single_object.world import SingleObjectWorld
 
 _NUM_FRAMES, _NUM_CROPS = 24, 256  # of backgrounds
@@ -52,16 +52,8 @@ def template_network(world: World) -> TemplateNetwork:
             f"--method templates finds one object in six degrees of freedom, which {world.name} does not ask for here: "
             "expected linemod with one class, or capture with one mesh and without --plane"
         )
-    return TemplateNetwork(_geometry(world), has_color=world.object.unpainted, aligns_outlines=world.aligns_outlines)
-
-
-def _geometry(world: SingleObjectWorld) -> Geometry:
-    assert world.camera.matrix is not None
-    one = world.object
-    size = world.camera.width, world.camera.height
-    return Geometry(
-        world.camera.matrix, *size, one.kind.diameter_m, one.near_m, one.far_m, any_side=one.seen_from_any_side
-    )
+    geometry = template_geometry(world.camera, world.object)
+    return TemplateNetwork(geometry, has_color=world.object.unpainted, aligns_outlines=world.aligns_outlines)
 
 
 def without_scan_excess(world: TwoStageWorld) -> TwoStageWorld:
@@ -133,7 +125,7 @@ def fill_outline(network: TwoStageNetwork | TemplateNetwork, world: SingleObject
         RendererError: The mesh cannot be rendered.
     """
     if network.outline is not None:
-        network.outline.put(*_outlines(world.object.mesh, _geometry(world)))
+        network.outline.put(*_outlines(world.object.mesh, template_geometry(world.camera, world.object)))
 
 
 def _outlines(mesh: Mesh, geometry: Geometry) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,8 +1,4 @@
-"""What every world is: a scene code, a distribution of scenes, and a differentiable renderer.
-
-What only some worlds can do stands in small protocols: :class:`StagedWorld`, :class:`AugmentedWorld`,
-:class:`HypothesisWorld`, :class:`UnlikeWorld` and :class:`NovelViewWorld`.
-"""
+"""What every world is: a scene code, a distribution of scenes, and a differentiable renderer."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -182,6 +178,16 @@ class CameraFrameOutputs:
         return (outputs["rotation"] @ self._centers_m.to(outputs[TRANSLATION])[..., None])[..., 0]
 
 
+class Explainer(Protocol):
+    """Finds the scenes of images by rendering many hypotheses."""
+
+    def explain(self, images: Tensor) -> SceneCode:
+        """The codes that were found for images, uint8 [batch, 3, height, width]; none of them is a label.
+
+        Objects that were not found have a confidence of 0.
+        """
+
+
 class World(ABC):
     """A family of scenes that can be described, drawn at random, and rendered."""
 
@@ -250,6 +256,32 @@ class World(ABC):
     def source(self, split: Split, seed: int, *, with_code: bool, cache: Path) -> ImageSource:
         """Images of a split. Without ``with_code`` no label file is opened and ``Batch.code`` is None."""
 
+    def augment(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
+        """Renderings [batch, 3, height, width] with the known differences to the data applied; here there are none."""
+        return images
+
+    def comparable(self, code: SceneCode, images: Tensor) -> SceneCode:
+        """The code as it has to be rendered for the comparison with images [batch, 3, height, width].
+
+        Here it is the code itself; what others add has no gradient.
+        """
+        return code
+
+    def novel_view(self, code: SceneCode) -> Tensor:
+        """Images [batch, 3, height, width] for the paper's image error, from a second camera if the world has one."""
+        return self.render(code)
+
+    def explainer(self) -> Explainer:
+        """A search for the scenes of images.
+
+        Raises:
+            UsageError: Scenes of this world cannot be found so.
+        """
+        raise UsageError(
+            f"--method hypotheses: {self.name} has no hypotheses here; expected chairs, multi, light, or linemod with "
+            "one class in two stages"
+        )
+
 
 @runtime_checkable
 class StagedWorld(Protocol):
@@ -273,57 +305,6 @@ class StagedWorld(Protocol):
 def stages_of(world: World) -> tuple[World, ...]:
     """The stages that are trained: the world itself unless it is a :class:`StagedWorld`."""
     return world.stages if isinstance(world, StagedWorld) else (world,)
-
-
-@runtime_checkable
-class AugmentedWorld(Protocol):
-    """A world whose renderings differ from the data in known ways."""
-
-    def augment(self, images: Tensor, seed: tuple[int, ...]) -> Tensor:
-        """Renderings [batch, 3, height, width] with the differences applied, for the loss term ``sleep``."""
-
-
-class Explainer(Protocol):
-    """Finds the scenes of images by rendering many hypotheses."""
-
-    def explain(self, images: Tensor) -> SceneCode:
-        """The codes that were found for images, uint8 [batch, 3, height, width]; none of them is a label.
-
-        Objects that were not found have a confidence of 0.
-        """
-
-
-@runtime_checkable
-class HypothesisWorld(Protocol):
-    """A world that finds the scenes of its images."""
-
-    def explainer(self) -> Explainer:
-        """A search for the scenes of images.
-
-        Raises:
-            UsageError: Scenes of this world cannot be found so.
-        """
-
-
-@runtime_checkable
-class UnlikeWorld(Protocol):
-    """A world whose renderings of scene codes differ from its images in more than the codes say."""
-
-    def comparable(self, code: SceneCode, images: Tensor) -> SceneCode:
-        """The code as it has to be rendered for the comparison with images; what is added has no gradient."""
-
-
-@runtime_checkable
-class NovelViewWorld(Protocol):
-    """A world whose scenes can be rendered from a second camera, for the paper's image error."""
-
-    def novel_view(self, code: SceneCode) -> Tensor:
-        """Images [batch, 3, height, width] from the second camera."""
-
-
-def novel_view(world: World, code: SceneCode) -> Tensor:
-    """Scenes as the paper's image error sees them: from the second camera if the world has one, else from the first."""
-    return world.novel_view(code) if isinstance(world, NovelViewWorld) else world.render(code)
 
 
 def jitter_seed(code: SceneCode) -> int:

@@ -204,23 +204,16 @@ class RemoteFiles:
         raise AssertionError("a request has at least one attempt")
 
 
-@lru_cache
-def remote_files(scheme: str) -> RemoteFiles:
-    """The files of a scheme, opened once a process.
-
-    Raises:
-        UsageError: As :class:`RemoteFiles`.
-    """
-    return RemoteFiles(scheme)
+_opened = lru_cache(RemoteFiles)
 
 
 def files_of(url: str) -> RemoteFiles:
-    """The files of a URL's scheme.
+    """The files of a URL's scheme, opened once a process.
 
     Raises:
         UsageError: As :class:`RemoteFiles`.
     """
-    return remote_files(url.partition("://")[0])
+    return _opened(url.partition("://")[0])
 
 
 def _foreign_errors(scheme: str) -> tuple[type[Exception], ...]:

@@ -5,6 +5,7 @@ After training it shows training images and how far their re-renderings are from
 """
 
 import importlib.metadata
+import json
 import platform
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +19,6 @@ from torch import Tensor
 from curio_train.errors import CheckpointError, DataError, ReportError
 from curio_train.evaluation.reporting import report_figures as figures
 from curio_train.evaluation.reporting.tables import apart, label
-from curio_train.evaluation.results import keep
 from curio_train.evaluation.subject import Subject, load_subject
 from curio_train.evaluation.unlabelled.photographed import Judgement, judge
 from curio_train.export.card import JUDGEMENT_FILE
@@ -27,13 +27,25 @@ from curio_train.learning.runs.configuration import world_name
 from curio_train.learning.runs.progress import read_history, stage_pictures
 from curio_train.learning.runs.provenance import RunSession, run_sessions
 from curio_train.metrics.images import dssim
-from curio_train.worlds.base import Split, novel_view
+from curio_train.worlds.base import Split
 
 REPORT_FILE = "report.html"
 _NUM_SAMPLES = 6
 _NUM_PHOTOGRAPHS = 24
 _NUM_COMPARED = 48  # training images whose re-renderings are compared with them; fewer where nothing was trained
 _LIBRARIES = ("curio-pose", "torch", "mitsuba", "drjit", "numpy")
+
+
+def keep(file: Path, result: Mapping[str, Any]) -> None:
+    """Write a result as JSON into a run folder, whole or not at all; export and reports read it.
+
+    Raises:
+        CheckpointError: The run folder cannot be written.
+    """
+    try:
+        write_whole(file, json.dumps(result, indent=2))
+    except OSError as exc:
+        raise CheckpointError(f"cannot write {file}: {exc.strerror}; make the run folder writable") from exc
 
 
 def report_training(run: Path, cache: Path) -> str:
@@ -107,7 +119,7 @@ def _page(
     batch = source.batch(0, _NUM_SAMPLES if errors or config.terms.templates else _NUM_COMPARED)
     code = subject.predict((batch.images.clamp(0, 1) * 255).round().byte())
     rendered = world.render(code, batch.backgrounds).clamp(0, 1)
-    columns = (batch.images, rendered, novel_view(world, code).clamp(0, 1))
+    columns = (batch.images, rendered, world.novel_view(code).clamp(0, 1))
     shown = errors or {"image_dssim": dssim(rendered, batch.images)}
     made, parts = run_sessions(run), [kind.name for kind in world.objects]
     history = read_history(run)

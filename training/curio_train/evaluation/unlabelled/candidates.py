@@ -1,6 +1,5 @@
 """The LineMOD runs and models in a folder, each with what made it."""
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -9,12 +8,12 @@ from typing import Any
 
 from curio_serve.models.model_folder import MODEL_FILE
 
-from curio_train.errors import DataError, UsageError
+from curio_train.errors import UsageError
 from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, to_portable
 from curio_train.refinement.template_poses import uses_templates
-from curio_train.worlds.options import ALL_CLASSES, LinemodOptions
+from curio_train.worlds.options import LinemodOptions
 
 SELF_TRAINED = ", self-trained"
 """Added to the method's name where real frames without labels were learned from."""
@@ -39,12 +38,8 @@ class Candidate:
     method: str
     """Method that trained it; ``, two stages`` follows where it is one of the paper's and the network is not,
     ``, templates`` where a locator was trained, ``, self-trained`` where unlabelled real frames took part."""
-    weights_sha256: str
-    """SHA-256 of the last checkpoint's tensors, or of the model file."""
-
-    def is_of_one_class(self) -> bool:
-        """Whether it finds one class, as rows of the table do."""
-        return self.name != ALL_CLASSES and "," not in self.name
+    weights: Path
+    """The last checkpoint's tensors, or the model file."""
 
 
 def candidates(folder: Path, flag: str = "--runs", *, of_any_method: bool = True) -> list[Candidate]:
@@ -81,15 +76,13 @@ def _found(folder: Path) -> Iterator[Candidate]:
             run = RunFolder.open(path)
             if isinstance(run.config.world, LinemodOptions) and run.checkpoints():
                 weights = run.checkpoints()[-1] / "tensors.safetensors"
-                yield Candidate(
-                    path, run.config.world.class_name, _method(to_portable(run.config)), files_sha256(weights)
-                )
+                yield Candidate(path, run.config.world.class_name, _method(to_portable(run.config)), weights)
         elif any(path.glob(f"[0-9]*/{MODEL_FILE}")):
             file = find_model(path)
             spec = ExportedModel.open(file).spec
             if spec.world == "linemod":
                 names = ",".join(one.name for one in spec.objects)
-                yield Candidate(path, names, _method(json.loads(spec.recipe)), files_sha256(file))
+                yield Candidate(path, names, _method(json.loads(spec.recipe)), file)
 
 
 def _method(provenance: Mapping[str, Any]) -> str:
@@ -98,18 +91,3 @@ def _method(provenance: Mapping[str, Any]) -> str:
     two_stages = name in ONE_STAGE_METHODS and provenance["world"].get("gaze", False)
     kind = TWO_STAGES * two_stages + BY_TEMPLATES * (name != "templates" and uses_templates(provenance, 1))
     return name + kind + SELF_TRAINED * bool(provenance["recipe"].get("self_training"))
-
-
-def files_sha256(*files: Path) -> str:
-    """SHA-256 of the contents of some files, one after the other.
-
-    Raises:
-        DataError: One cannot be read.
-    """
-    digest = hashlib.sha256()
-    for file in files:
-        try:
-            digest.update(file.read_bytes())
-        except OSError as exc:
-            raise DataError(f"{file}: cannot be read ({exc.strerror})") from exc
-    return digest.hexdigest()

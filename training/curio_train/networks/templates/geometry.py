@@ -112,15 +112,26 @@ def viewpoints(
     number = np.arange(num_views) + 0.5
     height, azimuth = number / num_views, _GOLDEN_ANGLE * number
     height = 2 * height - 1 if any_side else height
+    rolls = np.radians(max_roll_deg) * (2 * (np.arange(num_rolls) + 0.5) / num_rolls - 1)
+    rotations = np.stack([looking(azimuth, height, roll) for roll in rolls], axis=1)
+    return torch.from_numpy(rotations).flatten(0, 1).float()
+
+
+def looking(
+    azimuth: Float[np.ndarray, " views"],
+    height: Float[np.ndarray, " views"],
+    roll: float | Float[np.ndarray, "views 1"],
+) -> Float[np.ndarray, "views 3 3"]:
+    """Rotations cam_from_obj of cameras on a sphere around the object (z up) that look at its middle.
+
+    Args:
+        azimuth: Of the cameras, radians about z.
+        height: Of the cameras on the unit sphere, −1 to 1.
+        roll: Radians about the line of sight; one number for all, or one each.
+    """
     level = np.sqrt(1 - height**2)
     forward = -np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], axis=1)
-    right = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(num_views)], axis=1)
+    right = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(azimuth))], axis=1)
     down = np.cross(forward, right)
-    rolls = np.radians(max_roll_deg) * (2 * (np.arange(num_rolls) + 0.5) / num_rolls - 1)
-    rotations = [
-        np.stack(
-            [np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right, forward], axis=1
-        )
-        for roll in rolls
-    ]
-    return torch.from_numpy(np.stack(rotations, axis=1)).flatten(0, 1).float()
+    rows = [np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right, forward]
+    return np.stack(rows, axis=1)

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from curio_train.errors import UsageError
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, YAW, Field, Layout
+from curio_train.worlds.base import Explainer
 from curio_train.worlds.generated.fields import HIGHEST_SUN_DEG, LOWEST_SUN_DEG
 from curio_train.worlds.generated.hypotheses.search import GroundHypotheses
 from curio_train.worlds.generated.mesh_world import MeshKind, MeshWorld
@@ -81,15 +81,12 @@ class GeneratedWorld(MeshWorld):
             code[LIGHT] = random_suns(count, LOWEST_SUN_DEG, HIGHEST_SUN_DEG, random)
         return code
 
-    def explainer(self) -> GroundHypotheses:
+    def explainer(self) -> Explainer:
         """A search for the scenes of images among rendered hypotheses, see ``hypotheses/``.
 
         Raises:
-            UsageError: Scenes of this world cannot be found so.
+            UsageError: The objects do not stand on the ground.
         """
         if self.setup.ground_srgb is None or YAW not in self.layout:
-            raise UsageError(
-                f"--method hypotheses: finds objects that stand on the ground, as in chairs, multi and light, "
-                f"and {self.name} is another world; use --method our or sleep"
-            )
+            return super().explainer()
         return GroundHypotheses(self)

@@ -13,12 +13,9 @@ from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION, 
 from curio_train.worlds.base import Camera
 from curio_train.worlds.generated.fields import CONFIDENCE_FIELD
 from curio_train.worlds.several_objects.scenes import ObjectScenes
-from curio_train.worlds.single_object.localisation_stage import camera_grid
+from curio_train.worlds.single_object.localisation_stage import POSITION_WEIGHT, camera_grid, placing_error
 from curio_train.worlds.single_object.world import Object, position_field, resized
 
-_SLOPE_SCALE_PX = 2.0  # of this stage's pixels: an error that costs 1
-_LOG_DEPTH_SCALE = 0.1
-_POSITION_WEIGHT = 0.3  # beside the heat map's
 _COVERED = 0.35  # of a nearer object's diameter around its centre: what lies behind is taken as hidden
 _FROM_THE_FRONT = (1.0, 0.0, 0.0, 0.0, 0.0, -1.0)  # rotation that pictures of what was found are drawn with
 _LAMP = (0.0, -0.7, -0.7)
@@ -59,12 +56,9 @@ class LocatorStage(ObjectScenes):
         shown = type(splat)(one_each.cell, one_each.weight * present.reshape(rows, 1, 1))
         heat = heat_map_loss(predicted[HEAT_MAPS].flatten(0, 1), shown).unflatten(0, position.shape[:2])
         found = gather_cells(predicted[PROPOSALS].flatten(0, 1), one_each).unflatten(0, position.shape[:2])[:, :, 0]
-        wanted = position[:, :, None]
-        slope = found[..., :2] / found[..., 2:] - wanted[..., :2] / wanted[..., 2:]
-        log_depth = found[..., 2].log() - wanted[..., 2].log()
-        error = slope.norm(dim=-1) / self._slope_scale + log_depth.abs() / _LOG_DEPTH_SCALE
+        error = placing_error(found, position[:, :, None], self.camera)
         placed = (error * splat.weight).sum(dim=-1) * present
-        return ((heat + _POSITION_WEIGHT * placed) * taught).sum(dim=1).mean()
+        return ((heat + POSITION_WEIGHT * placed) * taught).sum(dim=1).mean()
 
     def _hidden(
         self, position_m: Float[Tensor, "batch objects 3"], present: Bool[Tensor, "batch objects"]
@@ -75,8 +69,3 @@ class LocatorStage(ObjectScenes):
         apart = (slope[:, :, None] - slope[:, None]).norm(dim=-1)
         behind = (depth[:, :, None] > depth[:, None]) & present[:, None] & present[:, :, None]
         return (behind & (apart < _COVERED * diameter_m / depth[:, None])).any(dim=2)
-
-    @property
-    def _slope_scale(self) -> float:
-        assert self.camera.matrix is not None
-        return _SLOPE_SCALE_PX / float(self.camera.matrix[0, 0])

@@ -12,11 +12,10 @@ from torch import nn
 from curio_train.networks.base import StageNetwork
 from curio_train.networks.several_objects.locator import LocatorNetwork
 from curio_train.networks.several_objects.network import ObjectsNetwork
-from curio_train.networks.templates.geometry import Geometry
 from curio_train.worlds.several_objects.confidence import calibrate
 from curio_train.worlds.several_objects.locator_stage import LocatorStage
 from curio_train.worlds.several_objects.scenes import ObjectScenes
-from curio_train.worlds.single_object.two_stage import TrainingPhotographs, frame_camera
+from curio_train.worlds.single_object.two_stage import TrainingPhotographs, frame_camera, template_geometry
 from curio_train.worlds.single_object.world import Object, pose_layout, position_field
 
 
@@ -69,20 +68,8 @@ class SeveralObjectsWorld(ObjectScenes):
         """The locator with templates that are still empty."""
         (locator,) = networks
         assert isinstance(locator, LocatorNetwork)
-        geometries = [self._geometry(member) for member in self.members]
+        geometries = [template_geometry(self.camera, member) for member in self.members]
         return ObjectsNetwork(locator, geometries, aligns_outlines=self._aligns_outlines)
-
-    def _geometry(self, member: Object) -> Geometry:
-        assert self.camera.matrix is not None
-        return Geometry(
-            self.camera.matrix,
-            self.camera.width,
-            self.camera.height,
-            member.kind.diameter_m,
-            member.near_m,
-            member.far_m,
-            any_side=member.seen_from_any_side,
-        )
 
     def calibrate_confidence(self, network: nn.Module, cache: Path) -> None:
         """Calibrate the network's confidence on renderings that it was not trained with."""

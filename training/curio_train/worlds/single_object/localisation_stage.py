@@ -16,9 +16,11 @@ from curio_train.worlds.single_object.world import Object, SingleObjectWorld, po
 LOCALISATION_STRIDE = 4
 """Frame pixels per pixel of this stage, each way."""
 
-_SLOPE_SCALE_PX = 2.0  # of this stage's pixels: an error that costs 1
+POSITION_WEIGHT = 0.3
+"""Weight of the proposals' errors beside the heat map's."""
+
+_SLOPE_SCALE_PX = 2.0  # of a stage's pixels: an error that costs 1
 _LOG_DEPTH_SCALE = 0.1
-_POSITION_WEIGHT = 0.3  # beside the heat map's
 
 
 class LocalisationStage(SingleObjectWorld):
@@ -61,17 +63,26 @@ class LocalisationStage(SingleObjectWorld):
         grid = camera_grid(self.camera, self.layout[TRANSLATION]).to(position.device)
         splat = grid.splat_weights(grid.project(position))
         found, wanted = gather_cells(predicted[PROPOSALS], splat), position[:, :, None]  # [batch, objects, 4, 3]
-        slope = found[..., :2] / found[..., 2:] - wanted[..., :2] / wanted[..., 2:]
-        log_depth = found[..., 2].log() - wanted[..., 2].log()
-        error = slope.norm(dim=-1) / self._slope_scale + log_depth.abs() / _LOG_DEPTH_SCALE
-        position_loss = (error * splat.weight).sum(dim=-1).mean()
+        position_loss = (placing_error(found, wanted, self.camera) * splat.weight).sum(dim=-1).mean()
         heat_loss = heat_map_loss(predicted[HEAT_MAP], splat).mean() / position.shape[1]
-        return heat_loss + _POSITION_WEIGHT * position_loss
+        return heat_loss + POSITION_WEIGHT * position_loss
 
-    @property
-    def _slope_scale(self) -> float:
-        assert self.camera.matrix is not None
-        return _SLOPE_SCALE_PX / float(self.camera.matrix[0, 0])
+
+def placing_error(
+    found_m: Float[Tensor, "*batch 3"], wanted_m: Float[Tensor, "*#batch 3"], camera: Camera
+) -> Float[Tensor, "*batch"]:
+    """How far positions in the camera's frame are off, across and along the line of sight.
+
+    Args:
+        found_m: Proposals, in front of the camera.
+        wanted_m: The true ones.
+        camera: Of the stage's images; it has K.
+    """
+    assert camera.matrix is not None
+    slope = found_m[..., :2] / found_m[..., 2:] - wanted_m[..., :2] / wanted_m[..., 2:]
+    log_depth = found_m[..., 2].log() - wanted_m[..., 2].log()
+    slope_scale = _SLOPE_SCALE_PX / float(camera.matrix[0, 0])
+    return slope.norm(dim=-1) / slope_scale + log_depth.abs() / _LOG_DEPTH_SCALE
 
 
 def camera_grid(camera: Camera, position: Field) -> CellGrid:

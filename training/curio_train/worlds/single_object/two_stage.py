@@ -17,7 +17,7 @@ from curio_train.camera import Intrinsics
 from curio_train.data.photographs import UnlabelledPhotographs
 from curio_train.networks.base import StageNetwork
 from curio_train.networks.outline_alignment import OutlineAlignment
-from curio_train.networks.templates.geometry import num_views
+from curio_train.networks.templates.geometry import Geometry, num_views
 from curio_train.networks.two_stage.network import Optics, TwoStageNetwork
 from curio_train.worlds.base import Camera
 from curio_train.worlds.single_object.confidence import calibrate
@@ -124,3 +124,17 @@ def frame_camera(frame: Intrinsics) -> Camera:
     scale = min(1.0, LONGEST_SIDE_PX / max(frame.width, frame.height))
     step = 2 * LOCALISATION_STRIDE
     return resized(frame, step * round(frame.width * scale / step), step * round(frame.height * scale / step))
+
+
+def template_geometry(camera: Camera, object_: Object) -> Geometry:
+    """How templates look at an object in a camera's frames; the camera has K."""
+    assert camera.matrix is not None
+    return Geometry(
+        camera.matrix,
+        camera.width,
+        camera.height,
+        object_.kind.diameter_m,
+        object_.near_m,
+        object_.far_m,
+        any_side=object_.seen_from_any_side,
+    )

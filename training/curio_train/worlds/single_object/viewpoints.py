@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from curio_train.geometry import rotation_between
-from curio_train.networks.templates.geometry import MAX_ROLL_DEG
+from curio_train.networks.templates.geometry import MAX_ROLL_DEG, looking
 from curio_train.rendering.materials import log_uniform
 from curio_train.scene_code import Field
 
@@ -39,13 +39,8 @@ def upper_hemisphere_rotations(count: int, random: np.random.Generator) -> Float
     """Rotations cam_from_obj of cameras on the upper hemisphere (object z up) that look at the object, rolled."""
     azimuth = random.uniform(0, 2 * np.pi, count)
     height = random.uniform(0, 1, count)  # of the camera on the unit sphere: uniform in height is uniform in area
-    level = np.sqrt(1 - height**2)
-    forward = -np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], axis=1)
-    right = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(count)], axis=1)
-    down = np.cross(forward, right)
     roll = np.radians(random.uniform(-MAX_ROLL_DEG, MAX_ROLL_DEG, count))[:, None]
-    rows = [np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right, forward]
-    return torch.from_numpy(np.stack(rows, axis=1)).float()
+    return torch.from_numpy(looking(azimuth, height, roll)).float()
 
 
 def allocentric_to_egocentric(
