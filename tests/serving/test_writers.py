@@ -151,7 +151,9 @@ def test_bop_object_ids_come_from_linemod_or_the_flag() -> None:
     assert bop_object_ids(["gear"], 7) == {"gear": 7}
     with pytest.raises(UsageError, match=r"gear.*--obj-id"):
         bop_object_ids(["ape", "gear"], None)
-    with pytest.raises(UsageError, match="2: ape, can"):
+    with pytest.raises(UsageError, match=r"box, cone.*--obj-id NUMBER with --objects NAME"):
+        bop_object_ids(["box", "cone"], None)
+    with pytest.raises(UsageError, match="2: ape, can; choose one of them with --objects"):
         bop_object_ids(["ape", "can"], 7)
 
 

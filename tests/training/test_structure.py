@@ -257,5 +257,5 @@ def test_a_still_camera_sees_no_depth(tmp_path: Path) -> None:
 def test_too_few_photographs(sequence: tuple[list[Path], np.ndarray]) -> None:
     with pytest.raises(DataError, match="at least 3"):
         recover(sequence[0][:2])
-    with pytest.raises(DataError, match="smaller step"):
+    with pytest.raises(DataError, match="--every 30 leaves 2; expected at least"):
         every_nth(sequence[0], 30)

@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 from curio_train.config import NetworkConfig
+from curio_train.errors import UsageError
 from curio_train.evaluation.scores import accuracy, scene_errors, scene_scores
 from curio_train.geometry import camera_looking_at, rotation_6d_from_matrix
 from curio_train.networks.grid import per_cell
@@ -199,3 +200,9 @@ def test_both_ends_of_a_folded_yaw_are_one_image(folder: Path) -> None:
     ends = [world.render({**code, YAW: yaw.expand_as(code[YAW])}) for yaw in yaws]
     beside = world.render({**code, TRANSLATION: code[TRANSLATION] + torch.tensor([0.005, 0.0, 0.0])})
     assert (ends[0] - ends[1]).abs().mean() < 0.2 * (beside - world.render(code)).abs().mean()
+
+
+def test_more_parts_than_find_room_are_refused(folder: Path) -> None:
+    assert world_of(folder, "nut.stl", count=9).layout.num_slots == 9
+    with pytest.raises(UsageError, match="--counts 200-200: so many parts do not fit"):
+        world_of(folder, "nut.stl", count=200)

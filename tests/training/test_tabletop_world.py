@@ -1,5 +1,4 @@
-"""Parts on a plane: STL files, photographs, background images and cameras become a world that is learned from the
-photographs."""
+"""Parts on a plane: STL files, photographs, background images and cameras become a world."""
 
 import json
 from pathlib import Path
@@ -130,9 +129,14 @@ def test_true_codes_score_better_than_wrong_ones(folder: Path, world: TabletopWo
     """And what looks right from the own camera alone is found out by the second."""
     code = truth(folder, world)
     moved = code | {TRANSLATION: code[TRANSLATION] + torch.tensor([0.1, 0.0, 0.0])}
-    right, wrong = (judge(world, lambda _, code=shown: code) for shown in (code, moved))
+    tipped = build(options(folder, up="y"))
+    shown = ((world, code), (world, moved), (tipped, code))
+    right, wrong, on_its_side = (judge(place, lambda _, code=found: code) for place, found in shown)
     assert right is not None
     assert wrong is not None
+    assert on_its_side is not None
+    assert "Trust it with care" in on_its_side.verdict
+    assert "(--up)" in on_its_side.verdict
     for name in ("own_view_dssim", "own_view_dssim_blurred", "second_view_dssim", "second_view_dssim_blurred"):
         assert right.metrics[name] < wrong.metrics[name]
         assert right.metrics[name] < right.metrics[name.replace("view_", "view_plate_")]
@@ -275,41 +279,16 @@ def test_camera_poses_in_millimetres_are_refused(folder: Path, tmp_path: Path) -
         build(options(folder, plane=tmp_path / "views.json"))
 
 
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"plane": None}, "--counts, --second, --second-background: for parts on a plane"),
-        (
-            {"plane": None, "counts": (), "second": None, "second_background": None, "mesh": ("a/b.stl", "b.stl")},
-            "rename one",
-        ),
-        ({"background": None}, "expected --background"),
-        ({"upright": True, "far_m": 2.0}, "--upright, --far-m: for a part in free space"),
-        ({"mesh": ("a/part.stl", "b/part.stl"), "counts": ()}, "rename one"),
-        ({"counts": ("2", "3")}, "2 --counts for 1 meshes"),
-        ({"counts": ("3-2",)}, "--counts 3-2"),
-        ({"counts": ("many",)}, "--counts many"),
-        ({"counts": ("0",)}, "all scenes are empty"),
-        ({"second_background": None}, "belong together"),
-        ({"blur_px": 4}, "odd"),
-    ],
-)
-def test_flags_that_contradict_each_other(folder: Path, changes: dict[str, object], expected: str) -> None:
-    if "mesh" in changes:
-        changes["mesh"] = tuple(folder / str(name) for name in changes["mesh"])  # type: ignore[attr-defined]
-    with pytest.raises(UsageError, match=expected):
-        options(folder, **changes)
-
-
 def test_pictures_that_do_not_belong_together(folder: Path, tmp_path: Path) -> None:
-    small = cv2.resize(cv2.imread(str(folder / "a" / "plate-a.png")), (48, 36))
-    cv2.imwrite(str(tmp_path / "plate-b.png"), small)
+    cv2.imwrite(str(tmp_path / "plate-b.png"), np.zeros((36, 48, 3), np.uint8))
     with pytest.raises(DataError, match="found 48x36 pixels"):
         build(options(folder, second_background=tmp_path / "plate-b.png"))
     (tmp_path / "other").mkdir()
     cv2.imwrite(str(tmp_path / "other" / "x.png"), cv2.imread(str(folder / "b" / "plate-b.png")))
     with pytest.raises(DataError, match="named like one in"):
         build(options(folder, second=tmp_path / "other"))
+    with pytest.raises(UsageError, match="its camera stands where that of --background"):
+        build(options(folder, second=folder / "a", second_background=folder / "a" / "plate-a.png"))
     assert not any("background" in doubt for doubt in refuse_unfit(options(folder)))
 
 

@@ -67,8 +67,9 @@ class CameraPoseFile:
             CameraError: The file has none, or it is not rigid.
         """
         if not self.is_known(photograph):
+            others = f"only of {', '.join([*self.entries][:5])}" if self.entries else "nor of any other photograph"
             raise CameraError(
-                f"{self.flag} {self.file}: has no pose of {photograph.name}, only of {', '.join([*self.entries][:5])}. "
+                f"{self.flag} {self.file}: has no pose of {photograph.name}, {others}. "
                 "Photographs are named by their path from that file's folder, or by their file name"
             )
         return _rigid(self._entry(photograph)["cam_from_world"], self._where(photograph))

@@ -58,7 +58,8 @@ def every_nth(photographs: Sequence[Path], step: int) -> list[Path]:
     """
     chosen = list(photographs[::step])
     if len(chosen) < _FEWEST_PHOTOGRAPHS:
-        raise DataError(f"every {step}th of {len(photographs)} photographs leaves {len(chosen)}; take a smaller step")
+        found = f"found {len(photographs)} photographs, of which --every {step} leaves {len(chosen)}"
+        raise DataError(f"{found}; expected at least {_FEWEST_PHOTOGRAPHS}")
     return chosen
 
 

@@ -227,6 +227,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_train.commands.prepare import prepared, with_kept_meshes
     from curio_train.learning.hardware import one_thread
     from curio_train.learning.loop import Outcome
+    from curio_train.learning.runs.checkpoint import RunFolder
     from curio_train.learning.runs.without_training import draw_templates
     from curio_train.learning.session import learn
 
@@ -251,7 +252,7 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
         return 0
     report(
         f"{path}: drawing the objects' templates, which takes a minute or two for each"
-        if _draws_templates(config.world) and not session.resume
+        if _draws_templates(config.world) and not (session.resume and RunFolder.open(path).checkpoints())
         else f"{path}: preparing images and renderer, which takes a minute or so where it was not done before"
     )
     with _saying_how_to_go_on(config, path):

@@ -284,13 +284,16 @@ def bop_object_ids(objects: Sequence[str], given: int | None) -> dict[str, int]:
     """
     if given is not None:
         if len(objects) != 1:
-            raise UsageError(f"--obj-id {given} names one object, the model finds {len(objects)}: {', '.join(objects)}")
+            raise UsageError(
+                f"--obj-id {given} names one object, the model finds {len(objects)}: {', '.join(objects)}; "
+                "choose one of them with --objects"
+            )
         return {objects[0]: given}
     unknown = [name for name in objects if name not in LINEMOD_IDS]
     if unknown:
         raise UsageError(
             f"--format bop needs the object id of {', '.join(unknown)}: expected a LineMOD class "
-            f"({', '.join(LINEMOD_IDS)}) or --obj-id NUMBER"
+            f"({', '.join(LINEMOD_IDS)}) or --obj-id NUMBER{' with --objects NAME' * (len(objects) > 1)}"
         )
     return {name: LINEMOD_IDS[name] for name in objects}
 

@@ -13,7 +13,7 @@ from curio_train.capture.plane import CameraPoseFile, changed_pixels, points_on_
 from curio_train.data.bop import ModelInfo
 from curio_train.data.part_color import is_unpainted
 from curio_train.data.photographs import Photographs, read_frames
-from curio_train.errors import CameraError, DataError
+from curio_train.errors import CameraError, DataError, UsageError
 from curio_train.geometry import Pose
 from curio_train.meshes.meshes import Mesh, load_mesh
 from curio_train.meshes.of_model import refuse_changed_mesh
@@ -28,6 +28,8 @@ from curio_train.worlds.tabletop.world import Part, TabletopPhotographs, Tableto
 
 SIDE_PX = 128
 _SMALLEST_PX = 2.0  # smaller parts are no more than noise, and their files are of another unit
+_MOST_COVERED = 0.55  # of a plane, by equal discs that are put on it at random, each beside the others
+_SAME_PLACE_M = 0.01  # within which two cameras are one
 _OFF_AXIS = 0.01  # of the diameter; symmetries are not found exactly enough to correct the box's middle by less
 _UP = np.array([0.0, 1.0, 0.0])
 _PARALLEL, _LEVEL = 0.999, 0.04  # cosine of the angle between an axis and the vertical: the same, and across it
@@ -73,7 +75,20 @@ def build_tabletop(options: CaptureOptions) -> TabletopWorld:
     _refuse_invisible(setup, max(part.kind.diameter_m for part in parts), options.plane)
     highest_m = max(part.radius_m for part in parts) if options.lying else 0.0
     photographs = _photographs(options, options.background, cameras, intrinsics, setup, highest_m)
+    _refuse_crowded(parts, photographs.position, options)
     return TabletopWorld(parts, setup, photographs, lying=options.lying, blur_px=options.blur_px)
+
+
+def _refuse_crowded(parts: Sequence[Part], position: Field, options: CaptureOptions) -> None:
+    """Discs that are put on a plane at random, none on another, cover about half of it, and then no more find room."""
+    radii = np.repeat([part.radius_m for part in parts], [part.max_count for part in parts])
+    sides = (np.asarray(position.upper) - np.asarray(position.lower))[[0, 2]] + 2 * radii.mean()
+    if np.pi * (radii**2).sum() > _MOST_COVERED * sides.prod():
+        counts = " ".join(f"{part.min_count}-{part.max_count}" for part in parts)
+        raise UsageError(
+            f"--counts {counts}: so many parts do not fit beside each other where the photographs show parts, "
+            f"{sides[0]:.2g} by {sides[1]:.2g} m; give the counts of your photographs, and check --mesh-unit"
+        )
 
 
 def _refuse_invisible(setup: SceneSetup, diameter_m: float, file: Path) -> None:
@@ -167,9 +182,19 @@ def _photographs(
         judged, others = _pairs(options.second, judged, empty)
         second = PhotographSet(_frames(others, intrinsics), _frames([options.second_background], intrinsics)[0])
         second_pose = Pose.from_matrix(cameras.pose_above_plane(options.second_background))
+        _refuse_same_view(second_pose, Pose.from_matrix(cameras.pose_above_plane(background)), options)
     own = PhotographSet(_frames(judged, intrinsics), images[background], [path.name for path in judged])
     differ = any(path != background for path in own_backgrounds)
     return TabletopPhotographs(training, backgrounds if differ else None, own, second, second_pose, occupied, position)
+
+
+def _refuse_same_view(second: Pose[np.ndarray], own: Pose[np.ndarray], options: CaptureOptions) -> None:
+    """From where the own camera stands, a second one cannot tell depth, which is what it is for."""
+    if np.allclose(second.inverse().translation_m, own.inverse().translation_m, atol=_SAME_PLACE_M):
+        raise UsageError(
+            f"--second-background {options.second_background}: by --plane {options.plane} its camera stands where that "
+            f"of --background {options.background} does; expected another viewpoint, or no --second"
+        )
 
 
 def empty_scenes(options: CaptureOptions, background: Path, cameras: CameraPoseFile) -> Sequence[Path]:
