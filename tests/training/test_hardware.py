@@ -32,12 +32,6 @@ def test_a_process_of_one_thread_tries_nothing() -> None:
     assert calls == []
 
 
-@pytest.mark.parametrize(("reserved", "expected"), [(0, 2), (1, 1), (5, 1)])
-def test_threads_for_other_work_are_left_alone(reserved: int, expected: int) -> None:
-    slow_alone = lambda: time.sleep(0.5 if torch.get_num_threads() == 1 else 0.0)  # noqa: E731
-    assert choose_threads(slow_alone, reserved=reserved) == torch.get_num_threads() == expected
-
-
 def test_one_thread_computes_within_the_block_alone() -> None:
     with one_thread() as allowed:
         assert (allowed, torch.get_num_threads()) == (2, 1)

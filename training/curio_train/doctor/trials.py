@@ -62,7 +62,7 @@ def images_per_second(name: str) -> float:
     config = RunConfig(options, kind.default_method, recipe=preset_recipe("laptop", kind))
     sources = [_source(stage) for stage in stages_of(world)]
     trainer = Trainer(config, world, sources, Ranks(0, 1, torch.device("cpu")))
-    choose_threads(trainer.warm_up, reserved=int(not config.terms.reads_images))
+    choose_threads(trainer.warm_up)
     steps = len(world.stage_schedule) if isinstance(world, StagedWorld) else _STEPS
     with trainer.synthetic.prefetching():
         for _ in range(steps):  # compiles the kernels

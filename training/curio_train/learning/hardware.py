@@ -27,17 +27,16 @@ def autocast(precision: str, device_type: str) -> torch.autocast:
     return torch.autocast(device_type, torch.bfloat16, enabled=half)
 
 
-def choose_threads(work: Callable[[], object], *, reserved: int = 0) -> int:
+def choose_threads(work: Callable[[], object]) -> int:
     """Set torch's number of threads to all it may use, or to one, whichever does ``work`` quicker now.
 
     Args:
         work: A typical part of what is to be computed.
-        reserved: Threads that torch leaves to other work of this process; it keeps at least one.
 
     Returns:
         That number.
     """
-    most = max(1, torch.get_num_threads() - reserved)
+    most = torch.get_num_threads()
     torch.set_num_threads(most if most == 1 else min((1, most), key=lambda count: _seconds(work, count)))
     return torch.get_num_threads()
 

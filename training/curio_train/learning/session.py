@@ -129,8 +129,7 @@ def learn(
             _refuse_spent(config, trainer.state.progress.seconds, path)
         quicken(trainer.state.pose.network)
         if here.device.type == "cpu":
-            # The thread that renders synthetic batches ahead needs a core of its own.
-            choose_threads(trainer.warm_up, reserved=int(not config.terms.reads_images))
+            choose_threads(trainer.warm_up)
 
         told = reporting(path, trainer.state.progress, is_flat=config.world.is_flat) if here.leads else nullcontext()
         with told as reporter:
