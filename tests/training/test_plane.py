@@ -92,6 +92,12 @@ def test_a_file_of_camera_places_is_a_regular_file(tmp_path: Path) -> None:
             CameraPoseFile.read(file)
 
 
+def test_a_file_of_no_photograph_says_so(tmp_path: Path) -> None:
+    (tmp_path / "views.json").write_text("{}")
+    with pytest.raises(CameraError, match=r"has no pose of plate\.png, nor of any other photograph"):
+        CameraPoseFile.read(tmp_path / "views.json").pose_above_plane(tmp_path / "plate.png")
+
+
 def test_photographs_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
     for folder in ("around", "photos"):
         (tmp_path / folder).mkdir()

@@ -8,6 +8,8 @@ import torch
 from curio_train.errors import ExportError
 from curio_train.export.graph import Graph, numerically_stable
 from curio_train.export.write_model import _golden
+from curio_train.networks.templates.quick_trunk import quicken
+from curio_train.networks.templates.trunk import Trunk
 from curio_train.scene_code import CONFIDENCE, LIGHT, TRANSLATION
 from curio_train.worlds.generated.circles import Circles
 
@@ -28,6 +30,28 @@ def test_images_on_which_rounding_decides_can_tell_nothing() -> None:
     assert numerically_stable(graph, images).tolist() == [[True]] * 5 + [[False]] * 3
     with pytest.raises(ExportError, match=r"7 of the network's 8 answers to check images"):
         numerically_stable(graph, images[[0, 5, 6, 7, 5, 6, 7, 5]])
+
+
+class _Likeliest(torch.nn.Module):
+    """The likeliest of the cells of a trunk: in a picture of one colour they are equal but for rounding."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.trunk = Trunk.pretrained()
+
+    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        cells = self.trunk(images)[1][:, 0, 4:-4, 4:-4].flatten(1)
+        return {TRANSLATION: cells.argmax(dim=1)[:, None, None].expand(-1, 1, 3).float()}
+
+
+@pytest.mark.parametrize("is_quick", [False, True])
+def test_features_of_a_trunk_are_jittered(monkeypatch: pytest.MonkeyPatch, is_quick: bool) -> None:
+    monkeypatch.setattr("curio_train.export.graph._PIXEL_JITTER", 0.0)
+    network = _Likeliest()
+    if is_quick:
+        quicken(network)
+    with pytest.raises(ExportError, match="2 of the network's 2 answers"):
+        numerically_stable(Graph(network, Circles()), torch.full((2, 128, 128, 3), 90, dtype=torch.uint8))
 
 
 class _BrighterAndFixed(_Brighter):

@@ -204,5 +204,5 @@ def test_both_ends_of_a_folded_yaw_are_one_image(folder: Path) -> None:
 
 def test_more_parts_than_find_room_are_refused(folder: Path) -> None:
     assert world_of(folder, "nut.stl", count=9).layout.num_slots == 9
-    with pytest.raises(UsageError, match="--counts 200-200: so many parts do not fit"):
-        world_of(folder, "nut.stl", count=200)
+    with pytest.raises(UsageError, match="--counts 2000-2000: so many parts do not fit"):
+        world_of(folder, "nut.stl", count=2000)

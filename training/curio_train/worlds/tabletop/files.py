@@ -28,7 +28,7 @@ from curio_train.worlds.tabletop.world import Part, TabletopPhotographs, Tableto
 
 SIDE_PX = 128
 _SMALLEST_PX = 2.0  # smaller parts are no more than noise, and their files are of another unit
-_MOST_COVERED = 0.55  # of a plane, by equal discs that are put on it at random, each beside the others
+_MOST_COVERED = 4.0  # of a plane, by the discs around parts; those of long parts that lie overlap, and parts do not
 _SAME_PLACE_M = 0.01  # within which two cameras are one
 _OFF_AXIS = 0.01  # of the diameter; symmetries are not found exactly enough to correct the box's middle by less
 _UP = np.array([0.0, 1.0, 0.0])
@@ -80,13 +80,13 @@ def build_tabletop(options: CaptureOptions) -> TabletopWorld:
 
 
 def _refuse_crowded(parts: Sequence[Part], position: Field, options: CaptureOptions) -> None:
-    """Discs that are put on a plane at random, none on another, cover about half of it, and then no more find room."""
+    """So many that each scene takes long to draw, and no photograph shows them."""
     radii = np.repeat([part.radius_m for part in parts], [part.max_count for part in parts])
     sides = (np.asarray(position.upper) - np.asarray(position.lower))[[0, 2]] + 2 * radii.mean()
     if np.pi * (radii**2).sum() > _MOST_COVERED * sides.prod():
         counts = " ".join(f"{part.min_count}-{part.max_count}" for part in parts)
         raise UsageError(
-            f"--counts {counts}: so many parts do not fit beside each other where the photographs show parts, "
+            f"--counts {counts}: so many parts do not fit where the photographs show parts, "
             f"{sides[0]:.2g} by {sides[1]:.2g} m; give the counts of your photographs, and check --mesh-unit"
         )
 
