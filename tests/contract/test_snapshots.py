@@ -38,7 +38,7 @@ ERRORS = {
     "train-unknown-method": "curio-train circles --method magic",
     "train-labels-of-a-method-without": "curio-train circles --labels 0.1",
     "train-negative-budget": "curio-train circles --minutes -1",
-    "train-micro-batches": "curio-train circles --batch-size 10",
+    "train-micro-batches": "curio-train circles --batch-size 100",
     "train-no-run-folder": "curio-train circles --resume nowhere",
     "train-no-class": "curio-train linemod",
     "train-mistyped-world": "curio-train linmod --class ape",

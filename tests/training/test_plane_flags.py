@@ -1,10 +1,13 @@
-"""Flags of parts on a plane that contradict each other; no file is read for it."""
+"""Flags of parts on a plane that contradict each other or have no effect; no file is read for it."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from curio_train.commands.prepare import prepared
+from curio_train.commands.train import parse
+from curio_train.config import RunConfig
 from curio_train.errors import UsageError
 from curio_train.worlds.options import CaptureOptions
 
@@ -44,3 +47,17 @@ def test_flags_that_contradict_each_other(changes: dict[str, Any], expected: str
         changes["mesh"] = tuple(map(Path, changes["mesh"]))
     with pytest.raises(UsageError, match=expected):
         replace(OPTIONS, **changes)
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        (["--method", "super"], "--method super: it learns from true poses, and photographs have none"),
+        (["--self-training", "0.3"], r"--self-training 0\.3: .* leave it out, or --plane"),
+    ],
+)
+def test_what_photographs_of_a_plane_have_no_use_for(flags: list[str], expected: str, tmp_path: Path) -> None:
+    words = ["--mesh", "wedge.stl", "--camera", "camera.json", "--photos", "a", "--background", "a/empty.png"]
+    config: RunConfig = parse(["capture", *words, "--plane", "views.json", "--out", "run", *flags]).config
+    with pytest.raises(UsageError, match=expected):
+        prepared(config, tmp_path, pytest.fail, pytest.fail)

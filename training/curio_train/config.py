@@ -144,8 +144,8 @@ class Recipe:
     batch_size: int = 128
     """Images a step."""
     micro_batch_size: int = 32
-    """Images held in memory at once; gradients add up to those of a whole batch, batch norm sees one micro-batch at a
-    time."""
+    """Images held in memory at once, at most a batch; gradients add up to those of a whole batch, batch norm sees one
+    micro-batch at a time."""
     learning_rate: float = 1e-4
     """Adam's learning rate for encoder and heads."""
     matrix_learning_rate: float = 0.0
@@ -217,6 +217,8 @@ class Recipe:
             raise UsageError(f"--sleep-drawn {self.sleep_drawn} is no fraction, expected 0 to 1")
         if not 0 <= self.self_training < 1:
             raise UsageError(f"--self-training {self.self_training}: expected 0 or more, and less than 1")
+        if self.batch_size < self.micro_batch_size:  # --batch-size alone is given below the preset's micro-batch
+            object.__setattr__(self, "micro_batch_size", self.batch_size)
         if self.batch_size % self.micro_batch_size or self.micro_batch_size < 2:
             raise UsageError(
                 f"--batch-size {self.batch_size} cannot be cut into micro-batches of {self.micro_batch_size}; "

@@ -62,7 +62,8 @@ class DetectArguments:
     max_detections: int | None = None
     """Keep that many of an image, the most confident. None: all."""
     max_instances: int | None = None
-    """Find up to that many of each kind of object, at a further run of the network each. None: what one run gives."""
+    """Find up to that many of each kind of object, at a further run of the network each; of parts on a plane, which one
+    run finds together, keep that many. None: what one run gives."""
     reads: int = 1
     """Read each image that many times, 1 to 9, through slightly turned and zoomed cameras, and answer what most reads
     agree on: better poses in photographs, in as many times the time."""

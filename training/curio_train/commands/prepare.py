@@ -54,6 +54,8 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
                 f"--self-training {config.recipe.self_training}: several parts in free space are not learned from "
                 "photographs; leave it out, or train a model of each part"
             )
+        if options.plane is not None:
+            _refuse_unlearnable(config, options.plane)
         from curio_train.doctor.examine import refuse_unfit
 
         for doubt in refuse_unfit(options, self_training=config.recipe.self_training > 0):
@@ -70,6 +72,20 @@ def _without_training(config: RunConfig, warn: Callable[[str], None]) -> None:
     for flag in ("minutes", "images"):
         if (given := getattr(config, flag)) is not None:
             warn(f"--{flag} {given} has no effect with --method templates, which trains nothing")
+
+
+def _refuse_unlearnable(config: RunConfig, plane: Path) -> None:
+    """Refuse what learning from photographs of a plane has no use for."""
+    if config.terms.label:
+        raise UsageError(
+            f"--method {config.method}: it learns from true poses, and photographs have none; leave it out, or "
+            "expected --method sleep, our or noncur"
+        )
+    if config.recipe.self_training:
+        raise UsageError(
+            f"--self-training {config.recipe.self_training}: it is for crops of a part in free space, and parts on a "
+            f"plane are read in whole photographs; leave it out, or --plane {plane}"
+        )
 
 
 def _with_stages(options: LinemodOptions, method: MethodName) -> LinemodOptions:

@@ -149,7 +149,7 @@ def _defaults(world: str, typed: list[str]) -> tuple[RunConfig, RunConfig | None
         recipe = replace(recipe, self_training=0.0)
     if preset == "laptop" and seen.method in (None, kind.default_method) and _names_locator(world, seen):
         recipe = replace(recipe, **LOCATOR_RECIPE)
-    if world == "capture" and _names_locator(world, seen):
+    if world == "capture" and (seen.plane is not None or _names_locator(world, seen)):
         recipe = replace(recipe, self_training=0.0)
     return RunConfig(_unset(kind), method=kind.default_method, recipe=recipe), stored
 

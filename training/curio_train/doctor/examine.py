@@ -107,7 +107,7 @@ _BROKEN = "photographs unreadable"  # all that matters about other scenes: they 
 
 
 def refuse_unfit(options: CaptureOptions, *, self_training: bool = True) -> list[str]:
-    """Compare the meshes, the camera, the photographs and the background image; read every other background.
+    """Compare the meshes, the camera, the photographs and the background image; read all other images.
 
     Args:
         options: Names the files.
@@ -128,9 +128,11 @@ def refuse_unfit(options: CaptureOptions, *, self_training: bool = True) -> list
     found = [finding for finding in found if finding.state != "good" and finding.fault != _HARMLESS]
     if not self_training or options.plane is not None:  # the count matters where a part's model learns from them
         found = [finding for finding in found if finding.fault != TOO_FEW]
-    if options.backgrounds is not None:
-        _, scenes = examine_photographs(options.backgrounds, None)
-        found += [replace(finding, subject="backgrounds") for finding in scenes if finding.fault == _BROKEN]
+    further = {"backgrounds": options.backgrounds, "held-out": options.held_out, "second": options.second}
+    for name, folder in further.items():
+        if folder is not None:
+            _, scenes = examine_photographs(folder, None, empty)
+            found += [replace(finding, subject=name) for finding in scenes if finding.fault == _BROKEN]
     unfit = [finding for finding in found if finding.state == "bad" and finding.sure == "certain"]
     if unfit:
         raise DataError("\n".join(f"{finding.subject}: {finding}" for finding in unfit))

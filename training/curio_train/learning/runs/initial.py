@@ -54,7 +54,8 @@ def begin_with(state: TrainState, path: Path) -> None:
     except RuntimeError as exc:
         raise UsageError(
             f"--init {path}: its network does not fit this world ({_first_difference(exc)}); "
-            "expected a run or a model of the same world and the same network flags, such as --two-stage"
+            "expected a run or a model of the same world and the same network flags, such as --two-stage, and for "
+            "parts on a plane with as many parts (--counts) in the same poses (--lying)"
         ) from exc
     state.progress.images_before, state.progress.seconds_before = images, seconds
 

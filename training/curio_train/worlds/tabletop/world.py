@@ -230,7 +230,7 @@ class TabletopWorld(MeshWorld):
             return super().source(split, seed, with_code=with_code, cache=cache)
         if with_code:
             raise UsageError(
-                "photographs have no labels: expected another --method than super, or --split test, which is rendered"
+                "photographs have no labels; expected --split test or validation, which are rendered"
             )
         photographs = self.photographs
         return StoredImages(photographs.training, None, seed=seed, shuffle=True, backgrounds=photographs.backgrounds)
