@@ -303,7 +303,11 @@ def test_a_run_keeps_its_mesh(capture: CaptureOptions, tmp_path: Path) -> None:
 
 
 def test_a_few_steps_of_training(
-    capture: CaptureOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    capture: CaptureOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    small_checks: None,
 ) -> None:
     """The run is whole, and its world is built of the mesh that it keeps; a model of such a run is made elsewhere."""
     monkeypatch.setattr("curio_train.data.backgrounds.POOL_SIZE", 10)
