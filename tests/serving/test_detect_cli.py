@@ -165,6 +165,19 @@ def test_an_exif_rotation_that_is_not_applied_is_told(
     assert "EXIF" not in capsys.readouterr().err
 
 
+def test_frames_that_show_more_than_the_model_is_shown_are_told(
+    models_dir: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = tmp_path / "camera.json"
+    for focal_px in (100.0, 900.0):
+        matrix = [[focal_px, 0, 159.5], [0, focal_px, 119.5], [0, 0, 1]]
+        camera.write_text(json.dumps({"camera_matrix": matrix}))
+        detect(models_dir / "pinhole", frames, camera=camera, out=tmp_path / "out", overwrite=True)
+        told = capsys.readouterr().err
+        wide = f"6 images show more than the model's camera saw in training (first: {frames}/000000.png): the middle"
+        assert (wide in told) == (focal_px == 100), told
+
+
 def test_a_model_that_exhausts_memory_is_refused(frames: Path, tmp_path: Path, spot_onnx: Callable[..., Any]) -> None:
     """Its graph fills 6 GiB before the first image; a check in another process with limits finds that out."""
     model = spot_onnx(False)

@@ -269,7 +269,7 @@ class RunConfig:
     seed: int = 0
     """Seed of the initial weights and every random draw."""
     minutes: float | None = None
-    """Budget of training time, in minutes."""
+    """Budget of training time, in minutes; templates that are drawn before the first step count, too."""
     images: int | None = None
     """Budget of images shown. Where both budgets are given the first to be reached ends the run."""
     stop_below: float = 0.0

@@ -26,6 +26,7 @@ from curio_serve.imaging.camera_files import CameraFile
 from curio_serve.imaging.image_header import Header
 from curio_serve.imaging.overlay import draw
 from curio_serve.imaging.silhouette import Surface
+from curio_serve.imaging.view import searched_fraction
 from curio_serve.models.detector import Detector
 from curio_serve.models.model import Model, canonical_camera
 from curio_serve.tracking.stream import FollowingStream
@@ -114,20 +115,22 @@ class Estimator(ABC):
     def result(self, image: SourceImage, data: bytes, seen: Seen) -> ImageResult:
         """The result of an image for the result file."""
         has_rotation = image.pixels is None and images.open_header(data).orientation > 1
+        camera = seen.camera
         return ImageResult(
             image.name,
             self.name,
             self.version,
             seen.width,
             seen.height,
-            () if seen.camera is None else seen.camera.matrix.ravel().tolist(),
+            () if camera is None else camera.matrix.ravel().tolist(),
             seen.results,
             seen.decode_ms,
             seen.inference_ms,
             is_turned=has_rotation and not self.settings.apply_exif_rotation,
             recorded=image.recorded,
-            distortion=() if seen.camera is None else seen.camera.distortion,
+            distortion=() if camera is None else camera.distortion,
             exif_rotation=has_rotation and self.settings.apply_exif_rotation,
+            searched=1.0 if camera is None else searched_fraction(camera, self.canonical, seen.width, seen.height),
         )
 
     def failed(self, image: SourceImage, exc: Exception) -> ImageResult:

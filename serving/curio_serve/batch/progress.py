@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from curio_serve.batch.progress_bar import Bar
 
 _NUM_PROBLEMS_SHOWN = 20
+_WHOLE = 0.9  # of a frame: less is told
 
 
 class Progress:
@@ -27,6 +28,7 @@ class Progress:
         self._num_new = 0
         self._num_errors = num_errors_before
         self._num_turned, self._first_turned = 0, ""
+        self._num_wide, self._first_wide, self._least_searched = 0, "", 1.0
         self._problems: list[str] = []
         self._start_s = time.perf_counter()
 
@@ -43,6 +45,9 @@ class Progress:
         if lines.is_turned:
             self._first_turned = self._first_turned or lines.image
             self._num_turned += 1
+        if lines.searched < _WHOLE:
+            self._first_wide = self._first_wide or lines.image
+            self._num_wide, self._least_searched = self._num_wide + 1, min(self._least_searched, lines.searched)
         if lines.error:
             self._num_errors += 1
             if len(self._problems) < _NUM_PROBLEMS_SHOWN:
@@ -65,6 +70,13 @@ class Progress:
                 f"{_counted(self._num_turned)} {have} an EXIF rotation that was not applied (first: "
                 f"{self._first_turned}); viewers turn pictures by it, K is taken to be of the stored pixels. With "
                 "--exif-rotation pixels are turned, and K with them"
+            )
+        if self._num_wide:
+            show = "shows" if self._num_wide == 1 else "show"
+            _say(
+                f"{_counted(self._num_wide)} {show} more than the model's camera saw in training (first: "
+                f"{self._first_wide}): the middle alone was searched, {self._least_searched:.0%} of the frame. Train "
+                "with this camera, or cut frames into overlapping parts, with cx and cy moved alike"
             )
         if self._num_errors:
             have = "has" if self._num_errors == 1 else "have"

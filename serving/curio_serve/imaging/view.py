@@ -35,6 +35,7 @@ from curio_serve.imaging.rotation import smallest_rotation
 
 Array = np.ndarray
 _MIN_RAY_DEPTH = 0.05  # cosine to the optical axis: 87 degrees
+_GRID = 20  # places along each side of a frame at which it is asked what a model sees of it
 _MAX_WARPS = 32  # where a camera distorts, each holds two numbers a pixel
 
 
@@ -169,6 +170,25 @@ def _canonical_warp(
         return _CanonicalWarp(rotation, maps=maps)
     homography = matrix @ rotation.T @ canonical.inverse
     return _CanonicalWarp(rotation, None if _is_identity(homography, pixels_size, size) else homography)
+
+
+@lru_cache(_MAX_WARPS)
+def searched_fraction(camera: PinholeCamera, canonical: CanonicalCamera, width: int, height: int) -> float:
+    """The part of a whole frame that a model is shown, 0 to 1; of a frame that shows more than K*, the middle.
+
+    Args:
+        camera: Of the frame.
+        canonical: Of the model; with K*.
+        width: Of the frame, pixels.
+        height: Of the frame, pixels.
+    """
+    canonical_from_cam = smallest_rotation(camera.ray((width - 1) / 2, (height - 1) / 2), canonical.rays[:, 0])
+    places = (np.arange(_GRID) + 0.5) / _GRID
+    rays = np.array([camera.ray(x * width - 0.5, y * height - 0.5) for x in places for y in places])
+    found = rays @ (np.asarray(canonical.matrix) @ canonical_from_cam).T
+    pixels = found[:, :2] / found[:, 2:] + 0.5
+    is_seen = (found[:, 2] > 0) & ((pixels > 0) & (pixels < (canonical.width, canonical.height))).all(axis=1)
+    return float(is_seen.mean())
 
 
 def undistort(pixels: Array, camera: PinholeCamera) -> Array:

@@ -58,7 +58,8 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
             _refuse_unlearnable(config, options.plane)
         from curio_train.doctor.examine import refuse_unfit
 
-        for doubt in refuse_unfit(options, self_training=config.recipe.self_training > 0):
+        learns = config.recipe.self_training > 0 and (config.terms.sleep or config.terms.renders_predictions)
+        for doubt in refuse_unfit(options, self_training=learns):
             warn(doubt)
         options = _with_sha256(_with_judged(_with_paint(options, report), config.init))
         return replace(config, world=options, network=_usual_network(config, options))
@@ -72,6 +73,12 @@ def _without_training(config: RunConfig, warn: Callable[[str], None]) -> None:
     for flag in ("minutes", "images"):
         if (given := getattr(config, flag)) is not None:
             warn(f"--{flag} {given} has no effect with --method templates, which trains nothing")
+    options = config.world
+    if isinstance(options, CaptureOptions) and len(options.mesh) > 1:
+        raise UsageError(
+            f"--method templates reads one part, found {len(options.mesh)} --mesh; leave out --method, which trains what "
+            "finds several parts and reads them by templates, or give one mesh"
+        )
 
 
 def _refuse_unlearnable(config: RunConfig, plane: Path) -> None:

@@ -86,6 +86,10 @@ def _calibrate(command: CalibrateCommand) -> int:
 
         return scale_by_objects(structure, models, data, report)
 
+    if command.objects is not None:
+        from curio_train.evaluation.unlabelled.scene_scale import check_objects
+
+        check_objects(command.objects, command.data)
     print(run(command, by_objects))
     return 0
 

@@ -10,7 +10,12 @@ from torch import Tensor, nn
 
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.two_stage.network import TwoStageNetwork
-from curio_train.refinement.photographed_confidence import calibrate_by, calibrate_by_agreement, read_by_others
+from curio_train.refinement.photographed_confidence import (
+    calibrate_by,
+    calibrate_by_agreement,
+    calibrate_parts_by_agreement,
+    read_by_others,
+)
 from curio_train.refinement.pseudo_labels import PseudoLabels
 from curio_train.refinement.scene_labels import SceneLabels
 from curio_train.scene_code import SceneCode
@@ -93,6 +98,9 @@ class SelfTraining:
             if isinstance(world, TwoStageWorld) and world.aligns_outlines:
                 assert isinstance(network, TwoStageNetwork)
                 calibrate_by_agreement(network, world)
+            elif isinstance(world, SeveralObjectsWorld) and world.aligns_outlines:
+                assert isinstance(network, ObjectsNetwork)
+                calibrate_parts_by_agreement(network, world)
         network.to(self._device)
 
     def mix_in(self, code: SceneCode, images: Tensor, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:

@@ -20,7 +20,7 @@ from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.progress import reporting
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress, TrainState
-from curio_train.learning.trainer import Trainer
+from curio_train.learning.trainer import Trainer, check_rendered_stages
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.templates.quick_trunk import quicken
 from curio_train.networks.two_stage.network import TwoStageNetwork
@@ -108,6 +108,7 @@ def learn(
     with ranks(device) as here, ExitStack() as own:
         # World and first network come first, so that an error in either leaves no run folder behind.
         world = build(config.world)
+        check_rendered_stages(config, world)
         if config.init is not None and not resume:
             begin_with(TrainState(config, world, torch.device("cpu")), config.init)
         training_images = _training_images(config, world, cache)

@@ -32,12 +32,14 @@ _NUM_PAIRS = 8
 _NUM_WARM_UP = 32
 
 
-def _check_rendered_stages(config: RunConfig, world: World) -> None:
+def check_rendered_stages(config: RunConfig, world: World) -> None:
     """Refuse detectors in stages whose answers are no poses yet, because an image loss could not teach them.
 
     Raises:
         UsageError: Its poses are those of templates, or its first stage is not trained.
     """
+    if not (isinstance(world, StagedWorld) and config.terms.renders_predictions):
+        return
     if not isinstance(world, TwoStageWorld):
         raise UsageError(
             f"--method {config.method} teaches how poses are read, and a detector for several objects reads them by "
@@ -85,8 +87,7 @@ class Trainer:
         Raises:
             UsageError: The method cannot train this world, or its network.
         """
-        if isinstance(world, StagedWorld) and config.terms.renders_predictions:
-            _check_rendered_stages(config, world)
+        check_rendered_stages(config, world)
         self.config, self.world, self.ranks = config, world, ranks
         self.state = TrainState(config, world, ranks.device)
         self._optimizers = [learner.optimizer for learner in self.state.learners.values()]  # before time is taken

@@ -19,20 +19,24 @@ from curio_train.worlds.single_object.crop_pose_loss import SYMMETRY_STEP
 from curio_train.worlds.single_object.world import Object
 
 NUM_READS = 5
-"""Reads of each photograph."""
+"""Reads of each photograph by a trained network."""
+
+NUM_READS_BY_TEMPLATES = 2
+"""Reads of each photograph by templates, whose poses are spread more: of five, all agree in too few photographs."""
 
 _NEAR = 0.05  # diameters, of ADD(-S) to the mean
 _NUM_POINTS = 500  # vertices that ADD is measured at, about
 
 
-def all_agree(reads: Reads, one: Object) -> Bool[np.ndarray, " photographs"]:
+def all_agree(reads: Reads, one: Object, slot: int = 0) -> Bool[np.ndarray, " photographs"]:
     """Whether ADD(-S) of each read of a photograph to their mean is below a twentieth of the diameter.
 
     Args:
         reads: Of every photograph.
-        one: The object, in the first slot.
+        one: The object.
+        slot: Of the object.
     """
-    read, num = poses(reads.code), int(reads.photograph.max()) + 1
+    read, num = poses(reads.code, slot), int(reads.photograph.max()) + 1
     points = one.mesh.vertices_m[:: max(1, len(one.mesh.vertices_m) // _NUM_POINTS)]
     symmetries = np.stack([pose.rotation for pose in symmetry_poses(one.kind.info, SYMMETRY_STEP)])
 

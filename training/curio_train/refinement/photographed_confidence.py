@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
 
 from curio_train.data.photographs import read_frames, spread
 from curio_train.geometry import Pose
@@ -13,17 +14,19 @@ from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.two_stage.network import TwoStageNetwork
-from curio_train.refinement.agreeing_reads import NUM_READS, all_agree
+from curio_train.refinement.agreeing_reads import NUM_READS, NUM_READS_BY_TEMPLATES, all_agree
 from curio_train.refinement.scene_labels import SceneLabels, read_often
 from curio_train.scene_code import poses
 from curio_train.templates.photographed import learn_appearance
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
+from curio_train.worlds.single_object.world import Object
 
 _NUM_POINTS = 500  # vertices that ADD is measured at, about
 _FEWEST = 8  # correct poses, and wrong ones, that a calibration needs
 _READ_AT_ONCE = 2
-_NUM_READ, _FEWEST_READ = 100, 20  # photographs of one object; each takes a third of a second
+_NUM_READ, _FEWEST_READ = 100, 20  # photographs of own parts; each takes a third of a second
+_CERTAIN = 20.0  # a logit whose probability is 1
 
 
 class Evidence(NamedTuple):
@@ -95,19 +98,65 @@ def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld) -> No
     Raises:
         DataError: A photograph cannot be read, or is not of the camera's size.
     """
-    paths = spread(world.photographs.paths(), _NUM_READ) if world.photographs is not None else []
-    if len(paths) < _FEWEST_READ:
+    frames = _frames(world, world.object)
+    if frames is None or world.camera.matrix is None:
         return
-    assert world.camera.matrix is not None
-    frames = torch.from_numpy(read_frames(paths, world.object.camera, world.camera.width, world.camera.height))
     reads = read_often(frames, world.camera.matrix, network, VIRTUAL_CAMERAS[:NUM_READS])
-    agrees = all_agree(reads, world.object).tolist()
     found = [network.uncalibrated(some.float() / 255)[1] for some in frames.split(_READ_AT_ONCE)]
     features = torch.cat([of_some.pose_correct for of_some in found]).numpy()
+    network.rightness.copy_(_share(features, all_agree(reads, world.object)))
+
+
+@torch.no_grad()
+def calibrate_parts_by_agreement(network: ObjectsNetwork, world: SeveralObjectsWorld) -> None:
+    """Make the confidence of each part the share of photographs of which both reads agree, in place.
+
+    Templates of a plain part match photographs half as well as renderings, so that renderings teach that a part with
+    such scores is absent (docs/experiments/captures.md). Photographs therefore tell both at once here: that a part is
+    there, and that its pose is correct. A part that few photographs show, or that is seldom read alike, stays as
+    renderings calibrate it.
+
+    Args:
+        network: Calibrated on renderings; with fewer than twenty photographs it stays as it is.
+        world: Its photographs show the parts.
+
+    Raises:
+        DataError: A photograph cannot be read, or is not of the camera's size.
+    """
+    frames = _frames(world, world.members[0])
+    if frames is None or world.camera.matrix is None:
+        return
+    reads = read_often(frames, world.camera.matrix, network, VIRTUAL_CAMERAS[:NUM_READS_BY_TEMPLATES])
+    features = torch.cat([network.read(some.float() / 255)[1].right for some in frames.split(_READ_AT_ONCE)]).numpy()
+    reader = network.reader
+    for slot, member in enumerate(world.members):
+        agrees = all_agree(reads, member, slot)
+        if agrees.sum() >= _FEWEST_READ:
+            reader.pose_correct[slot] = _share(features[:, slot], agrees)
+            reader.presence[slot] = torch.tensor([0.0, 0.0, _CERTAIN])
+
+
+def _frames(world: TwoStageWorld | SeveralObjectsWorld, one: Object) -> UInt8[Tensor, "num 3 height width"] | None:
+    """Photographs that tell how often reads agree, or None if there are too few.
+
+    Args:
+        world: With photographs, or without.
+        one: Of its objects; its camera is that of all.
+    """
+    paths = spread(world.photographs.paths(), _NUM_READ) if world.photographs is not None else []
+    if len(paths) < _FEWEST_READ:
+        return None
+    return torch.from_numpy(read_frames(paths, one.camera, world.camera.width, world.camera.height))
+
+
+def _share(
+    features: Float[np.ndarray, "photographs size"], agrees: Bool[np.ndarray, " photographs"]
+) -> Float[Tensor, "size+1"]:
+    """Weights of the logit of how often reads of photographs with like features agree."""
     mean = features.mean(axis=0)
     # One right and one wrong answer more (Laplace's rule): that all agree does not make them certain.
-    weights = fit_calibration(np.vstack([features, mean, mean]), [*agrees, True, False])
-    network.rightness.copy_(torch.tensor(weights))
+    weights = fit_calibration(np.vstack([features, mean, mean]), [*agrees.tolist(), True, False])
+    return torch.tensor(weights).float()
 
 
 def _correct(

@@ -57,6 +57,9 @@ class ImageResult:
     """OpenCV's coefficients that were used with K; empty if none were."""
     exif_rotation: bool = False
     """The pixels were rotated as EXIF asks; size, K and distortion are of the frame after that."""
+    searched: float = 1.0
+    """Fraction of the frame that the model was shown: of a frame that shows more than the model's camera, the middle.
+    """
 
     @property
     def detections(self) -> list[Detection]:
@@ -80,6 +83,8 @@ class ImageLines:
     """The lines, each with its newline."""
     is_turned: bool = False
     """EXIF asks for a rotation that was not applied."""
+    searched: float = 1.0
+    """Fraction of the frame that models were shown, the smallest one."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +118,9 @@ class ResultFormat(ABC):
     def lines(self, results: Sequence[ImageResult]) -> ImageLines:
         """Format the lines of an image, those of one model after those of another."""
         errors = dict.fromkeys(result.error for result in results if result.error)
-        is_turned = any(result.is_turned for result in results)
-        return ImageLines(results[0].image, "; ".join(errors), b"".join(map(self.encode, results)), is_turned)
+        is_turned, searched = any(result.is_turned for result in results), min(result.searched for result in results)
+        data = b"".join(map(self.encode, results))
+        return ImageLines(results[0].image, "; ".join(errors), data, is_turned, searched)
 
     @abstractmethod
     def encode(self, result: ImageResult) -> bytes:

@@ -55,6 +55,8 @@ def candidates(folder: Path, flag: str = "--runs", *, of_any_method: bool = True
         CheckpointError: A run is damaged or has no checkpoint.
         ExportError: A model is damaged.
     """
+    if not folder.exists():
+        raise UsageError(f"{flag} {folder}: no such folder; expected runs or models of linemod there")
     found = list(_found(folder))
     if not found:
         raise UsageError(f"{flag} {folder}: found no run folder and no model of linemod; expected one a class")

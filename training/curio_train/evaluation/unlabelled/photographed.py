@@ -213,16 +213,16 @@ def _verdict(fraction: float, overlaps: float, num: int, second: bool) -> str:
     if fraction >= _DOUBTFUL and overlaps < _LEAST_OVERLAP:
         return (
             f"Trust it with care: {found}, which is little; look whether parts are drawn the right way up (--up) and "
-            "in their size (--mesh-unit), and train longer (--images) or with --method sleep."
+            "in their size (--mesh-unit), and train longer (--images), with --method sleep if it was another."
         )
     if fraction >= _TRUSTED:
         return f"Trust it: {found}."
     if fraction >= _DOUBTFUL:
-        advice = "look at the worst scenes, and train longer (--images) or with --method sleep"
+        advice = "look at the worst scenes, and train longer (--images), with --method sleep if it was another"
         return f"Trust it with care: {found}; {advice}."
     return (
-        f"Do not trust it: {found}. Train longer (--images) or with --method sleep; if that does not help, look "
-        "whether --plane, --mesh-unit and --up fit: parts that are drawn beside themselves in the second view do not "
+        f"Do not trust it: {found}. Train longer (--images), with --method sleep if it was another; if that does not "
+        "help, look whether --plane, --mesh-unit and --up fit: parts that are drawn beside themselves in the second view do not "
         "stand where the plane is."
     )
 
@@ -236,7 +236,8 @@ def _verdict_in_space(fraction: float, num: int, has_background_image: bool, num
     if not has_background_image:
         limits += "; --background tells right from wrong better"
     advice = (
-        "train longer (--method sleep, --images), or tell the network more (--upright, narrower --near-m and --far-m)"
+        "train longer (--images), with --method sleep if it was another, or tell the network more where that was not "
+        "done (--upright, narrower --near-m and --far-m)"
     )
     if fraction >= _TRUSTED:
         text = f"Trust it: {found}; {limits}."

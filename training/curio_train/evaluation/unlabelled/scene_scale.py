@@ -30,6 +30,22 @@ MOST_PHOTOGRAPHS = 100
 _SAME_CAMERA = 0.01  # of the focal length, and of it for the centre
 
 
+def check_objects(models: Path, data: Path | None) -> None:
+    """Find out before minutes are spent on a structure whether :func:`scale_by_objects` can use models and data.
+
+    Args:
+        models: A run or a model of LineMOD objects, or a folder with one of each object.
+        data: Data folder of exported models.
+
+    Raises:
+        UsageError: No model there, or two of one object.
+        ExportError: A model is broken.
+        DataError: The data cannot be read.
+    """
+    first, *_ = candidates(models, "--objects", of_any_method=False)
+    load_subject(first.path, data)
+
+
 def scale_by_objects(
     structure: Structure, models: Path, data: Path | None, report: Callable[[str], None]
 ) -> tuple[Structure, str]:

@@ -53,6 +53,7 @@ class Reporter:
         self._counts: Counter[str] = Counter()
         self._since = (progress.step, progress.images, progress.seconds)
         self._logged_at = progress.seconds
+        self._first = (0.0, 0.0)  # fraction of the budget and seconds after the first step
         quoted = shlex.quote(str(run))
         viewed = "" if is_flat else f"curio-view {quoted}, or "
         console.print(f"{run}: to watch it learn: {viewed}tensorboard --logdir {quoted}", soft_wrap=True, markup=False)
@@ -73,6 +74,8 @@ class Reporter:
             losses: By name.
             spent: Fraction of the budget after the step.
         """
+        if self._first == (0.0, 0.0):
+            self._first = (spent, self._progress.seconds)
         self._sums.update(losses)
         self._counts.update(losses.keys())
         if self._progress.step - self._since[0] >= _STEPS_A_LINE:
@@ -131,7 +134,9 @@ class Reporter:
 
     def _show(self, text: str, spent: float) -> None:
         seconds = self._progress.seconds
-        text = f"{_clock(seconds * max(0.0, 1 / spent - 1))} left  {text}"
+        # Since the first step: what was drawn before it takes as long for any budget.
+        spent_since, seconds_since = spent - self._first[0], seconds - self._first[1]
+        text = f"{_clock(seconds_since * max(0.0, 1 - spent) / max(spent_since, 1e-9))} left  {text}"
         if self._bar is not None:
             self._bar.update(self._task, completed=min(spent, 1.0), description=text)
         elif seconds - self._logged_at >= _SECONDS_A_LINE:

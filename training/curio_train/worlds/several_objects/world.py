@@ -24,6 +24,8 @@ class SeveralObjectsWorld(ObjectScenes):
 
     photographs: TrainingPhotographs | None
     """Photographs of a scene with the objects; None: there are none."""
+    aligns_outlines: bool
+    """Whether poses are aligned with the objects' outlines in the end."""
 
     def __init__(
         self,
@@ -46,7 +48,7 @@ class SeveralObjectsWorld(ObjectScenes):
         layout = pose_layout(position_field(members[0]), confidence=True, num_slots=len(members))
         super().__init__(name, members, frame_camera(members[0].camera), layout)
         self.photographs, self._model_name = photographs, model_name or name
-        self._aligns_outlines = aligns_outlines
+        self.aligns_outlines = aligns_outlines
         self._stage = LocatorStage(members, self.camera)
 
     @property
@@ -69,7 +71,7 @@ class SeveralObjectsWorld(ObjectScenes):
         (locator,) = networks
         assert isinstance(locator, LocatorNetwork)
         geometries = [template_geometry(self.camera, member) for member in self.members]
-        return ObjectsNetwork(locator, geometries, aligns_outlines=self._aligns_outlines)
+        return ObjectsNetwork(locator, geometries, aligns_outlines=self.aligns_outlines)
 
     def calibrate_confidence(self, network: nn.Module, cache: Path) -> None:
         """Calibrate the network's confidence on renderings that it was not trained with."""
