@@ -327,12 +327,17 @@ def test_a_model_of_another_mesh(files: Files, size: float, fault: str, state: s
     assert (finding.fault, finding.state) == (fault, state)
 
 
-def test_a_model_of_another_camera(files: Files) -> None:
+@pytest.mark.parametrize(
+    ("factor", "text"), [(3.0, "fills the middle 33%"), (0.8, "the middle 80% of a frame's width is searched")]
+)
+def test_a_model_of_another_camera(files: Files, factor: float, text: str) -> None:
     mesh = load_mesh(files.mesh, "mm")
     export(files.folder / "model.onnx", mesh.sha256, mesh.diameter_m)
-    write_camera(files.camera, [[560, 0, 81], [0, 560, 58], [0, 0, 1]])
+    focal_px = factor * np.asarray(K)[0, 0]
+    write_camera(files.camera, [[focal_px, 0, 81], [0, focal_px, 58], [0, 0, 1]])
     (finding,) = alarms(replace(files.subjects(), model=files.folder / "model.onnx"))
     assert finding.fault == "other view"
+    assert text in str(finding)
 
 
 @pytest.mark.parametrize("name", ["mesh", "camera", "photos", "background", "model"])

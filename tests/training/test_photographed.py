@@ -1,15 +1,21 @@
-"""Templates learn how an object looks from photographs whose poses are known."""
+"""Templates learn how an object looks from photographs whose poses are known, and these calibrate confidence."""
 
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
 import numpy as np
 import onnxruntime
 import pytest
 import torch
+from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS
 from curio_train.camera import Intrinsics
 from curio_train.config import NetworkConfig
 from curio_train.data.backgrounds import ClutterBackgrounds
+from curio_train.data.photographs import UnlabelledPhotographs
 from curio_train.export.onnx import Tracing, to_onnx
 from curio_train.export.stages import tracing_of
-from curio_train.geometry import Pose
+from curio_train.geometry import Pose, rotation_6d_from_matrix
 from curio_train.meshes.shapes import chair
 from curio_train.networks import outline_alignment
 from curio_train.networks.crop_camera import cut_crops
@@ -21,14 +27,21 @@ from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS, NUM_VIEWS
 from curio_train.networks.templates.reader import PoseReader
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
-from curio_train.refinement.photographed_confidence import Evidence, calibrate_by, read_by_others
+from curio_train.refinement.agreeing_reads import NUM_READS_BY_TEMPLATES
+from curio_train.refinement.photographed_confidence import (
+    Evidence,
+    calibrate_by,
+    calibrate_parts_by_agreement,
+    read_by_others,
+)
 from curio_train.refinement.scene_labels import SceneLabels
-from curio_train.scene_code import poses
+from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, poses
 from curio_train.templates.outline import outlines
 from curio_train.templates.photographed import learn_appearance
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.world import Object
+from scipy.spatial.transform import Rotation
 
 K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
 MESH = chair(0.2)
@@ -199,3 +212,57 @@ def test_confidence_is_calibrated_by_photographs_that_agree_and_templates_stay(w
     weights = network.reader.pose_correct.numpy()
     logits = (features * weights[:, :3]).sum(axis=2) + weights[:, 3]
     assert ((logits > 0) == right).mean() > 0.85
+
+
+@torch.no_grad()
+def test_a_part_that_is_read_alike_often_is_calibrated_by_it(world: SeveralObjectsWorld, tmp_path: Path) -> None:
+    """Both reads of the first part agree in three of four photographs, those of the second one in none."""
+    paths = [tmp_path / f"{number:02}.png" for number in range(28)]
+    for number, path in enumerate(paths):
+        cv2.imwrite(str(path), np.full((480, 640, 3), 9 * number, np.uint8))
+    network = with_random_templates(world)
+    network.look_less()
+    before = {name: value.clone() for name, value in network.reader.state_dict().items()}
+    random, count = np.random.default_rng(1), 0
+
+    def read(_network: object, _images: object, _output: object) -> dict[str, torch.Tensor]:
+        nonlocal count
+        number, virtual = count // NUM_READS_BY_TEMPLATES, VIRTUAL_CAMERAS[count % NUM_READS_BY_TEMPLATES]
+        count += 1
+        turned = Rotation.from_matrix(virtual.virtual_from_cam)
+        rotations = [Rotation.random(random_state=random) if number % 4 == 0 else turned, Rotation.random(random_state=random)]
+        matrices = torch.from_numpy(np.stack([rotation.as_matrix() for rotation in rotations])).float()
+        return {
+            ROTATION_6D: rotation_6d_from_matrix(matrices)[None],
+            TRANSLATION: torch.tensor([0.0, 0.0, 0.8 / virtual.zoom]).expand(1, 2, 3),
+            CONFIDENCE: torch.full((1, 2, 1), 0.5),
+        }
+
+    hook = network.register_forward_hook(read)
+    photographed = SeveralObjectsWorld("capture", world.members, _Photographs(paths), aligns_outlines=True)
+    calibrate_parts_by_agreement(network, photographed)
+    hook.remove()
+    after = network.reader.state_dict()
+    for name in ("pose_correct", "presence"):
+        assert torch.equal(after[name][1], before[name][1]), "what is never read alike stays as it was"
+    frames = torch.stack([torch.full((3, 480, 640), 9 * number / 255) for number in range(0, 28, 3)])
+    confidence = torch.cat([network(frame[None])[CONFIDENCE] for frame in frames])
+    assert abs(float(confidence[:, 0].mean()) - (0.75 * 28 + 1) / 30) < 0.05
+    untouched = {name: value for name, value in after.items() if name not in ("pose_correct", "presence")}
+    assert all(torch.equal(value, before[name]) for name, value in untouched.items())
+
+
+class _Photographs:
+    """Photographs that nothing learns from."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths = paths
+
+    def paths(self) -> Sequence[Path]:
+        return self._paths
+
+    def unlabelled_paths(self) -> Sequence[Path]:
+        return []
+
+    def unlabelled(self) -> UnlabelledPhotographs:
+        return UnlabelledPhotographs([])

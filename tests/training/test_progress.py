@@ -17,12 +17,14 @@ def test_how_to_watch_names_what_can_show_the_world(tmp_path: Path, is_flat: boo
     assert f"to watch it learn: {viewed}tensorboard --logdir {tmp_path}\n" in screen.getvalue()
 
 
-def test_eighty_columns_show_a_bar_and_the_time_left(tmp_path: Path) -> None:
-    screen, progress = io.StringIO(), TrainingProgress()
+@pytest.mark.parametrize("drawing_s", [0.0, 100.0])
+def test_eighty_columns_show_a_bar_and_the_time_left(tmp_path: Path, drawing_s: float) -> None:
+    """Templates that were drawn before the first step are not drawn again."""
+    screen, progress = io.StringIO(), TrainingProgress(seconds=drawing_s)
     console = Console(file=screen, width=80, force_terminal=True, color_system=None)
     reporter = Reporter(tmp_path, progress, console, is_flat=False)
     for number in range(20):
-        progress.step, progress.images, progress.seconds = number + 1, 64 * (number + 1), 0.5 * (number + 1)
+        progress.step, progress.images, progress.seconds = number + 1, 64 * (number + 1), drawing_s + 0.5 * (number + 1)
         losses = {"sleep, localisation": 7.25, "sleep, crop pose": 14.5}
         reporter.step(losses, (number + 1) / 40)
     reporter.close()

@@ -40,6 +40,16 @@ def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, 
     return int(exit_.value.code or 0), captured.out, captured.err
 
 
+def test_models_that_are_not_there_are_told_before_photographs_are_matched(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "photos").mkdir()  # has none, which the matching would say
+    flags = ["--images", tmp_path / "photos", "--camera", "camera.json", "--views-out", tmp_path / "views.json"]
+    status, _, errors = call(capsys, *flags, "--objects", tmp_path / "nowhere")
+    assert status == 2
+    assert f"--objects {tmp_path}/nowhere: no such folder; expected runs or models of linemod there" in errors
+
+
 @pytest.mark.skipif("CURIO_DATA" not in os.environ, reason="CURIO_DATA is unset: no real data here")
 def test_real_frames_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By the shipped ape alone, against the labels: as far as an object moved before the camera is known of both."""

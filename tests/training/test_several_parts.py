@@ -15,6 +15,8 @@ from curio_train.config import Recipe, RunConfig
 from curio_train.data import backgrounds
 from curio_train.errors import UsageError
 from curio_train.evaluation.unlabelled.photographed import judge
+from curio_train.learning.runs.interruption import Interruption
+from curio_train.learning.session import learn
 from curio_train.scene_code import COLOR, CONFIDENCE
 from curio_train.templates.build import template_network
 from curio_train.worlds import build
@@ -110,14 +112,25 @@ def test_calls_that_contradict_themselves_are_refused(folder: Path, tmp_path: Pa
         template_network(build(options(folder)))
     warnings: list[str] = []
     without = RunConfig(options(folder), method="templates", minutes=3.0, recipe=replace(Recipe(), self_training=0.0))
+    with pytest.raises(UsageError, match="--method templates reads one part, found 2 --mesh; leave out --method"):
+        prepared(without, tmp_path, print, print)
+    without = replace(without, world=options(folder, mesh=(folder / "red.ply",)), recipe=Recipe())
     prepared(without, tmp_path, warnings.append, print)
     assert "--minutes 3.0 has no effect with --method templates, which trains nothing" in warnings
+    assert not any("below" in warning for warning in warnings), "templates learn from no photograph, so few are enough"
     with pytest.raises(UsageError, match=r"--init .* has no effect with --method templates"):
         prepared(replace(without, init=tmp_path), tmp_path, print, print)
     with pytest.raises(UsageError, match="--class ape,can,ape: found a class twice"):
         LinemodOptions("ape,can,ape")
     with pytest.raises(UsageError, match="goes on in its own folder; leave out --out"):
         Session(out=tmp_path / "a", resume=tmp_path / "b")
+
+
+def test_a_method_that_cannot_train_them_leaves_no_run(folder: Path, tmp_path: Path) -> None:
+    config = RunConfig(options(folder), method="our")
+    with pytest.raises(UsageError, match="reads them by templates: use --method sleep"):
+        learn(config, tmp_path / "run", Interruption(), resume=False, cache=tmp_path)
+    assert not (tmp_path / "run").exists()
 
 
 def test_the_command_trains_a_locator(folder: Path) -> None:

@@ -14,7 +14,7 @@ from curio_train.exported_model import ExportedModel, find_model
 from curio_train.meshes.meshes import METRES, Mesh
 
 _SAME_SIZE = 0.01
-_OTHER_VIEW = 2.0
+_WIDER, _NARROWER = 0.9, 2.0  # focal length over the model's, for images of one width
 
 
 def examine_model(path: Path, mesh: Mesh | None, camera: Intrinsics | None) -> Iterator[Finding]:
@@ -55,8 +55,12 @@ def _other_view(spec: ModelSpec, camera: Intrinsics) -> Iterator[Finding]:
     """Any K can be warped to the model's, but what lies outside the model's view is not seen."""
     own = np.array(spec.camera.camera_matrix).reshape(3, 3)[0, 0] / spec.camera.width
     ratio = camera.matrix[0, 0] / camera.width / own
-    if not 1 / _OTHER_VIEW <= ratio <= _OTHER_VIEW:
-        wider = "wider" if ratio < 1 else "narrower"
-        text = f"the camera's view is much {wider} than the model's own ({ratio:.2g} of its focal length)"
-        remedy = "Objects will be seen at other sizes than in training: train with this camera"
+    told = f"than the model's own ({ratio:.2g} of its focal length)"
+    if ratio < _WIDER:
+        text = f"the camera's view is wider {told}: the middle {ratio:.0%} of a frame's width is searched"
+        remedy = "Train with this camera, or search the rest as regions"
+        yield Finding("model camera", "warning", text, remedy, "possible", fault="other view")
+    if ratio > _NARROWER:
+        text = f"the camera's view is much narrower {told}: a frame fills the middle {1 / ratio:.0%} of its images"
+        remedy = "Train with this camera, for the distances at which it sees the objects"
         yield Finding("model camera", "warning", text, remedy, "possible", fault="other view")
