@@ -230,7 +230,8 @@ def test_a_part_that_is_read_alike_often_is_calibrated_by_it(world: SeveralObjec
         number, virtual = count // NUM_READS_BY_TEMPLATES, VIRTUAL_CAMERAS[count % NUM_READS_BY_TEMPLATES]
         count += 1
         turned = Rotation.from_matrix(virtual.virtual_from_cam)
-        rotations = [Rotation.random(random_state=random) if number % 4 == 0 else turned, Rotation.random(random_state=random)]
+        wrong = Rotation.random(2, random_state=random)
+        rotations = [wrong[0] if number % 4 == 0 else turned, wrong[1]]
         matrices = torch.from_numpy(np.stack([rotation.as_matrix() for rotation in rotations])).float()
         return {
             ROTATION_6D: rotation_6d_from_matrix(matrices)[None],

@@ -76,8 +76,8 @@ def _without_training(config: RunConfig, warn: Callable[[str], None]) -> None:
     options = config.world
     if isinstance(options, CaptureOptions) and len(options.mesh) > 1:
         raise UsageError(
-            f"--method templates reads one part, found {len(options.mesh)} --mesh; leave out --method, which trains what "
-            "finds several parts and reads them by templates, or give one mesh"
+            f"--method templates reads one part, found {len(options.mesh)} --mesh; leave out --method, which trains "
+            "what finds several parts and reads them by templates, or give one mesh"
         )
 
 

@@ -158,8 +158,8 @@ def numerically_stable(graph: Graph, images: Tensor) -> Bool[Tensor, "batch slot
     if stable.float().mean() < _LEAST_STABLE:
         raise ExportError(
             f"{int((~stable).sum())} of the network's {stable.numel()} answers to check images change with the images' "
-            "last digits or are not finite; nothing was written. Training has diverged, or hardly begun: then go on with "
-            "it, by curio-train with --resume and more --images or --minutes"
+            "last digits or are not finite; nothing was written. Training has diverged, or hardly begun: then go on "
+            "with it, by curio-train with --resume and more --images or --minutes"
         )
     return stable
 

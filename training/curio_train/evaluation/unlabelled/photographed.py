@@ -222,8 +222,8 @@ def _verdict(fraction: float, overlaps: float, num: int, second: bool) -> str:
         return f"Trust it with care: {found}; {advice}."
     return (
         f"Do not trust it: {found}. Train longer (--images), with --method sleep if it was another; if that does not "
-        "help, look whether --plane, --mesh-unit and --up fit: parts that are drawn beside themselves in the second view do not "
-        "stand where the plane is."
+        "help, look whether --plane, --mesh-unit and --up fit: parts that are drawn beside themselves in the second "
+        "view do not stand where the plane is."
     )
 
 

@@ -229,9 +229,7 @@ class TabletopWorld(MeshWorld):
         if split != "train":
             return super().source(split, seed, with_code=with_code, cache=cache)
         if with_code:
-            raise UsageError(
-                "photographs have no labels; expected --split test or validation, which are rendered"
-            )
+            raise UsageError("photographs have no labels; expected --split test or validation, which are rendered")
         photographs = self.photographs
         return StoredImages(photographs.training, None, seed=seed, shuffle=True, backgrounds=photographs.backgrounds)
 
