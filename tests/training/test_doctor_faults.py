@@ -8,16 +8,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnx
 import pytest
 import trimesh
-from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec
 from curio_train.camera import load_intrinsics
 from curio_train.data.photographs import FEWEST_TO_LEARN_FROM, NUM_JUDGED
 from curio_train.doctor.examine import Subjects, examine_files
 from curio_train.doctor.finding import Finding
-from curio_train.export.onnx import put_spec
-from curio_train.meshes.meshes import load_mesh
 from curio_train.worlds.base import Camera
 from curio_train.worlds.capture import CapturePhotographs
 from PIL import Image
@@ -285,59 +281,6 @@ def test_a_plate_of_another_size_than_the_camera(files: Files) -> None:
     (finding,) = alarms(subjects)
     assert (finding.fault, finding.state) == ("background size", "bad")
     assert f"has 100x{HEIGHT} pixels, the camera file is for {WIDTH}x{HEIGHT}" in finding.text
-
-
-# Faults of a model beside mesh and camera.
-
-
-def export(path: Path, sha256: str, diameter_m: float) -> None:
-    """An ONNX file that says it was trained for such a mesh, and for the good camera."""
-    make, tensor = onnx.helper.make_node, onnx.helper.make_tensor_value_info
-    nodes = [
-        make("Cast", ["image"], ["values"], to=onnx.TensorProto.FLOAT),
-        make("ReduceMean", ["values"], ["mean"], axes=[1, 2], keepdims=0),
-        make("Unsqueeze", ["mean", "one"], ["translation_m"]),
-    ]
-    image = tensor("image", onnx.TensorProto.UINT8, ["batch", HEIGHT, WIDTH, 3])
-    output = tensor("translation_m", onnx.TensorProto.FLOAT, ["batch", 1, 3])
-    one = onnx.helper.make_tensor("one", onnx.TensorProto.INT64, [1], [1])
-    graph = onnx.helper.make_graph(nodes, "mean colour", [image], [output], [one])
-    model = onnx.helper.make_model(graph, ir_version=9, opset_imports=[onnx.helper.make_opsetid("", 17)])
-    spec = ModelSpec(schema_version=1, name="part", world="linemod", num_slots=1)
-    spec.fields.add(name="translation_m", size=3, per_object=True)
-    spec.objects.add(name="part", slots=[0], mesh_sha256=sha256, diameter_m=diameter_m)
-    spec.camera.MergeFrom(CanonicalCamera(width=WIDTH, height=HEIGHT, camera_matrix=np.ravel(K).tolist()))
-    put_spec(model, spec)
-    onnx.save(model, str(path))
-
-
-def test_the_models_own_mesh_and_camera_are_good(files: Files) -> None:
-    mesh = load_mesh(files.mesh, "mm")
-    export(files.folder / "model.onnx", mesh.sha256, mesh.diameter_m)
-    assert alarms(replace(files.subjects(), model=files.folder / "model.onnx")) == []
-
-
-@pytest.mark.parametrize(
-    ("size", "fault", "state"),
-    [(1.0, "other mesh", "warning"), (1.7, "other mesh", "bad"), (1000.0, "mesh unit", "bad")],
-)
-def test_a_model_of_another_mesh(files: Files, size: float, fault: str, state: str) -> None:
-    export(files.folder / "model.onnx", "0" * 64, load_mesh(files.mesh, "mm").diameter_m * size)
-    (finding,) = alarms(replace(files.subjects(), model=files.folder / "model.onnx"))
-    assert (finding.fault, finding.state) == (fault, state)
-
-
-@pytest.mark.parametrize(
-    ("factor", "text"), [(3.0, "fills the middle 33%"), (0.8, "the middle 80% of a frame's width is searched")]
-)
-def test_a_model_of_another_camera(files: Files, factor: float, text: str) -> None:
-    mesh = load_mesh(files.mesh, "mm")
-    export(files.folder / "model.onnx", mesh.sha256, mesh.diameter_m)
-    focal_px = factor * np.asarray(K)[0, 0]
-    write_camera(files.camera, [[focal_px, 0, 81], [0, focal_px, 58], [0, 0, 1]])
-    (finding,) = alarms(replace(files.subjects(), model=files.folder / "model.onnx"))
-    assert finding.fault == "other view"
-    assert text in str(finding)
 
 
 @pytest.mark.parametrize("name", ["mesh", "camera", "photos", "background", "model"])
