@@ -16,6 +16,7 @@ from curio_train.data.photographs import UnlabelledPhotographs
 from curio_train.export.onnx import Tracing, to_onnx
 from curio_train.export.stages import tracing_of
 from curio_train.geometry import Pose, rotation_6d_from_matrix
+from curio_train.learning.self_training import SelfTraining
 from curio_train.meshes.shapes import chair
 from curio_train.networks import outline_alignment
 from curio_train.networks.crop_camera import cut_crops
@@ -31,7 +32,6 @@ from curio_train.refinement.agreeing_reads import NUM_READS_BY_TEMPLATES
 from curio_train.refinement.photographed_confidence import (
     Evidence,
     calibrate_by,
-    calibrate_parts_by_agreement,
     read_by_others,
 )
 from curio_train.refinement.scene_labels import SceneLabels
@@ -39,6 +39,7 @@ from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, poses
 from curio_train.templates.outline import outlines
 from curio_train.templates.photographed import learn_appearance
 from curio_train.worlds.base import ObjectKind
+from curio_train.worlds.several_objects import confidence as confidence_of_several
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.world import Object
 from scipy.spatial.transform import Rotation
@@ -215,8 +216,11 @@ def test_confidence_is_calibrated_by_photographs_that_agree_and_templates_stay(w
 
 
 @torch.no_grad()
-def test_a_part_that_is_read_alike_often_is_calibrated_by_it(world: SeveralObjectsWorld, tmp_path: Path) -> None:
+def test_a_part_that_is_read_alike_often_is_calibrated_by_it(
+    world: SeveralObjectsWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Both reads of the first part agree in three of four photographs, those of the second one in none."""
+    monkeypatch.setattr(confidence_of_several, "NUM_FRAMES", 6)
     paths = [tmp_path / f"{number:02}.png" for number in range(28)]
     for number, path in enumerate(paths):
         cv2.imwrite(str(path), np.full((480, 640, 3), 9 * number, np.uint8))
@@ -241,11 +245,12 @@ def test_a_part_that_is_read_alike_often_is_calibrated_by_it(world: SeveralObjec
 
     hook = network.register_forward_hook(read)
     photographed = SeveralObjectsWorld("capture", world.members, _Photographs(paths), aligns_outlines=True)
-    calibrate_parts_by_agreement(network, photographed)
+    SelfTraining(network, photographed, 0.0, torch.device("cpu")).finish(tmp_path)
     hook.remove()
     after = network.reader.state_dict()
-    for name in ("pose_correct", "presence"):
-        assert torch.equal(after[name][1], before[name][1]), "what is never read alike stays as it was"
+    certain = after["presence"][0]
+    assert certain.tolist() == [0, 0, 20]
+    assert not torch.equal(after["presence"][1], certain), "of what is never read alike renderings tell the presence"
     frames = torch.stack([torch.full((3, 480, 640), 9 * number / 255) for number in range(0, 28, 3)])
     confidence = torch.cat([network(frame[None])[CONFIDENCE] for frame in frames])
     assert abs(float(confidence[:, 0].mean()) - (0.75 * 28 + 1) / 30) < 0.05

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from curio_train.camera import Intrinsics
 from curio_train.capture.structure import Structure
 from curio_train.commands import train as train_command
 from curio_train.data.bop import BopDataset
@@ -28,9 +27,8 @@ def test_two_networks_of_one_object_are_refused(tmp_path: Path) -> None:
     """Neither is to count silently, and nothing is read before."""
     for name in ("first", "second"):
         (tmp_path / name).symlink_to(MODELS / "ape")
-    nothing = Structure((), np.zeros((0, 4, 4)), Intrinsics(np.eye(3), 640, 480), np.zeros((0, 3)), 0.5)
     with pytest.raises(UsageError, match=r"^--objects .*: found first and second, both ape; expected one of each"):
-        scale_by_objects(nothing, tmp_path, None, pytest.fail)
+        scale_by_objects(tmp_path, None, None, pytest.fail)
 
 
 def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, str]:
@@ -44,10 +42,13 @@ def test_models_that_are_not_there_are_told_before_photographs_are_matched(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "photos").mkdir()  # has none, which the matching would say
-    flags = ["--images", tmp_path / "photos", "--camera", "camera.json", "--views-out", tmp_path / "views.json"]
-    status, _, errors = call(capsys, *flags, "--objects", tmp_path / "nowhere")
+    flags = ["--images", tmp_path / "photos", "--views-out", tmp_path / "views.json", "--objects", tmp_path / "nowhere"]
+    status, _, errors = call(capsys, *flags)
     assert status == 2
     assert f"--objects {tmp_path}/nowhere: no such folder; expected runs or models of linemod there" in errors
+    status, _, errors = call(capsys, *flags, "--distance-m", 1)
+    assert status == 2
+    assert "both say how large the scene is; leave one out" in errors, "what contradicts itself comes first"
 
 
 @pytest.mark.skipif("CURIO_DATA" not in os.environ, reason="CURIO_DATA is unset: no real data here")
@@ -86,11 +87,11 @@ def test_what_tells_no_scale_is_said(tmp_path: Path) -> None:
     still = Structure(photographs, np.tile(np.eye(4), (3, 1, 1)), camera, np.zeros((1, 3)), 0.5)
     told: list[str] = []
     with pytest.raises(UsageError, match=str(tmp_path)):
-        scale_by_objects(still, tmp_path, data, told.append)
+        scale_by_objects(tmp_path, data, None, told.append)
     (tmp_path / "lmo").symlink_to(MODELS / "lmo-fast")
     with pytest.raises(DataError, match=r"none of the objects .*--distance-m"):
-        scale_by_objects(still, tmp_path, data, told.append)
+        scale_by_objects(tmp_path, data, camera, told.append)(still)
     assert told == [f"{name}: seen too seldom to tell" for name in BopDataset(data).classes], "all that one model finds"
-    longer = replace(still, camera=replace(camera, matrix=camera.matrix * [[1.2], [1.2], [1]]))
+    longer = replace(camera, matrix=camera.matrix * [[1.2], [1.2], [1]])
     with pytest.raises(UsageError, match=r"focal length of 572\.4 pixels, but --camera has 686\.9"):
-        scale_by_objects(longer, tmp_path, data, told.append)
+        scale_by_objects(tmp_path, data, longer, told.append)

@@ -121,7 +121,7 @@ def test_a_reader_that_leaves_early_is_no_crash() -> None:
         (["circles", "--labels", "0.1"], 2, "--labels 0.1 with --method our, which uses none; expected --method super"),
         (["circles", "--minutes", "-1"], 2, "--minutes is -1.0, expected more than 0"),
         (["circles", "--batch-size", "100"], 2, "cannot be cut into micro-batches of 64"),
-        (["circles", "--batch-size", "1"], 2, "cannot be cut into micro-batches of 1;"),
+        (["circles", "--batch-size", "1"], 2, "--batch-size is 1, expected 2 or more"),
         (["circles", "--resume", "nowhere"], 1, "nowhere is no run folder: cannot read nowhere/config.json"),
         (["circles", "--resume"], 2, "--resume"),
         (["linemod"], 2, "--class"),

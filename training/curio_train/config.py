@@ -217,12 +217,15 @@ class Recipe:
             raise UsageError(f"--sleep-drawn {self.sleep_drawn} is no fraction, expected 0 to 1")
         if not 0 <= self.self_training < 1:
             raise UsageError(f"--self-training {self.self_training}: expected 0 or more, and less than 1")
+        if self.batch_size < 2 or self.micro_batch_size < 2:
+            least = "--batch-size" if self.batch_size < 2 else "--micro-batch-size"
+            raise UsageError(f"{least} is 1, expected 2 or more, because batch norm needs two images")
         if self.batch_size < self.micro_batch_size:  # --batch-size alone is given below the preset's micro-batch
             object.__setattr__(self, "micro_batch_size", self.batch_size)
-        if self.batch_size % self.micro_batch_size or self.micro_batch_size < 2:
+        if self.batch_size % self.micro_batch_size:
             raise UsageError(
                 f"--batch-size {self.batch_size} cannot be cut into micro-batches of {self.micro_batch_size}; "
-                "expected --micro-batch-size to divide it and be at least 2, because batch norm needs two images"
+                "expected --micro-batch-size to divide it"
             )
 
 

@@ -5,12 +5,12 @@ import time
 from typing import TYPE_CHECKING, Self
 
 from curio_serve.batch.results.formats import ImageLines
+from curio_serve.imaging.view import MOSTLY_SEARCHED
 
 if TYPE_CHECKING:
     from curio_serve.batch.progress_bar import Bar
 
 _NUM_PROBLEMS_SHOWN = 20
-_WHOLE = 0.9  # of a frame: less is told
 
 
 class Progress:
@@ -45,7 +45,7 @@ class Progress:
         if lines.is_turned:
             self._first_turned = self._first_turned or lines.image
             self._num_turned += 1
-        if lines.searched < _WHOLE:
+        if lines.searched < MOSTLY_SEARCHED:
             self._first_wide = self._first_wide or lines.image
             self._num_wide, self._least_searched = self._num_wide + 1, min(self._least_searched, lines.searched)
         if lines.error:
@@ -76,7 +76,7 @@ class Progress:
             _say(
                 f"{_counted(self._num_wide)} {show} more than the model's camera saw in training (first: "
                 f"{self._first_wide}): the middle alone was searched, {self._least_searched:.0%} of the frame. Train "
-                "with this camera, or cut frames into overlapping parts, with cx and cy moved alike"
+                "with this camera, or ask curio-serve about regions of the frames"
             )
         if self._num_errors:
             have = "has" if self._num_errors == 1 else "have"

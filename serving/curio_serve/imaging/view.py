@@ -33,9 +33,12 @@ from curio_serve.errors import CameraError
 from curio_serve.imaging.camera import PinholeCamera, scaling
 from curio_serve.imaging.rotation import smallest_rotation
 
+MOSTLY_SEARCHED = 0.9
+"""Fraction of a frame; users are told where a model sees less of it."""
+
 Array = np.ndarray
 _MIN_RAY_DEPTH = 0.05  # cosine to the optical axis: 87 degrees
-_GRID = 20  # places along each side of a frame at which it is asked what a model sees of it
+_GRID = 100  # places along each side of a frame at which it is asked what a model sees of it
 _MAX_WARPS = 32  # where a camera distorts, each holds two numbers a pixel
 
 
@@ -184,7 +187,10 @@ def searched_fraction(camera: PinholeCamera, canonical: CanonicalCamera, width: 
     """
     canonical_from_cam = smallest_rotation(camera.ray((width - 1) / 2, (height - 1) / 2), canonical.rays[:, 0])
     places = (np.arange(_GRID) + 0.5) / _GRID
-    rays = np.array([camera.ray(x * width - 0.5, y * height - 0.5) for x in places for y in places])
+    columns, rows = np.meshgrid(places * width - 0.5, places * height - 0.5)
+    grid = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+    slopes = cv2.undistortPoints(grid, camera.matrix, camera.coefficients)[:, 0]
+    rays = np.column_stack([slopes, np.ones(len(slopes))])
     found = rays @ (np.asarray(canonical.matrix) @ canonical_from_cam).T
     pixels = found[:, :2] / found[:, 2:] + 0.5
     is_seen = (found[:, 2] > 0) & ((pixels > 0) & (pixels < (canonical.width, canonical.height))).all(axis=1)

@@ -29,9 +29,9 @@ _NEEDED = {
 }
 """Flags that have no effect without another one."""
 
-ByObjects = Callable[[Structure, Path, Path | None], tuple[Structure, str]]
-"""Brings a structure to metres by models of objects (their folder, their data), and says how; networks are none of this
-module's business."""
+ByObjects = Callable[[Path, Path | None, Intrinsics | None], Callable[[Structure], tuple[Structure, str]]]
+"""Loads models of objects (their folder, their data, the camera if it is known), and returns what brings a structure to
+metres by them and says how; networks are none of this module's business."""
 
 
 def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
@@ -101,6 +101,7 @@ def _reading(given: Board, found: Board) -> str:
 
 def _from_scene(command: CalibrateCommand, by_objects: ByObjects) -> str:
     known = None if command.camera is None else load_intrinsics(command.camera)
+    scale = None if command.objects is None else by_objects(command.objects, command.data, known)
     given = every_nth(Photographs(command.images).paths, command.every)
     found = recover(given, known)
     missing = [path.name for path in given if path not in found.photographs]
@@ -117,8 +118,8 @@ def _from_scene(command: CalibrateCommand, by_objects: ByObjects) -> str:
         world = to_world(found)
         if command.distance_m is not None:
             world = scale_by_distance(world, 0, len(world.photographs) - 1, command.distance_m)
-        elif command.objects is not None:
-            world, line = by_objects(world, command.objects, command.data)
+        elif scale is not None:
+            world, line = scale(world)
             lines.append(line)
         in_metres = command.distance_m is not None or command.objects is not None
         _save_views(command.views_out, world, "m" if in_metres else None)

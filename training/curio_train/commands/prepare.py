@@ -74,10 +74,10 @@ def _without_training(config: RunConfig, warn: Callable[[str], None]) -> None:
         if (given := getattr(config, flag)) is not None:
             warn(f"--{flag} {given} has no effect with --method templates, which trains nothing")
     options = config.world
-    if isinstance(options, CaptureOptions) and len(options.mesh) > 1:
+    if isinstance(options, CaptureOptions) and options.names_several:
         raise UsageError(
-            f"--method templates reads one part, found {len(options.mesh)} --mesh; leave out --method, which trains "
-            "what finds several parts and reads them by templates, or give one mesh"
+            f"--method templates reads one part, found {len(options.mesh)} --mesh; leave out --method: the default "
+            "finds several parts and reads them by templates; or give one mesh"
         )
 
 
@@ -85,8 +85,8 @@ def _refuse_unlearnable(config: RunConfig, plane: Path) -> None:
     """Refuse what learning from photographs of a plane has no use for."""
     if config.terms.label:
         raise UsageError(
-            f"--method {config.method}: it learns from true poses, and photographs have none; leave it out, or "
-            "expected --method sleep, our or noncur"
+            f"--method {config.method}: it learns from true poses, and photographs have none; leave it out, or give "
+            "--method sleep, our or noncur"
         )
     if config.recipe.self_training:
         raise UsageError(

@@ -28,6 +28,7 @@ from curio_train.worlds import WORLDS
 from curio_train.worlds.options import LOCATOR_RECIPE, CaptureOptions, LinemodOptions
 
 if TYPE_CHECKING:
+    from curio_train.camera import Intrinsics
     from curio_train.capture.structure import Structure
     from curio_train.export.ahead import TracingAhead
 
@@ -81,15 +82,13 @@ def train(arguments: Sequence[str] | None = None) -> None:
 def _calibrate(command: CalibrateCommand) -> int:
     from curio_train.commands.calibrate import run
 
-    def by_objects(structure: "Structure", models: Path, data: Path | None) -> "tuple[Structure, str]":
+    def by_objects(
+        models: Path, data: Path | None, camera: "Intrinsics | None"
+    ) -> "Callable[[Structure], tuple[Structure, str]]":
         from curio_train.evaluation.unlabelled.scene_scale import scale_by_objects
 
-        return scale_by_objects(structure, models, data, report)
+        return scale_by_objects(models, data, camera, report)
 
-    if command.objects is not None:
-        from curio_train.evaluation.unlabelled.scene_scale import check_objects
-
-        check_objects(command.objects, command.data)
     print(run(command, by_objects))
     return 0
 

@@ -5,6 +5,9 @@ from pathlib import Path
 
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ModelSpec
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.imaging.view import MOSTLY_SEARCHED, searched_fraction
+from curio_serve.models.model import canonical_camera
 
 from curio_train.camera import Intrinsics
 from curio_train.doctor.finding import Finding
@@ -14,7 +17,7 @@ from curio_train.exported_model import ExportedModel, find_model
 from curio_train.meshes.meshes import METRES, Mesh
 
 _SAME_SIZE = 0.01
-_WIDER, _NARROWER = 0.9, 2.0  # focal length over the model's, for images of one width
+_NARROWER = 2.0  # focal length over the model's, for images of one width
 
 
 def examine_model(path: Path, mesh: Mesh | None, camera: Intrinsics | None) -> Iterator[Finding]:
@@ -56,9 +59,11 @@ def _other_view(spec: ModelSpec, camera: Intrinsics) -> Iterator[Finding]:
     own = np.array(spec.camera.camera_matrix).reshape(3, 3)[0, 0] / spec.camera.width
     ratio = camera.matrix[0, 0] / camera.width / own
     told = f"than the model's own ({ratio:.2g} of its focal length)"
-    if ratio < _WIDER:
-        text = f"the camera's view is wider {told}: the middle {ratio:.0%} of a frame's width is searched"
-        remedy = "Train with this camera, or search the rest as regions"
+    view = canonical_camera(spec, spec.name)
+    searched = searched_fraction(PinholeCamera(camera.matrix), view, camera.width, camera.height)
+    if searched < MOSTLY_SEARCHED:
+        text = f"the camera's view is wider {told}: {searched:.0%} of a frame, its middle, are searched"
+        remedy = "Train with this camera, or ask curio-serve about regions of the frames"
         yield Finding("model camera", "warning", text, remedy, "possible", fault="other view")
     if ratio > _NARROWER:
         text = f"the camera's view is much narrower {told}: a frame fills the middle {1 / ratio:.0%} of its images"

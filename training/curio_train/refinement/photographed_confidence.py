@@ -25,7 +25,7 @@ from curio_train.worlds.single_object.world import Object
 _NUM_POINTS = 500  # vertices that ADD is measured at, about
 _FEWEST = 8  # correct poses, and wrong ones, that a calibration needs
 _READ_AT_ONCE = 2
-_NUM_READ, _FEWEST_READ = 100, 20  # photographs of own parts; each takes a third of a second
+_NUM_READ, _FEWEST_READ = 100, 20  # photographs; each takes a third of a second for one part, twice as long for two
 _CERTAIN = 20.0  # a logit whose probability is 1
 
 
@@ -99,8 +99,9 @@ def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld) -> No
         DataError: A photograph cannot be read, or is not of the camera's size.
     """
     frames = _frames(world, world.object)
-    if frames is None or world.camera.matrix is None:
+    if frames is None:
         return
+    assert world.camera.matrix is not None
     reads = read_often(frames, world.camera.matrix, network, VIRTUAL_CAMERAS[:NUM_READS])
     found = [network.uncalibrated(some.float() / 255)[1] for some in frames.split(_READ_AT_ONCE)]
     features = torch.cat([of_some.pose_correct for of_some in found]).numpy()
@@ -124,8 +125,9 @@ def calibrate_parts_by_agreement(network: ObjectsNetwork, world: SeveralObjectsW
         DataError: A photograph cannot be read, or is not of the camera's size.
     """
     frames = _frames(world, world.members[0])
-    if frames is None or world.camera.matrix is None:
+    if frames is None:
         return
+    assert world.camera.matrix is not None
     reads = read_often(frames, world.camera.matrix, network, VIRTUAL_CAMERAS[:NUM_READS_BY_TEMPLATES])
     features = torch.cat([network.read(some.float() / 255)[1].right for some in frames.split(_READ_AT_ONCE)]).numpy()
     reader = network.reader

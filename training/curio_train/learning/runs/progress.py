@@ -53,7 +53,7 @@ class Reporter:
         self._counts: Counter[str] = Counter()
         self._since = (progress.step, progress.images, progress.seconds)
         self._logged_at = progress.seconds
-        self._first = (0.0, 0.0)  # fraction of the budget and seconds after the first step
+        self._first: tuple[float, float] | None = None  # fraction of the budget and seconds after the first step
         quoted = shlex.quote(str(run))
         viewed = "" if is_flat else f"curio-view {quoted}, or "
         console.print(f"{run}: to watch it learn: {viewed}tensorboard --logdir {quoted}", soft_wrap=True, markup=False)
@@ -74,7 +74,7 @@ class Reporter:
             losses: By name.
             spent: Fraction of the budget after the step.
         """
-        if self._first == (0.0, 0.0):
+        if self._first is None:
             self._first = (spent, self._progress.seconds)
         self._sums.update(losses)
         self._counts.update(losses.keys())
@@ -135,8 +135,9 @@ class Reporter:
     def _show(self, text: str, spent: float) -> None:
         seconds = self._progress.seconds
         # Since the first step: what was drawn before it takes as long for any budget.
-        spent_since, seconds_since = spent - self._first[0], seconds - self._first[1]
-        text = f"{_clock(seconds_since * max(0.0, 1 - spent) / max(spent_since, 1e-9))} left  {text}"
+        first_spent, first_seconds = self._first or (0.0, 0.0)
+        rate = max(spent - first_spent, 1e-9) / max(seconds - first_seconds, 1e-9)
+        text = f"{_clock(max(0.0, 1 - spent) / rate)} left  {text}"
         if self._bar is not None:
             self._bar.update(self._task, completed=min(spent, 1.0), description=text)
         elif seconds - self._logged_at >= _SECONDS_A_LINE:
