@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from curio_train.camera import Intrinsics
 from curio_train.capture.structure import Structure
 from curio_train.commands import train as train_command
 from curio_train.data.bop import BopDataset
@@ -28,7 +29,7 @@ def test_two_networks_of_one_object_are_refused(tmp_path: Path) -> None:
     for name in ("first", "second"):
         (tmp_path / name).symlink_to(MODELS / "ape")
     with pytest.raises(UsageError, match=r"^--objects .*: found first and second, both ape; expected one of each"):
-        scale_by_objects(tmp_path, None, None, pytest.fail)
+        scale_by_objects(tmp_path, None, Intrinsics(np.eye(3), 640, 480), pytest.fail)
 
 
 def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, str]:
@@ -42,7 +43,10 @@ def test_models_that_are_not_there_are_told_before_photographs_are_matched(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "photos").mkdir()  # has none, which the matching would say
-    flags = ["--images", tmp_path / "photos", "--views-out", tmp_path / "views.json", "--objects", tmp_path / "nowhere"]
+    camera = {"camera_matrix": [[572.4, 0, 325.3], [0, 573.6, 242], [0, 0, 1]], "width": 640, "height": 480}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    flags = ["--images", tmp_path / "photos", "--camera", tmp_path / "camera.json"]
+    flags += ["--views-out", tmp_path / "views.json", "--objects", tmp_path / "nowhere"]
     status, _, errors = call(capsys, *flags)
     assert status == 2
     assert f"--objects {tmp_path}/nowhere: no such folder; expected runs or models of linemod there" in errors
@@ -87,7 +91,7 @@ def test_what_tells_no_scale_is_said(tmp_path: Path) -> None:
     still = Structure(photographs, np.tile(np.eye(4), (3, 1, 1)), camera, np.zeros((1, 3)), 0.5)
     told: list[str] = []
     with pytest.raises(UsageError, match=str(tmp_path)):
-        scale_by_objects(tmp_path, data, None, told.append)
+        scale_by_objects(tmp_path, data, camera, told.append)
     (tmp_path / "lmo").symlink_to(MODELS / "lmo-fast")
     with pytest.raises(DataError, match=r"none of the objects .*--distance-m"):
         scale_by_objects(tmp_path, data, camera, told.append)(still)

@@ -29,8 +29,8 @@ _NEEDED = {
 }
 """Flags that have no effect without another one."""
 
-ByObjects = Callable[[Path, Path | None, Intrinsics | None], Callable[[Structure], tuple[Structure, str]]]
-"""Loads models of objects (their folder, their data, the camera if it is known), and returns what brings a structure to
+ByObjects = Callable[[Path, Path | None, Intrinsics], Callable[[Structure], tuple[Structure, str]]]
+"""Loads models of objects (their folder, their data, the photographs' camera), and returns what brings a structure to
 metres by them and says how; networks are none of this module's business."""
 
 
@@ -101,7 +101,9 @@ def _reading(given: Board, found: Board) -> str:
 
 def _from_scene(command: CalibrateCommand, by_objects: ByObjects) -> str:
     known = None if command.camera is None else load_intrinsics(command.camera)
-    scale = None if command.objects is None else by_objects(command.objects, command.data, known)
+    scale = None
+    if command.objects is not None and known is not None:  # which it needs, as was checked
+        scale = by_objects(command.objects, command.data, known)
     given = every_nth(Photographs(command.images).paths, command.every)
     found = recover(given, known)
     missing = [path.name for path in given if path not in found.photographs]

@@ -83,7 +83,7 @@ def _calibrate(command: CalibrateCommand) -> int:
     from curio_train.commands.calibrate import run
 
     def by_objects(
-        models: Path, data: Path | None, camera: "Intrinsics | None"
+        models: Path, data: Path | None, camera: "Intrinsics"
     ) -> "Callable[[Structure], tuple[Structure, str]]":
         from curio_train.evaluation.unlabelled.scene_scale import scale_by_objects
 

@@ -33,7 +33,7 @@ _SAME_CAMERA = 0.01  # of the focal length, and of it for the centre
 
 
 def scale_by_objects(
-    models: Path, data: Path | None, camera: Intrinsics | None, report: Callable[[str], None]
+    models: Path, data: Path | None, camera: Intrinsics, report: Callable[[str], None]
 ) -> Callable[[Structure], tuple[Structure, str]]:
     """Get ready to scale structures to metres by the poses that trained networks predict in the photographs.
 
@@ -42,16 +42,15 @@ def scale_by_objects(
     Args:
         models: A run or a model of LineMOD objects, or a folder with one of each object.
         data: Data folder of exported models.
-        camera: Of the photographs, where it is known before the structure is.
+        camera: Of the photographs.
         report: Called with a line after each object, which takes about a minute.
 
     Returns:
         What brings a structure of any scale to metres, and says in a line how well the objects agree. It raises
-        UsageError for another camera than the networks', and DataError where a photograph cannot be read or no object
-        tells a scale.
+        DataError where a photograph cannot be read or no object tells a scale.
 
     Raises:
-        UsageError: No model there, two of one object, or one that cannot be used for this.
+        UsageError: No model there, two of one object, or one that cannot be used for this or is of another camera.
         CheckpointError: A run is damaged.
         ExportError: A model is broken.
         DataError: The data cannot be read.
@@ -62,8 +61,7 @@ def scale_by_objects(
 
     def in_metres(structure: Structure) -> tuple[Structure, str]:
         scales = {}
-        for path, subject in named.items():
-            _check_subject(path, subject, structure.camera)
+        for subject in named.values():
             for name, scale in _scales_by(subject, structure):
                 report(f"{name}: {'seen too seldom to tell' if scale is None else f'{scale:.4g} m a unit'}")
                 if scale is not None:
@@ -87,12 +85,12 @@ def mean_scale(scales: Mapping[str, float]) -> tuple[float, str]:
     return float(np.exp(logs.mean())), f"scale by each object beside their mean: {each}{error}"
 
 
-def _check_subject(path: Path, subject: Subject, camera: Intrinsics | None) -> None:
+def _check_subject(path: Path, subject: Subject, camera: Intrinsics) -> None:
     """Refuse a network that finds no objects in whole frames, or in those of another camera."""
     own = _objects(subject)[0].camera if isinstance(subject.world, TwoStageWorld | SeveralObjectsWorld) else None
     if own is None:
         raise UsageError(f"{path}: the paper's network (--one-stage), expected one that finds objects in whole frames")
-    if camera is not None and np.abs(own.matrix - camera.matrix).max() > _SAME_CAMERA * own.matrix[0, 0]:
+    if np.abs(own.matrix - camera.matrix).max() > _SAME_CAMERA * own.matrix[0, 0]:
         raise UsageError(
             f"{path}: reads frames of a camera with a focal length of {own.matrix[0, 0]:.1f} pixels, but --camera "
             f"has {camera.matrix[0, 0]:.1f}, or another centre; give the data set's camera.json"
