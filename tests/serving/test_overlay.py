@@ -103,6 +103,18 @@ def test_an_object_the_spec_does_not_know_is_still_labelled() -> None:
     assert draw(frame, [found], spec(), CAMERA).any()
 
 
+def test_labels_do_not_cover_each_other() -> None:
+    """Two detections at one place: the surer one's label stays where it is alone, and the other one's is below it."""
+    frame = np.full((480, 640, 3), 128, np.uint8)
+    alone, both = pose(TILTED, (0, 0, 0.6)), pose(TILTED, (0, 0, 0.6))
+    both.detections.add().CopyFrom(both.detections[0])
+    both.detections[1].confidence = 0.25
+    drawn = [draw(frame, [result], spec(), CAMERA) for result in (alone, both)]
+    top = np.flatnonzero((drawn[0] != frame).any(axis=(1, 2)))[0]
+    np.testing.assert_array_equal(drawn[1][top : top + 15], drawn[0][top : top + 15])
+    assert not np.array_equal(drawn[1][top + 22 : top + 35], drawn[0][top + 22 : top + 35])
+
+
 def test_a_slot_that_is_empty_to_two_digits_is_not_drawn() -> None:
     frame = np.zeros((480, 640, 3), np.uint8)
     found = pose(TILTED, (0, 0, 0.6))

@@ -15,8 +15,11 @@ from curio_train.config import Recipe, RunConfig
 from curio_train.data import backgrounds
 from curio_train.errors import UsageError
 from curio_train.evaluation.unlabelled.photographed import judge
+from curio_train.export.write_model import export
+from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.session import learn
+from curio_train.learning.state import TrainState
 from curio_train.scene_code import COLOR, CONFIDENCE
 from curio_train.templates.build import template_network
 from curio_train.worlds import build
@@ -131,6 +134,28 @@ def test_a_method_that_cannot_train_them_leaves_no_run(folder: Path, tmp_path: P
     with pytest.raises(UsageError, match="reads them by templates: use --method sleep"):
         learn(config, tmp_path / "run", Interruption(), resume=False, cache=tmp_path)
     assert not (tmp_path / "run").exists()
+
+
+def test_slots_of_a_first_network_are_of_the_same_parts(folder: Path, tmp_path: Path) -> None:
+    """Its weights would be those of the other part, without a word."""
+    before = RunConfig(options(folder), method="sleep")
+    RunFolder(tmp_path / "before", before).write_config(new=True)
+    for meshes, names in ((("red.ply", "block.stl"), "red, block"), (("red.ply",), "red")):
+        swapped = replace(before, world=options(folder, mesh=tuple(folder / mesh for mesh in meshes)))
+        swapped = replace(swapped, init=tmp_path / "before")
+        with pytest.raises(UsageError, match=f"it finds block, red, and this run is of {names}; expected as many"):
+            learn(swapped, tmp_path / "run", Interruption(), resume=False, cache=tmp_path)
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_learned_from_no_photograph_cannot_look_less(folder: Path, tmp_path: Path) -> None:
+    config = RunConfig(options(folder), method="sleep")
+    run = RunFolder(tmp_path / "run", config)
+    run.write_config(new=True)
+    run.save(TrainState(config, build(config.world), torch.device("cpu")))
+    with pytest.raises(UsageError, match="--fast is for detectors that learned from photographs"):
+        export(tmp_path / "run", tmp_path / "models", fast=True)
+    assert not (tmp_path / "models").exists()
 
 
 def test_the_command_trains_a_locator(folder: Path) -> None:

@@ -61,6 +61,7 @@ def draw(
     canvas = pixels.copy()
     objects = {kind.name: (kind, _PALETTE[i % len(_PALETTE)]) for i, kind in enumerate(spec.objects)}
     stroke_px = max(1, round(min(canvas.shape[:2]) / 240))
+    labels = list[tuple[NDArray[np.float64], str, Rgb]]()
     # the most confident last: on top
     for detection in sorted((d for result in results for d in result.detections), key=lambda d: d.confidence):
         if round(detection.confidence, 2) == 0:
@@ -75,7 +76,10 @@ def draw(
             _draw_contour(canvas, surfaces[detection.object], detection, kind, camera, color, stroke_px)
         else:
             _draw_solid(canvas, corners_px, detection, kind, camera, color, stroke_px)
-        _draw_label(canvas, corners_px, f"{detection.object}{'?' * is_unsure} {detection.confidence:.2f}", color)
+        labels.append((corners_px, f"{detection.object}{'?' * is_unsure} {detection.confidence:.2f}", color))
+    is_labelled = np.zeros(canvas.shape[:2], bool)
+    for label in reversed(labels):  # the most confident one first: others make room
+        _draw_label(canvas, *label, is_labelled)
     return canvas
 
 
@@ -206,8 +210,13 @@ def _draw_segment(
     cv2.line(canvas, fixed[0], fixed[1], ink, width, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def _draw_label(canvas: Pixels, corners_px: NDArray[np.float64], text: str, color: Rgb) -> None:
-    """Name and confidence on a dark label over the box, moved inside the frame where it would stick out."""
+def _draw_label(
+    canvas: Pixels, corners_px: NDArray[np.float64], text: str, color: Rgb, is_labelled: NDArray[np.bool_]
+) -> None:
+    """Name and confidence on a dark label over the box, moved inside the frame where it would stick out.
+
+    It is moved down where it would cover another label (``is_labelled`` [height, width]), unless there is no room.
+    """
     seen_px = corners_px[np.isfinite(corners_px).all(axis=1)]
     if not len(seen_px):
         return
@@ -217,6 +226,11 @@ def _draw_label(canvas: Pixels, corners_px: NDArray[np.float64], text: str, colo
     label_width, label_height = text_width + 8, text_height + below + 6
     left = int(np.clip(seen_px[:, 0].min(), 0, max(0, width - label_width)))
     top = int(np.clip(seen_px[:, 1].min() - label_height - 3, 0, max(0, height - label_height)))
+    for below_px in range(top, height - label_height, label_height + 1):
+        if not is_labelled[below_px : below_px + label_height, left : left + label_width].any():
+            top = below_px
+            break
+    is_labelled[top : top + label_height, left : left + label_width] = True
     label = canvas[top : top + label_height, left : left + label_width]
     label[:] = label // 4
     label[:, :3] = color

@@ -107,7 +107,7 @@ def export(
     target = ModelFolder.named(out, ModelFolder.fitting_name(world.model_name) if name is None else name)
     state = folder.trained(world)
     if fast:
-        _look_less(state.pose.network, run)
+        _look_less(state.pose.network, run, folder.config)
     trained = Graph(state.pose.network, world)
     deployed = Graph(deployable(state.pose.network, half), world)
     images = check_images(world)
@@ -183,9 +183,14 @@ def _describe(spec: ModelSpec, config: RunConfig, commit: str, progress: Trainin
     spec.images_seen, spec.training_seconds = progress.all_images, progress.all_seconds
 
 
-def _look_less(network: nn.Module, run: Path) -> None:
+def _look_less(network: nn.Module, run: Path, config: RunConfig) -> None:
     if not isinstance(network, ObjectsNetwork):
         raise UsageError(f"--fast is for detectors of several objects, and {run} is of another kind; leave it out")
+    if getattr(config.world, "photos", None) is None or not config.recipe.self_training:
+        raise UsageError(
+            f"--fast is for detectors that learned from photographs (curio-train linemod --photos), and {run} did not: "
+            "the likeliest place of an object alone, which it looks at, is too often a wrong one; leave it out"
+        )
     network.look_less()
 
 

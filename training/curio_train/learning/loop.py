@@ -26,7 +26,7 @@ def train(
     interruption: Interruption,
     reporter: Reporter | None,
     checkpoint_minutes: float,
-    finish: Callable[[], None],
+    finish: Callable[[], str],
 ) -> Outcome:
     """Train until convergence, the end of the budget, or a signal; a checkpoint is saved in each case.
 
@@ -36,7 +36,8 @@ def train(
         interruption: How signals arrive.
         reporter: Only the process that has one writes: under torchrun all have the same state.
         checkpoint_minutes: Minutes of training between checkpoints.
-        finish: Called before the last checkpoint of a run that was not interrupted, unless that was done already.
+        finish: Called before the last checkpoint of a run that was not interrupted, unless that was done already;
+            returns what the user is to know of it.
 
     Raises:
         TrainingError: The optimisation broke down; the last checkpoint is the one to go back to.
@@ -55,7 +56,9 @@ def train(
                 if outcome and outcome is not Outcome.INTERRUPTED and progress.finished_step != progress.step:
                     if reporter and config.terms.knows_codes:
                         reporter.say(f"{outcome.value}; now the confidence is calibrated, which may take minutes")
-                    finish()
+                    told = finish()
+                    if reporter and told:
+                        reporter.say(told)
                     progress.finished_step = progress.step
                 if reporter:
                     run.save(trainer.state)

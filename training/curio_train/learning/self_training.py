@@ -76,15 +76,19 @@ class SelfTraining:
         self._labels = self._labels_of_photographs() or self._labels
         self._network.train()
 
-    def finish(self, cache: Path) -> None:
+    def finish(self, cache: Path) -> str:
         """Once the network is trained, let its templates look as photographs do, and calibrate its confidence.
 
         Args:
             cache: Folder of the image sets that worlds draw once.
 
+        Returns:
+            What calibrates the confidence of parts of one's own, for the user; else nothing.
+
         Raises:
             DataError: The backgrounds cannot be read.
         """
+        told = ""
         world, network, labels = self._world, self._network.cpu(), self._labels  # as the frames that it reads here
         if isinstance(labels, SceneLabels) and isinstance(world, SeveralObjectsWorld):
             assert isinstance(network, ObjectsNetwork)
@@ -97,11 +101,12 @@ class SelfTraining:
             # Without outlines wrong reads agree as often as right ones (docs/experiments/captures.md).
             if isinstance(world, TwoStageWorld) and world.aligns_outlines:
                 assert isinstance(network, TwoStageNetwork)
-                calibrate_by_agreement(network, world)
+                told = calibrate_by_agreement(network, world)
             elif isinstance(world, SeveralObjectsWorld) and world.aligns_outlines:
                 assert isinstance(network, ObjectsNetwork)
-                calibrate_parts_by_agreement(network, world)
+                told = calibrate_parts_by_agreement(network, world)
         network.to(self._device)
+        return told
 
     def mix_in(self, code: SceneCode, images: Tensor, seed: tuple[int, ...]) -> tuple[dict[str, Tensor], Tensor]:
         """The last stage's codes and images with the first ones replaced by pseudo-labelled photographs, or crops.

@@ -15,7 +15,7 @@ from curio_train.learning.hardware import choose_threads, one_thread
 from curio_train.learning.loop import Outcome, train
 from curio_train.learning.parallel import ranks
 from curio_train.learning.runs.checkpoint import RunFolder
-from curio_train.learning.runs.initial import begin_with
+from curio_train.learning.runs.initial import begin_with, check_objects_before
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.progress import reporting
 from curio_train.learning.runs.provenance import record_session
@@ -110,6 +110,7 @@ def learn(
         world = build(config.world)
         check_rendered_stages(config, world)
         if config.init is not None and not resume:
+            check_objects_before(config.init, [kind.name for kind in world.objects])
             begin_with(TrainState(config, world, torch.device("cpu")), config.init)
         training_images = _training_images(config, world, cache)
         run = RunFolder(path, config)
@@ -140,6 +141,6 @@ def learn(
                 interruption,
                 reporter,
                 checkpoint_minutes,
-                finish=lambda: trainer.self_training.finish(cache) if config.terms.knows_codes else None,
+                finish=lambda: trainer.self_training.finish(cache) if config.terms.knows_codes else "",
             )
         return outcome, trainer.state.progress

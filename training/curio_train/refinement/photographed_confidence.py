@@ -26,6 +26,7 @@ _NUM_POINTS = 500  # vertices that ADD is measured at, about
 _FEWEST = 8  # correct poses, and wrong ones, that a calibration needs
 _READ_AT_ONCE = 2
 _NUM_READ, _FEWEST_READ = 100, 20  # photographs; each takes a third of a second for one part, twice as long for two
+_TOO_FEW = f"confidence by renderings: there are fewer than {_FEWEST_READ} photographs"
 _CERTAIN = 20.0  # a logit whose probability is 1
 
 
@@ -84,7 +85,7 @@ def calibrate_by(network: ObjectsNetwork, evidence: Evidence) -> None:
 
 
 @torch.no_grad()
-def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld) -> None:
+def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld) -> str:
     """Make the confidence of a correct pose the share of photographs of which all reads agree, in place.
 
     Renderings show clutter and parts that the frame's border cuts, which photographs of a part hardly do: calibrated by
@@ -95,21 +96,26 @@ def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld) -> No
         network: Calibrated on renderings; with fewer than twenty photographs it stays as it is.
         world: Its photographs show the object.
 
+    Returns:
+        What calibrates the confidence, for the user.
+
     Raises:
         DataError: A photograph cannot be read, or is not of the camera's size.
     """
     frames = _frames(world, world.object)
     if frames is None:
-        return
+        return _TOO_FEW
     assert world.camera.matrix is not None
     reads = read_often(frames, world.camera.matrix, network, VIRTUAL_CAMERAS[:NUM_READS])
     found = [network.uncalibrated(some.float() / 255)[1] for some in frames.split(_READ_AT_ONCE)]
     features = torch.cat([of_some.pose_correct for of_some in found]).numpy()
-    network.rightness.copy_(_share(features, all_agree(reads, world.object)))
+    agrees = all_agree(reads, world.object)
+    network.rightness.copy_(_share(features, agrees))
+    return _told(world.object, agrees)
 
 
 @torch.no_grad()
-def calibrate_parts_by_agreement(network: ObjectsNetwork, world: SeveralObjectsWorld) -> None:
+def calibrate_parts_by_agreement(network: ObjectsNetwork, world: SeveralObjectsWorld) -> str:
     """Make the confidence of each part the share of photographs of which both reads agree, in place.
 
     Templates of a plain part match photographs half as well as renderings, so that renderings teach that a part with
@@ -121,21 +127,31 @@ def calibrate_parts_by_agreement(network: ObjectsNetwork, world: SeveralObjectsW
         network: Calibrated on renderings; with fewer than twenty photographs it stays as it is.
         world: Its photographs show the parts.
 
+    Returns:
+        What calibrates the confidence of each part, for the user.
+
     Raises:
         DataError: A photograph cannot be read, or is not of the camera's size.
     """
     frames = _frames(world, world.members[0])
     if frames is None:
-        return
+        return _TOO_FEW
     assert world.camera.matrix is not None
     reads = read_often(frames, world.camera.matrix, network, VIRTUAL_CAMERAS[:NUM_READS_BY_TEMPLATES])
     features = torch.cat([network.read(some.float() / 255)[1].right for some in frames.split(_READ_AT_ONCE)]).numpy()
-    reader = network.reader
+    reader, told = network.reader, list[str]()
     for slot, member in enumerate(world.members):
         agrees = all_agree(reads, member, slot)
-        if agrees.sum() >= _FEWEST_READ:
+        is_enough = agrees.sum() >= _FEWEST_READ
+        told.append(_told(member, agrees) + ("" if is_enough else ", too few: renderings calibrate it"))
+        if is_enough:
             reader.pose_correct[slot] = _share(features[:, slot], agrees)
             reader.presence[slot] = torch.tensor([0.0, 0.0, _CERTAIN])
+    return "; ".join(told)
+
+
+def _told(one: Object, agrees: Bool[np.ndarray, " photographs"]) -> str:
+    return f"confidence of {one.kind.name} by photographs: {int(agrees.sum())} of {len(agrees)} are read alike"
 
 
 def _frames(world: TwoStageWorld | SeveralObjectsWorld, one: Object) -> UInt8[Tensor, "num 3 height width"] | None:

@@ -5,7 +5,7 @@ shares constants. So each version also stores the network as it was trained, in 
 """
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from curio_serve.files import check_regular
@@ -15,12 +15,13 @@ from torch import Tensor, nn
 
 from curio_train.config import RunConfig
 from curio_train.errors import CheckpointError, CurioError, ExportError, UsageError
-from curio_train.exported_model import WEIGHTS_FILE, find_model
+from curio_train.exported_model import WEIGHTS_FILE, ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import MAX_TENSOR_BYTES, RunFolder
 from curio_train.learning.runs.configuration import CONFIG_FILE, load_config
 from curio_train.learning.state import TrainState, under
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.two_stage.network import TwoStageNetwork
+from curio_train.worlds.options import ALL_CLASSES, CaptureOptions, LinemodOptions
 
 _IMAGES, _SECONDS, _SYNTHETIC_LABELS = "images_seen", "training_seconds", "synthetic_labels"
 _MESSAGE_LENGTH = 160
@@ -58,6 +59,42 @@ def begin_with(state: TrainState, path: Path) -> None:
             "parts on a plane with as many parts (--counts) in the same poses (--lying)"
         ) from exc
     state.progress.images_before, state.progress.seconds_before = images, seconds
+
+
+def check_objects_before(path: Path, names: Sequence[str]) -> None:
+    """Refuse a first network whose slots are of the same objects in another order, or of more or fewer objects.
+
+    Weights are taken over slot by slot, so that each object would begin as another one.
+
+    Args:
+        path: As for :func:`begin_with`.
+        names: Of the new run's objects, in their order.
+
+    Raises:
+        UsageError: The network is of such objects, or there is none.
+        CheckpointError: The run is damaged.
+        ExportError: The model is broken.
+    """
+    before = _object_names(path)
+    if not before or len(before) == len(names) == 1:
+        return
+    if len(before) != len(names) or (sorted(before) == sorted(names) and before != list(names)):
+        raise UsageError(
+            f"--init {path}: it finds {', '.join(before)}, and this run is of {', '.join(names)}; expected as many "
+            "objects, and the same ones in the same order"
+        )
+
+
+def _object_names(path: Path) -> list[str]:
+    """Names of the objects that a run or a model finds, in the order of their slots; none where it does not say."""
+    if not _is_run(path):
+        return [one.name for one in ExportedModel.open(find_model(path)).spec.objects]
+    world = load_config(path).world
+    if isinstance(world, CaptureOptions):
+        return [mesh.stem for mesh in world.mesh]
+    if isinstance(world, LinemodOptions) and world.class_name != ALL_CLASSES:
+        return world.class_name.split(",")
+    return []
 
 
 def _first_difference(exc: RuntimeError) -> str:
