@@ -1,14 +1,16 @@
 """Run folders for what comes after training, and a two-stage network at a brick."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from curio_train.camera import Intrinsics
 from curio_train.config import RunConfig, WorldOptions
 from curio_train.data.backgrounds import ClutterBackgrounds
+from curio_train.data.photographs import UnlabelledPhotographs
 from curio_train.export import graph
 from curio_train.export.write_model import Exported, export
 from curio_train.learning.runs.checkpoint import RunFolder
@@ -82,6 +84,30 @@ def small_checks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(confidence, "NUM_FRAMES", 25)
     monkeypatch.setattr(graph, "NUM_JITTERED", 2)
     monkeypatch.setattr(outline_alignment, "_REACHES_PX", (4.0,))
+
+
+class _Greys:
+    """Photographs of one grey each, darker to brighter, that nothing learns from."""
+
+    def __init__(self, folder: Path, count: int) -> None:
+        self._paths = [folder / f"{number:02}.png" for number in range(count)]
+        for number, path in enumerate(self._paths):
+            cv2.imwrite(str(path), np.full((480, 640, 3), 9 * number, np.uint8))
+
+    def paths(self) -> Sequence[Path]:
+        return self._paths
+
+    def unlabelled_paths(self) -> Sequence[Path]:
+        return []
+
+    def unlabelled(self) -> UnlabelledPhotographs:
+        return UnlabelledPhotographs([])
+
+
+@pytest.fixture
+def greys(tmp_path: Path) -> Callable[[int], _Greys]:
+    """``greys(count)``: so many photographs of 640x480 pixels; number n has the grey level 9 n."""
+    return lambda count: _Greys(tmp_path, count)
 
 
 @pytest.fixture(scope="session")

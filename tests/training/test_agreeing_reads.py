@@ -1,16 +1,14 @@
 """Reads of a photograph agree or not, and the share of photographs whose reads agree is what confidence says."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS
 from curio_train.config import RunConfig
-from curio_train.data.photographs import UnlabelledPhotographs
 from curio_train.geometry import rotation_6d_from_matrix
 from curio_train.learning.state import TrainState
 from curio_train.networks.two_stage.network import TwoStageNetwork
@@ -63,30 +61,10 @@ def test_each_photograph_is_judged_by_its_own_reads(brick: Object) -> None:
     assert all_agree(Reads(code, np.array([0, 0, 1, 1, 2, 2])), brick).tolist() == [True, False, True]
 
 
-class Greys:
-    """Photographs of the brick's camera that show nothing."""
-
-    def __init__(self, folder: Path) -> None:
-        self.num = NUM
-        self._paths = [folder / f"{number:02}.png" for number in range(NUM)]
-        for number, path in enumerate(self._paths):
-            cv2.imwrite(str(path), np.full((480, 640, 3), 5 * number, np.uint8))
-
-    def paths(self) -> Sequence[Path]:
-        return self._paths[: self.num]
-
-    def unlabelled_paths(self) -> Sequence[Path]:
-        return []
-
-    def unlabelled(self) -> UnlabelledPhotographs:
-        return UnlabelledPhotographs([])
-
-
 @torch.no_grad()
-def test_confidence_is_the_share_of_photographs_whose_reads_agree(brick: Object, tmp_path: Path) -> None:
+def test_confidence_is_the_share_of_photographs_whose_reads_agree(brick: Object, greys: Callable[[int], Any]) -> None:
     """Every fourth photograph is read in another way each time."""
-    greys = Greys(tmp_path)
-    world = TwoStageWorld("capture", brick, greys, aligns_outlines=True)
+    world = TwoStageWorld("capture", brick, greys(NUM), aligns_outlines=True)
     state = TrainState(RunConfig(LinemodOptions("ape", two_stage=True)), world, torch.device("cpu"))
     network = state.pose.network.eval()
     assert isinstance(network, TwoStageNetwork)
@@ -105,13 +83,14 @@ def test_confidence_is_the_share_of_photographs_whose_reads_agree(brick: Object,
     network.register_forward_hook(read)
     calibrate_by_agreement(network, world)
     assert count == NUM * NUM_READS
-    frames = torch.stack([torch.full((3, 480, 640), 5 * number / 255) for number in range(NUM)])
+    frames = torch.stack([torch.full((3, 480, 640), 9 * number / 255) for number in range(NUM)])
     features = torch.cat([network.uncalibrated(frame[None])[1].pose_correct for frame in frames])
     confidence = torch.sigmoid(features @ network.rightness[:1] + network.rightness[1])
     assert abs(float(confidence.mean()) - (0.75 * NUM + 1) / (NUM + 2)) < 0.03
     assert torch.equal(network.presence, presence)
 
     network.rightness.copy_(torch.tensor([0.7, 0.3]))
-    greys.num = NUM - 1
-    calibrate_by_agreement(network, world)
+    assert "fewer than 20" in calibrate_by_agreement(
+        network, TwoStageWorld("capture", brick, greys(NUM - 1), aligns_outlines=True)
+    )
     assert network.rightness.tolist() == pytest.approx([0.7, 0.3]), "too few photographs say nothing"

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 from curio_serve.batch.results.formats import ImageLines
@@ -11,6 +12,17 @@ if TYPE_CHECKING:
     from curio_serve.batch.progress_bar import Bar
 
 _NUM_PROBLEMS_SHOWN = 20
+
+
+@dataclass
+class _Some:
+    """Images that share what is told in the end."""
+
+    num: int = 0
+    first: str = ""
+
+    def add(self, image: str) -> None:
+        self.num, self.first = self.num + 1, self.first or image
 
 
 class Progress:
@@ -27,8 +39,7 @@ class Progress:
         self._num_before = num_before
         self._num_new = 0
         self._num_errors = num_errors_before
-        self._num_turned, self._first_turned = 0, ""
-        self._num_wide, self._first_wide, self._least_searched = 0, "", 1.0
+        self._turned, self._wide, self._least_searched = _Some(), _Some(), 1.0
         self._problems: list[str] = []
         self._start_s = time.perf_counter()
 
@@ -43,11 +54,10 @@ class Progress:
         """Count one more image."""
         self._num_new += 1
         if lines.is_turned:
-            self._first_turned = self._first_turned or lines.image
-            self._num_turned += 1
+            self._turned.add(lines.image)
         if lines.searched < MOSTLY_SEARCHED:
-            self._first_wide = self._first_wide or lines.image
-            self._num_wide, self._least_searched = self._num_wide + 1, min(self._least_searched, lines.searched)
+            self._wide.add(lines.image)
+            self._least_searched = min(self._least_searched, lines.searched)
         if lines.error:
             self._num_errors += 1
             if len(self._problems) < _NUM_PROBLEMS_SHOWN:
@@ -64,23 +74,20 @@ class Progress:
         )
         if self._num_before:
             _say("answers of earlier runs stay as they are, whatever flags they had; --overwrite answers all again")
-        if self._num_turned:
-            have = "has" if self._num_turned == 1 else "have"
+        if self._turned.num:
             _say(
-                f"{_counted(self._num_turned)} {have} an EXIF rotation that was not applied (first: "
-                f"{self._first_turned}); viewers turn pictures by it, K is taken to be of the stored pixels. With "
+                f"{_counted(self._turned.num, 'has', 'have')} an EXIF rotation that was not applied (first: "
+                f"{self._turned.first}); viewers turn pictures by it, K is taken to be of the stored pixels. With "
                 "--exif-rotation pixels are turned, and K with them"
             )
-        if self._num_wide:
-            show = "shows" if self._num_wide == 1 else "show"
+        if self._wide.num:
             _say(
-                f"{_counted(self._num_wide)} {show} more than the model's camera saw in training (first: "
-                f"{self._first_wide}): the middle alone was searched, {self._least_searched:.0%} of the frame. Train "
+                f"{_counted(self._wide.num, 'shows', 'show')} more than the model's camera saw in training (first: "
+                f"{self._wide.first}): the middle alone was searched, {self._least_searched:.0%} of the frame. Train "
                 "with this camera, or ask curio-serve about regions of the frames"
             )
         if self._num_errors:
-            have = "has" if self._num_errors == 1 else "have"
-            _say(f"{_counted(self._num_errors)} {have} no answer{':' if self._problems else ''}")
+            _say(f"{_counted(self._num_errors, 'has', 'have')} no answer{':' if self._problems else ''}")
         for problem in self._problems:
             print(f"  {problem}", file=sys.stderr)
         if len(self._problems) < self._num_errors and self._problems:
@@ -93,8 +100,9 @@ def _bar(num_images: int, num_errors: int) -> "Bar":
     return Bar(num_images, num_errors)
 
 
-def _counted(num_images: int) -> str:
-    return f"{num_images} image{'' if num_images == 1 else 's'}"
+def _counted(num_images: int, of_one: str = "", of_several: str = "") -> str:
+    """The number of images, and the verb that goes with it."""
+    return f"1 image {of_one}".rstrip() if num_images == 1 else f"{num_images} images {of_several}".rstrip()
 
 
 def _say(text: str) -> None:

@@ -26,7 +26,7 @@ _NUM_POINTS = 500  # vertices that ADD is measured at, about
 _FEWEST = 8  # correct poses, and wrong ones, that a calibration needs
 _READ_AT_ONCE = 2
 _NUM_READ, _FEWEST_READ = 100, 20  # photographs; each takes a third of a second for one part, twice as long for two
-_TOO_FEW = f"confidence by renderings: there are fewer than {_FEWEST_READ} photographs"
+_TOO_FEW = f"confidence is calibrated by renderings, because there are fewer than {_FEWEST_READ} photographs"
 _CERTAIN = 20.0  # a logit whose probability is 1
 
 
@@ -143,15 +143,16 @@ def calibrate_parts_by_agreement(network: ObjectsNetwork, world: SeveralObjectsW
     for slot, member in enumerate(world.members):
         agrees = all_agree(reads, member, slot)
         is_enough = agrees.sum() >= _FEWEST_READ
-        told.append(_told(member, agrees) + ("" if is_enough else ", too few: renderings calibrate it"))
+        told.append(_told(member, agrees, is_enough=bool(is_enough)))
         if is_enough:
             reader.pose_correct[slot] = _share(features[:, slot], agrees)
             reader.presence[slot] = torch.tensor([0.0, 0.0, _CERTAIN])
-    return "; ".join(told)
+    return "\n".join(told)
 
 
-def _told(one: Object, agrees: Bool[np.ndarray, " photographs"]) -> str:
-    return f"confidence of {one.kind.name} by photographs: {int(agrees.sum())} of {len(agrees)} are read alike"
+def _told(one: Object, agrees: Bool[np.ndarray, " photographs"], *, is_enough: bool = True) -> str:
+    by = "which calibrates its confidence" if is_enough else "too few, so renderings calibrate its confidence"
+    return f"{one.kind.name}: {agrees.sum()} of {len(agrees)} photographs are read alike, {by}"
 
 
 def _frames(world: TwoStageWorld | SeveralObjectsWorld, one: Object) -> UInt8[Tensor, "num 3 height width"] | None:

@@ -87,9 +87,9 @@ def mean_scale(scales: Mapping[str, float]) -> tuple[float, str]:
 
 def _check_subject(path: Path, subject: Subject, camera: Intrinsics) -> None:
     """Refuse a network that finds no objects in whole frames, or in those of another camera."""
-    own = _objects(subject)[0].camera if isinstance(subject.world, TwoStageWorld | SeveralObjectsWorld) else None
-    if own is None:
+    if not isinstance(subject.world, TwoStageWorld | SeveralObjectsWorld):
         raise UsageError(f"{path}: the paper's network (--one-stage), expected one that finds objects in whole frames")
+    own = _objects(subject)[0].camera
     if np.abs(own.matrix - camera.matrix).max() > _SAME_CAMERA * own.matrix[0, 0]:
         raise UsageError(
             f"{path}: reads frames of a camera with a focal length of {own.matrix[0, 0]:.1f} pixels, but --camera "
