@@ -9,7 +9,7 @@ the name of their topic says. Of images that come while the server answers anoth
 """
 
 import rclpy
-from curio_serve.client.client import PoseClient
+from curio_serve.client import PoseClient
 from curio_serve.errors import CurioError
 from curio_serve.imaging.camera_files import camera_of_images
 from curio_serve.imaging.image import from_raw
