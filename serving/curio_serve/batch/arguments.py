@@ -34,7 +34,8 @@ class DetectArguments:
     port: int = 8080
     """Port that --video listens on."""
     camera: Path | None = None
-    """Intrinsics: camera JSON, BOP's camera.json or scene_camera.json, OpenCV YAML. 2D worlds need none."""
+    """Camera file: camera JSON, BOP's camera.json or scene_camera.json, or YAML of OpenCV or ROS. 2D worlds need
+    none."""
     rig: Path | None = None
     """Several cameras: a file of --calibrate --rig-out. IMAGES are then a folder or video of each, in its order, and
     poses are in the rig's frame."""

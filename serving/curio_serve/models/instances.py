@@ -1,4 +1,4 @@
-"""Several instances of an object from a network that reads one pose of it an image.
+"""Several instances of an object from a network that finds one pose of it in an image.
 
 The network reads the image again with the instances covered that it found, as long as it finds another. This works with
 any exported model and costs a run an instance, and one more that finds none. An instance that stands in the box of

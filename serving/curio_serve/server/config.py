@@ -22,8 +22,8 @@ _LONGEST_S = 1e9  # thirty years; clocks hold no more
 class ServeConfig:
     """Serve exported models over gRPC.
 
-    Every flag is also an environment variable (--max-pixels is CURIO_SERVE_MAX_PIXELS) and a key of the --config file
-    (max_pixels). Flags win over the environment, the environment over the file.
+    Every flag but --config and --dump-config is also an environment variable (--max-pixels is CURIO_SERVE_MAX_PIXELS)
+    and a key of the --config file (max_pixels). Flags win over the environment, the environment over the file.
     """
 
     models: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[MODELS]")] = "models"
@@ -81,7 +81,7 @@ class ServeConfig:
     log_level: str = "info"
     """debug, info, warning or error."""
     config: Path | None = None
-    """TOML file with these settings."""
+    """TOML file with these settings; CURIO_SERVE_CONFIG may name it, too."""
     dump_config: bool = False
     """Print the settings in effect as TOML and stop."""
 

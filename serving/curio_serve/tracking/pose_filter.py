@@ -2,8 +2,9 @@
 
 Position and velocity are in the camera's frame. The rotation's error is a rotation vector in the camera's frame, small
 between frames, with its angular velocity beside it (an error-state filter, Solà 2017). The covariance of a measurement
-is the network's own spread; the filter trusts it, and is told how fast objects accelerate only while measurements agree
-with constant velocity: a surprise opens it, so that it neither trembles at rest nor lags behind a sudden movement.
+is the network's own spread. While measurements agree with constant velocity, the process noise is that of small
+accelerations, so that the pose does not tremble at rest. Where a measurement contradicts it, the filter adds process
+noise, so that the pose does not lag behind a sudden movement.
 """
 
 import numpy as np
@@ -11,10 +12,10 @@ import numpy as np
 from curio_serve.imaging.rotation import from_rotation_vector, rotation_vector
 
 Array = np.ndarray
-_ACCELERATION_M_S2, _ANGULAR_ACCELERATION_RAD_S2 = 0.06, 0.4  # standard deviations while nothing surprises
+_ACCELERATION_M_S2, _ANGULAR_ACCELERATION_RAD_S2 = 0.06, 0.4  # standard deviations, while measurements agree
 _FIRST_SPEED_M_S, _FIRST_TURN_RAD_S = 0.7, 1.5  # of an object that was just found
-_SURPRISE = 4.0  # mean squared normalised innovation above which the filter opens
-_MOST_OPEN = 1e6
+_SURPRISE = 4.0  # mean squared normalised innovation above which process noise is added
+_MOST_ADDED = 1e6  # times the process noise of a frame
 _LEAST_M, _LEAST_RAD = 0.5e-3, 0.5e-2  # standard deviations that no measurement is better than
 _DAMPING_S = 0.5  # an object that nobody sees is soon expected to stand still
 
@@ -120,7 +121,7 @@ def _corrected(
     expected = covariance[:3, :3] + noise
     surprise = float(innovation @ np.linalg.solve(expected, innovation)) / 3
     if surprise > _SURPRISE:
-        covariance = covariance + _process(seconds, acceleration) * min((surprise / _SURPRISE) ** 2 * 100, _MOST_OPEN)
+        covariance = covariance + _process(seconds, acceleration) * min((surprise / _SURPRISE) ** 2 * 100, _MOST_ADDED)
         expected = covariance[:3, :3] + noise
     gain = covariance[:, :3] @ np.linalg.inv(expected)
     kept = np.eye(6)

@@ -25,11 +25,11 @@ class CalibrateCommand:
     dictionary: str = "DICT_4X4_50"
     """OpenCV's name of the markers' dictionary."""
     camera: Path | None = None
-    """The camera, where it is known and only its places are wanted."""
+    """Camera file, where K and lens are known and only the camera's poses are wanted."""
     every: int = 1
-    """Take each so many-th photograph of a sequence."""
+    """Take every N-th photograph of a sequence."""
     distance_m: float | None = None
-    """Distance of the first and the last camera, for poses in metres."""
+    """Distance between the first and the last camera in metres; poses are then in metres, too."""
     objects: Path | None = None
     """For poses in metres, too: model or run of the LineMOD objects that the scene shows, or a folder with one of
     each."""

@@ -26,7 +26,7 @@ class DoctorCommand:
     body: str | None = None
     """Name of the one body of a STEP or IGES file to take, in its own frame; all of them, as placed, unless given."""
     camera: Path | None = None
-    """Camera JSON, or BOP's camera.json."""
+    """Camera file: camera JSON, BOP's camera.json, or YAML of OpenCV or ROS."""
     photos: Path | None = None
     """Folder of photographs, taken with that camera where one is given."""
     background: Path | None = None

@@ -27,7 +27,8 @@ class ExportCommand:
     out: Path = Path("models")
     """Folder of models; the model goes to OUT/NAME/VERSION/model.onnx."""
     name: str | None = None
-    """Name of the model; the world's name, or LineMOD's class, unless given."""
+    """Name of the model. None: the one class of LineMOD, the name of the mesh file (of several parts, all joined by -),
+    or else the world's name."""
     half: FlagCreatePairsOff[bool] = False
     """Store weights as float16: half the size, computed with in float32."""
     int8: FlagCreatePairsOff[bool] = False

@@ -31,7 +31,7 @@ class Subjects:
     body: str | None = None
     """The one body of a CAD file to look at; all unless given."""
     camera: Path | None = None
-    """Camera JSON, or BOP's ``camera.json``."""
+    """A camera file of one camera."""
     photos: Path | None = None
     """A folder of photographs, taken with that camera."""
     background: Path | None = None

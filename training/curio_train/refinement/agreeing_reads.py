@@ -33,8 +33,8 @@ def all_agree(reads: Reads, one: Object, slot: int = 0) -> Bool[np.ndarray, " ph
 
     Args:
         reads: Of every photograph.
-        one: The object.
-        slot: Of the object.
+        one: The object whose poses were read.
+        slot: Its slot in the scene codes of the reads.
     """
     read, num = poses(reads.code, slot), int(reads.photograph.max()) + 1
     points = one.mesh.vertices_m[:: max(1, len(one.mesh.vertices_m) // _NUM_POINTS)]

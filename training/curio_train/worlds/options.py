@@ -101,9 +101,9 @@ class LinemodOptions(WorldOptions):
     ] = True
     """Train the paper's network, whose one encoder sees the frame squeezed to 128x128."""
     two_stage: FlagCreatePairsOff[bool] = False
-    """Train a detector of one object that finds it in the whole frame, then regresses its pose from a crop. Methods
-    other than sleep always do. Without it a trained locator finds objects, and templates, drawn beforehand, tell their
-    poses: photographs are read better so."""
+    """Train a detector of one object that finds it in the whole frame, then regresses its pose from a crop. With one
+    class, methods other than sleep and templates do so unless --one-stage is given. Without it a trained locator finds
+    objects, and templates, drawn beforehand, tell their poses: photographs are read better so."""
     download: FlagCreatePairsOff[bool] = False
     """Without --data, fetch LineMOD's meshes and cameras from BOP's repository into --cache, once, without asking."""
 
@@ -143,7 +143,7 @@ class CaptureOptions(WorldOptions):
 
     With --calibrate: find out its camera instead. With --assistant: take its photographs with a camera on this machine.
 
-    With --plane: parts of one or more kinds, in any number, on a table or floor.
+    With --plane: parts of one or more kinds on a table or floor, as many of each as --counts says.
     """
 
     default_method: ClassVar[MethodName] = "sleep"
@@ -153,7 +153,7 @@ class CaptureOptions(WorldOptions):
     """Mesh file: STL, OBJ, PLY, GLB, glTF, OFF, STEP or IGES. Several make one detector with a slot for each, or, with
     --plane, for each kind of part."""
     camera: Path
-    """Camera file of the photographs: camera JSON, or BOP's camera.json."""
+    """Camera file of the photographs: camera JSON, BOP's camera.json, or YAML of OpenCV or ROS."""
     photos: Path
     """Folder of unlabelled photographs. They are checked against the camera, show the part's colour, and the report
     draws the estimated poses over them. Towards the end of training the network of one part learns from them, with the

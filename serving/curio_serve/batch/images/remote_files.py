@@ -87,7 +87,7 @@ class RemoteFiles:
         """The content of an object, as one request saw it: one that changes meanwhile is read as before or as after.
 
         Raises:
-            ImageError: It is missing, refused or larger, or over HTTP, its host does not answer.
+            ImageError: It is missing, refused or larger than allowed, or, over HTTP, its host does not answer.
             Unavailable: The store does not answer.
         """
         try:

@@ -24,7 +24,7 @@ FLAG = "--project"
 
 
 def with_project(arguments: list[str], paths: Collection[str]) -> list[str]:
-    """A call with the flags of its project file, if it names one, before its own: those win.
+    """Put the flags of a call's project file, if it names one, before those that were typed; what was typed wins.
 
     Args:
         arguments: As typed: the world, then flags.

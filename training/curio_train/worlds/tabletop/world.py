@@ -224,7 +224,7 @@ class TabletopWorld(MeshWorld):
         """The photographs as training split; as the other splits renderings, whose codes are known.
 
         Raises:
-            UsageError: Codes of photographs are asked for.
+            UsageError: ``with_code`` with the training split: photographs have no codes.
         """
         if split != "train":
             return super().source(split, seed, with_code=with_code, cache=cache)
