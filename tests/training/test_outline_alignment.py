@@ -236,7 +236,8 @@ def test_a_pose_that_is_not_finite_is_an_error(stage: tuple[OutlineStage, bytes,
 def test_a_note_of_tensors_that_are_not_there_is_refused(stage: tuple[OutlineStage, bytes, OutlineStageNote]) -> None:
     _, data, note = stage
     wrong = dataclasses.replace(note, tensors={**note.tensors, "crops": "image_of_nothing"})
-    with pytest.raises(ModelError, match=r"curio\.outline_stage names tensors that need .* beside image_of_nothing"):
+    expected = r"curio\.outline_stage: .* depend on .*, which is none of its inputs \(image_of_nothing"
+    with pytest.raises(ModelError, match=expected):
         OutlineStage(data, wrong, "brick.onnx", ())
 
 

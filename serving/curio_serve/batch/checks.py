@@ -108,7 +108,7 @@ def check_camera(arguments: DetectArguments, estimator: Estimator, recordings: S
     if arguments.video is not None or not all(map(names_recordings, arguments.images)):
         raise UsageError(
             f"model {estimator.name} needs the intrinsics of the camera that took the images; give --camera FILE "
-            "(camera JSON, BOP's camera.json or scene_camera.json, or OpenCV YAML)"
+            "(camera JSON, BOP's camera.json or scene_camera.json, or YAML of OpenCV or ROS)"
         )
 
 

@@ -112,6 +112,6 @@ def check_golden(path: Path, model: Model) -> None:
         if not off <= golden_tolerance(model):
             raise ModelError(
                 f"{path}: the network's {name} is {off:.3g} off for the golden image; at most "
-                f"{golden_tolerance(model):.3g} is "
-                "accepted: this file, or this machine's runtime, does not compute what was exported"
+                f"{golden_tolerance(model):.3g} is accepted: this file, or this machine's runtime, does not compute "
+                "what was exported; copy or export the model again"
             )

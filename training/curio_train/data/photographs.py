@@ -91,7 +91,9 @@ def read_photograph(path: Path) -> np.ndarray:
     if pixels is None:
         raise DataError(f"{path}: the image cannot be decoded; expected a PNG, JPEG, WebP, BMP or TIFF file")
     if path.suffix.lower() in _TIFF and pixels.ndim == 3 and pixels.shape[2] == 4 and pixels[..., 3].min() < _OPAQUE:
-        raise DataError(f"{path}: the TIFF file has transparent pixels, whose colours OpenCV darkens; save it without")
+        raise DataError(
+            f"{path}: the TIFF file has transparent pixels, whose colours OpenCV darkens; save it without transparency"
+        )
     return _to_rgb8(path, pixels)
 
 

@@ -121,7 +121,10 @@ def _cut(data: bytes, inputs: Sequence[str], outputs: Sequence[str], where: str)
         if not name or name in known:
             continue
         if name not in number_of:
-            raise ModelError(f"{where} names tensors that need {name!r} beside {', '.join(inputs)}")
+            raise ModelError(
+                f"{where}: its outputs also depend on {name!r}, which is none of its inputs ({', '.join(inputs)}); "
+                "export the model again"
+            )
         if number_of[name] not in needed:
             needed.add(number_of[name])
             pending += graph.node[number_of[name]].input
