@@ -11,8 +11,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import NoReturn, Protocol
+from typing import NoReturn
 from weakref import WeakKeyDictionary
+
+import grpc
 
 from curio_serve.errors import CallCancelled, DeadlineError, Overloaded
 from curio_serve.telemetry import Metrics
@@ -23,22 +25,6 @@ _RESERVATION_S = 1.0
 _MARGIN = 1.5
 _IS_FULL = "which is the limit (--workers, --queue)"
 _COMES_TOO_LATE = "which takes longer than the call's deadline leaves"
-
-
-class Call(Protocol):
-    """The part of gRPC's servicer context that admission uses."""
-
-    def time_remaining(self) -> float | None:
-        """Seconds until the caller's deadline; None or 9.2e18 without one."""
-
-    def is_active(self) -> bool:
-        """Whether the call has not ended."""
-
-    def peer(self) -> str:
-        """The connection that it came over."""
-
-    def add_callback(self, callback: Callable[[], None]) -> bool:
-        """Register a function that runs when the call ends; False if it has ended already."""
 
 
 class QueueEntry:
@@ -93,14 +79,14 @@ class WorkQueue:
         self._lock = threading.Lock()
         self._num_free = num_slots
         self._waiting: deque[QueueEntry] = deque()
-        self._sleepers: WeakKeyDictionary[Call, _Sleeper] = WeakKeyDictionary()
+        self._sleepers: WeakKeyDictionary[grpc.ServicerContext, _Sleeper] = WeakKeyDictionary()
         self._reserved: dict[QueueEntry, float] = {}  # since when, oldest first
         self._mean_work_s = 0.005
         metrics.waiting.set_function(lambda: len(self._waiting))
         metrics.working.set_function(lambda: num_slots - self._num_free)
 
     @contextmanager
-    def reserve(self, call: Call) -> Iterator[QueueEntry]:
+    def reserve(self, call: grpc.ServicerContext) -> Iterator[QueueEntry]:
         """Reserve an entry for a call before its message is read: a later refusal would waste the reading.
 
         A reservation lasts one second, so callers who never send their message do not fill the queue.
@@ -130,7 +116,9 @@ class WorkQueue:
                 self._reserved.pop(entry, None)
 
     @contextmanager
-    def slot(self, call: Call, entry: QueueEntry | None = None, *, always: bool = False) -> Iterator[float]:
+    def slot(
+        self, call: grpc.ServicerContext, entry: QueueEntry | None = None, *, always: bool = False
+    ) -> Iterator[float]:
         """Hold a slot while this thread works.
 
         Args:
@@ -173,7 +161,7 @@ class WorkQueue:
             self._waiting.append(entry)
             return False
 
-    def _wait(self, entry: QueueEntry, call: Call, remaining_s: float | None) -> None:
+    def _wait(self, entry: QueueEntry, call: grpc.ServicerContext, remaining_s: float | None) -> None:
         """Return with a slot, or raise without one."""
         # gRPC keeps what is registered until the call ends, and a stream waits for each of its frames.
         if (sleeper := self._sleepers.get(call)) is not None:
@@ -235,7 +223,7 @@ class WorkQueue:
         )
 
 
-def check_is_wanted(call: Call) -> None:
+def check_is_wanted(call: grpc.ServicerContext) -> None:
     """Check that somebody still waits for a call's answer.
 
     Raises:

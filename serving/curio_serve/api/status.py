@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Protocol
 
 import grpc
 from curio_proto.v1.detector_pb2 import FrameError
@@ -23,13 +22,6 @@ _MAX_TEXT_BYTES = 1000  # trailers are limited to 8 KiB, and carry the text twic
 _MAX_ID_LENGTH = 128
 
 
-class Caller(Protocol):
-    """The client of a call; gRPC's servicer context is one."""
-
-    def peer(self) -> str:
-        """The caller's address, as gRPC writes it."""
-
-
 @dataclass
 class CallRecord:
     """The fields of a call's log line, besides its method."""
@@ -45,7 +37,7 @@ class CallLog:
         self._requests = cache(metrics.requests.labels)  # labels() checks and locks each time
 
     @contextmanager
-    def record(self, method: str, caller: Caller) -> Iterator[CallRecord]:
+    def record(self, method: str, caller: grpc.ServicerContext) -> Iterator[CallRecord]:
         """Count and log how the body of a ``with`` statement ends.
 
         Yields:
@@ -68,7 +60,7 @@ class CallLog:
         self._requests(method, "OK").inc()
         log(logging.DEBUG, "answered", method=method, request_id=call.request_id[:_MAX_ID_LENGTH])
 
-    def refused(self, method: str, request_id: str, error: CurioError, caller: Caller) -> None:
+    def refused(self, method: str, request_id: str, error: CurioError, caller: grpc.ServicerContext) -> None:
         """Count and log a call that ends without an answer."""
         code = status_of(error)
         self._requests(method, code).inc()

@@ -8,9 +8,9 @@ streams as the caller's keeps them.
 import threading
 import time
 from functools import partial
-from typing import Protocol
 
-from curio_serve.api.admission import Call
+import grpc
+
 from curio_serve.errors import Overloaded
 
 # One connection may have this part of the streams, but at least so many.
@@ -19,17 +19,10 @@ _FRACTION, _LEAST = 4, 8
 _IDLE_S = 1.0
 
 
-class StreamCall(Call, Protocol):
-    """The part of gRPC's servicer context that streams use."""
-
-    def cancel(self) -> object:
-        """End the call."""
-
-
 class Stream:
     """An open stream."""
 
-    def __init__(self, call: StreamCall) -> None:
+    def __init__(self, call: grpc.ServicerContext) -> None:
         self.call, self.peer = call, call.peer()
         self._idle_since: float | None = time.monotonic()
 
@@ -60,7 +53,7 @@ class Streams:
         """Number of open streams."""
         return sum(map(len, list(self._open.values())))
 
-    def open(self, call: StreamCall) -> Stream:
+    def open(self, call: grpc.ServicerContext) -> Stream:
         """Open a stream, which is closed when the call ends.
 
         Raises:
