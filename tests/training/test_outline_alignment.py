@@ -70,6 +70,13 @@ def matrix(world: TwoStageWorld) -> torch.Tensor:
     return torch.from_numpy(world.camera.matrix).float()
 
 
+def aligned(outline: OutlineAlignment, images: torch.Tensor, matrix: torch.Tensor, pose: OutlinePose) -> OutlinePose:
+    """Poses aligned as those of a code are, positions in diameters."""
+    code = {ROTATION_6D: rotation_6d_from_matrix(pose.rotation)[:, None], TRANSLATION: pose.position[:, None]}
+    found, _ = outline.of_code(images, matrix, code, diameter_m=1.0)
+    return OutlinePose(matrix_from_rotation_6d(found[ROTATION_6D][:, 0]), found[TRANSLATION][:, 0])
+
+
 def off(found: OutlinePose, true: OutlinePose) -> tuple[float, float, float]:
     """Median errors: degrees, log distance, and across the view in diameters."""
     cosine = ((found.rotation * true.rotation).sum(dim=(1, 2)) - 1) / 2
@@ -92,7 +99,7 @@ def test_outlines_correct_what_a_network_errs_by(
     scale = 1 + 0.03 * torch.randn(NUM, 1, generator=random)
     shift = torch.nn.functional.pad(0.02 * torch.randn(NUM, 2, generator=random), (0, 1))
     start = OutlinePose(turn(vector) @ true.rotation, scale * (true.position + shift))
-    found = outline(images, matrix(world), *start)
+    found = aligned(outline, images, matrix(world), start)
     for before, after, share in zip(off(start, true), off(found, true), (0.5, 0.7, 0.4), strict=True):
         assert after < share * before
 
@@ -102,8 +109,8 @@ def test_images_are_aligned_alone_as_among_others(
     world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, OutlinePose]
 ) -> None:
     images, true = scenes
-    both = outline(images[:3], matrix(world), true.rotation[:3], true.position[:3])
-    alone = outline(images[1:2], matrix(world), true.rotation[1:2], true.position[1:2])
+    both = aligned(outline, images[:3], matrix(world), OutlinePose(*(values[:3] for values in true)))
+    alone = aligned(outline, images[1:2], matrix(world), OutlinePose(*(values[1:2] for values in true)))
     for together, single in zip(both, alone, strict=True):
         torch.testing.assert_close(together[1:2], single, atol=1e-4, rtol=1e-4)
 
@@ -114,7 +121,7 @@ def test_where_nothing_is_seen_poses_stay(
     world: TwoStageWorld, outline: OutlineAlignment, scenes: tuple[torch.Tensor, OutlinePose], shade: float
 ) -> None:
     images, true = scenes
-    found = outline(torch.full_like(images, shade), matrix(world), *true)
+    found = aligned(outline, torch.full_like(images, shade), matrix(world), true)
     for before, after in zip(true, found, strict=True):
         torch.testing.assert_close(after, before, atol=2e-3, rtol=1e-3)
 
@@ -207,7 +214,7 @@ def test_the_alignment_alone_moves_poses_as_the_network_does(
     images, true = scenes
     start = OutlinePose(turn(torch.tensor([[0.03, -0.03, 0.02]])) @ true.rotation, 1.02 * true.position)
     with one_round():
-        expected = outline(images, matrix(world), *start)
+        expected = aligned(outline, images, matrix(world), start)
     gaps, moves = [], []
     for number, image in enumerate(images):
         pixels = (image.permute(1, 2, 0) * 255).round().byte().numpy()

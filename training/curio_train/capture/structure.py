@@ -44,11 +44,6 @@ class Structure:
         rotations, shifts = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
         return -np.einsum("nji,nj->ni", rotations, shifts)
 
-    def relative(self, first: int, second: int) -> np.ndarray:
-        """The rigid transform [4, 4] second_from_first of two cameras."""
-        result: np.ndarray = self.cam_from_world[second] @ np.linalg.inv(self.cam_from_world[first])
-        return result
-
 
 def every_nth(photographs: Sequence[Path], step: int) -> list[Path]:
     """Every so many-th frame of a moving camera's sequence (the paper takes n = 10), from the first on.

@@ -119,7 +119,13 @@ class OutlineAlignment(nn.Module):
         code: dict[str, Tensor],
         diameter_m: float,
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """A code of one object, metres and 6D rotation [batch, 1, …], with its pose aligned; see :meth:`forward`.
+        """A code of one object, metres and 6D rotation [batch, 1, …], with its pose where the outline lies on edges.
+
+        Args:
+            images: sRGB in [0, 1].
+            matrix: K of the images.
+            code: What was read: rotations right to some degrees, positions to some per cent.
+            diameter_m: Of the object.
 
         Returns:
             The code, and the tensors at which the alignment can be cut out of an exported graph.
@@ -168,24 +174,6 @@ class OutlineAlignment(nn.Module):
             diameter_m: Of the object.
         """
         return OutlineStageNote(tensors, _SIDE, _FILL, diameter_m)
-
-    def forward(
-        self,
-        images: Float[Tensor, "batch 3 height width"],
-        matrix: Float[Tensor, "3 3"],
-        rotation: Float[Tensor, "batch 3 3"],
-        position: Float[Tensor, "batch 3"],
-    ) -> OutlinePose:
-        """Move poses to where their outlines lie on edges.
-
-        Args:
-            images: sRGB in [0, 1].
-            matrix: K of the images.
-            rotation: cam_from_obj, right to some degrees.
-            position: In front of the camera, diameters, right to some per cent.
-        """
-        seen = _cut(images, matrix, OutlinePose(rotation, position), position[:, None])
-        return seen.in_frame(self._in_crops(seen))
 
     def _in_crops(self, seen: _Crops, objects: Int[Tensor, " batch"] | None = None) -> OutlinePose:
         """The poses in the crops' cameras, aligned; each crop's object where there are several."""
