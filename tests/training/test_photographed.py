@@ -92,8 +92,9 @@ def agreement(network: ObjectsNetwork, frame: torch.Tensor, pose: Pose) -> tuple
     )
     fine, coarse = network.locator.trunk(crop)
     start = Aligned(banks.rotations[number][None], position_m[None] / MESH.diameter_m, torch.zeros(1))
-    shown = banks.points_of(0)[number][None], banks.described(0)[number][None]
-    found = align(FeatureMaps.of(banks.fine_of(0, fine)), torch.tensor([0]), *shown, start, focal_px, 0)
+    slot = torch.tensor([0])
+    shown = banks.surface(torch.tensor([[number]]), slot)
+    found = align(FeatureMaps.of(banks.fine(fine, slot, 1)), slot, *shown, start, focal_px, 0)
     both = coarse[:, None, None].expand(-1, 2, -1, -1, -1, -1)
     return float(found.score), float(banks.match(both, torch.arange(2))[0, 0, 0, 0, number])
 
@@ -111,7 +112,9 @@ def test_what_a_photograph_shows_is_learned_and_the_rest_stays(world: SeveralObj
     unknown = Pose(np.full((2, 3, 3), np.nan), np.full((2, 3), np.nan))
     pose = Pose(rotation, position_m)
 
-    before, described, other = agreement(network, frames[0], pose), banks.described(0), banks.codes[1].clone()
+    every = torch.arange(len(banks.rotations))[None], torch.tensor([0])
+    _, described = banks.surface(*every)
+    before, other = agreement(network, frames[0], pose), banks.codes[1].clone()
     learn_appearance(network, frames, [pose, unknown])
     after = agreement(network, frames[0], pose)
     assert after[0] > before[0] + 0.2
@@ -125,7 +128,7 @@ def test_what_a_photograph_shows_is_learned_and_the_rest_stays(world: SeveralObj
 
     directions = banks.rotations[:, 2]
     far = directions @ directions[VIEW * NUM_ROLLS] < 0.9
-    kept = torch.nn.functional.cosine_similarity(banks.described(0)[far], described[far], dim=2)
+    kept = torch.nn.functional.cosine_similarity(banks.surface(*every)[1][far], described[far], dim=2)
     assert float(kept.mean()) > 0.8, "codewords are chosen anew, which costs a little"
 
 

@@ -89,8 +89,9 @@ def learn_appearance(
 def _learn(network: ObjectsNetwork, number: int, frames: Tensor, cam_from_obj: Pose[Tensor]) -> None:
     """The templates of one object."""
     banks = network.reader.banks
-    points = banks.points_of(number).unflatten(0, (-1, NUM_ROLLS))
-    of_points = _Mean(banks.described(number).unflatten(0, (-1, NUM_ROLLS)), _RENDERED_POINTS)
+    surface = banks.surface(torch.arange(len(banks.rotations))[None], torch.tensor([number]))
+    points, described = (values.unflatten(0, (-1, NUM_ROLLS)) for values in surface)
+    of_points = _Mean(described, _RENDERED_POINTS)
     of_cells = _Mean(banks.templates(number).unflatten(0, (-1, NUM_ROLLS)).movedim(2, -1), _RENDERED_CELLS)
     for frame, rotation, position_m in zip(frames, cam_from_obj.rotation, cam_from_obj.translation_m, strict=True):
         seen = _seen(network, number, frame, Pose(rotation.float(), position_m.float()))
@@ -135,7 +136,7 @@ def _seen(network: ObjectsNetwork, number: int, frame: Tensor, cam_from_obj: Pos
     return _Seen(
         views,
         weight,
-        FeatureMaps.of(banks.fine_of(number, fine)),
+        FeatureMaps.of(banks.fine(fine, torch.tensor([number]), NUM_ROLLS)),
         banks.coarse_of(number, coarse)[:, :, inside, inside],
         Pose(crop_from_cam @ cam_from_obj.rotation, crop_from_cam @ position_m / geometry.diameter_m),
         focal_px,

@@ -105,27 +105,12 @@ class Banks(nn.Module):
         weights = self.weights[number].float() * self.match_scale[number]
         return (weights @ self.filters[number].float().flatten(1)).unflatten(1, self.filters.shape[2:])
 
-    def points_of(self, number: int) -> Float[Tensor, "templates points 3"]:
-        """Surface points of one object, diameters."""
-        return self.points[number].float() * self.points_scale[number]
-
-    def described(self, number: int) -> Float[Tensor, "templates points channels"]:
-        """Fine descriptors of one object's surface points."""
-        parts = torch.arange(_PARTS, device=self.codes.device)
-        return self.codewords[number][parts, self.codes[number].long()].float().flatten(2)
-
     def coarse_of(
         self, number: int, features: Float[Tensor, "batch channels rows columns"]
     ) -> Float[Tensor, "batch size rows columns"]:
         """Descriptors at stride 8 as templates of one object have them."""
         centred = features - self.coarse_mean[number][:, None, None]
         return normalised(F.conv2d(centred, self.coarse_projection[number][..., None, None]), dim=1)
-
-    def fine_of(
-        self, number: int, features: Float[Tensor, "batch channels rows columns"]
-    ) -> Float[Tensor, "batch channels rows columns"]:
-        """Descriptors at stride 4 as surface points of one object have them."""
-        return normalised(features - self.fine_mean[number][:, None, None], dim=1)
 
     def match(
         self, features: Float[Tensor, "batch asked num channels rows columns"], slots: Int[Tensor, " asked"]
