@@ -47,6 +47,17 @@ class Pose(Generic[Array]):
         """The pose of homogeneous matrices [*batch, 4, 4]."""
         return Pose(matrix[..., :3, :3], matrix[..., :3, 3])
 
+    @property
+    def matrix(self) -> np.ndarray:
+        """A single pose as a homogeneous matrix [4, 4], float64."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self
+        return matrix
+
+    def rows(self, which: int | slice | np.ndarray) -> "Pose[Array]":
+        """Those poses of a batch; the single pose of a number."""
+        return Pose(self.rotation[which], self.translation_m[which])
+
     def apply(self, points: Array) -> Array:
         """Points of the source frame in the target frame.
 

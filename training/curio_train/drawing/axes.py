@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 from curio_train.color import linear_from_srgb
 from curio_train.drawing.pictures import LIGHT, SceneContext
 from curio_train.drawing.scenes import Scene
-from curio_train.geometry import Pose
 
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 """Turns OpenCV's camera axes to OpenGL's, which glTF and USD have, too."""
@@ -31,13 +30,6 @@ def towards_light(light: np.ndarray) -> tuple[np.ndarray, float]:
     """The matrix [4, 4] of a lamp that shines along −z from the light's direction, and the light's strength."""
     strength = float(np.linalg.norm(light))
     return embed(_rotation_onto(_Z, light / strength if strength else _Y)), strength
-
-
-def pose_matrix(pose: Pose[np.ndarray]) -> np.ndarray:
-    """A pose as a matrix [4, 4]."""
-    matrix = embed(pose.rotation)
-    matrix[:3, 3] = pose.translation_m
-    return matrix
 
 
 def embed(rotation: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ import trimesh
 from curio_serve.files import read_file
 from PIL import Image
 
-from curio_train.drawing.axes import GL_FROM_CV, embed, light_of, linear, pose_matrix, root_from_camera, towards_light
+from curio_train.drawing.axes import GL_FROM_CV, embed, light_of, linear, root_from_camera, towards_light
 from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Placed, Scene, located
 from curio_train.errors import DataError
@@ -41,7 +41,7 @@ def to_glb(scene: Scene, context: SceneContext) -> bytes:
     out = trimesh.Scene(base_frame="world")
     root = root_from_camera(context)
     for number, item in enumerate(scene.objects):
-        matrix = root @ pose_matrix(item.pose)
+        matrix = root @ item.pose.matrix
         extras = {"object": item.kind, "color": list(item.color_srgb), "confidence": item.confidence}
         name = f"{number:02d}-{item.kind}"
         geometry = _geometry(context.mesh(item.kind), item)

@@ -136,10 +136,6 @@ def _known_or_identity(cameras: CameraPoses) -> Pose[np.ndarray]:
     return Pose.from_matrix(np.where(cameras.known[:, None, None], cameras.cam_from_world, np.eye(4)))
 
 
-def _rows(poses: Pose[np.ndarray], rows: np.ndarray) -> Pose[np.ndarray]:
-    return Pose(poses.rotation[rows], poses.translation_m[rows])
-
-
 def _predictions(code: SceneCode, chosen: Bool[np.ndarray, " num"]) -> _Predictions:
     rotation = matrix_from_rotation_6d(code[ROTATION_6D][:, 0]).double().numpy()
     translation_m = code[TRANSLATION][:, 0].double().numpy()
@@ -148,7 +144,7 @@ def _predictions(code: SceneCode, chosen: Bool[np.ndarray, " num"]) -> _Predicti
 
 def _scale(cameras: Pose[np.ndarray], predictions: _Predictions, diameter_m: float) -> float | None:
     """Metres a unit of the scene: the mode over all pairs of photographs."""
-    world_from_cam = _rows(cameras, predictions.frame).inverse()
+    world_from_cam = cameras.rows(predictions.frame).inverse()
     centres = world_from_cam.translation_m
     rays_m = _rotated(world_from_cam.rotation, predictions.cam_from_obj.translation_m)  # in the scene's axes
     first, second = np.triu_indices(len(rays_m), 1)
@@ -190,7 +186,7 @@ def consensus_in_scene(
         in_depth: Standard deviation of distances, relative.
         moved: Standard deviation of movements in the scene, diameters.
     """
-    world_from_cam = _rows(cam_from_world, frame).inverse()
+    world_from_cam = cam_from_world.rows(frame).inverse()
     poses = world_from_cam @ cam_from_obj
     rotation = np.tile(np.eye(3), (len(frame), 1, 1)) if info.turns_any_way else poses.rotation
     rays_m = _rotated(world_from_cam.rotation, cam_from_obj.translation_m)

@@ -57,7 +57,7 @@ def read_by_others(network: ObjectsNetwork, world: SeveralObjectsWorld, labels: 
     evidence = Evidence(np.zeros((num, objects, 3)), np.zeros((num, objects), dtype=bool))
     for half in range(2):
         own, others = np.arange(half, num, 2), slice(1 - half, None, 2)
-        known = [Pose(pose.rotation[others], pose.translation_m[others]) for pose in labels.poses]
+        known = [pose.rows(others) for pose in labels.poses]
         learn_appearance(network, labels.frames[others], known)
         for rows in np.split(own, range(_READ_AT_ONCE, len(own), _READ_AT_ONCE)):
             code, found = network.read(labels.frames[torch.from_numpy(rows)].float() / 255)
@@ -183,7 +183,7 @@ def _correct(
 ) -> list[bool]:
     member = world.members[slot]
     points = member.mesh.vertices_m[:: max(1, len(member.mesh.vertices_m) // _NUM_POINTS)]
-    labelled = [Pose(labels.rotation[row], labels.translation_m[row]) for row in rows]
+    labelled = [labels.rows(row) for row in rows]
     return [
         bool(np.isfinite(label.translation_m).all())
         and add_or_add_s_m(pose, label, points, member.kind.info) < ADD_THRESHOLD * member.kind.diameter_m

@@ -135,7 +135,7 @@ def _pairs(object_: Object, slot: int, code: SceneCode, cam_from_world: Pose, kn
     for one, other in _neighbours(np.flatnonzero(known)):
         first.append(one)
         second.append(other)
-        moved.append(_row(cam_from_world, one) @ _row(cam_from_world, other).inverse() @ answers[other])
+        moved.append(cam_from_world.rows(one) @ cam_from_world.rows(other).inverse() @ answers[other])
     own = [answers[one] for one in first]
     errors = [add_or_add_s_m(one, other, points, kind.info) for one, other in zip(own, moved, strict=True)]
     return Pairs(
@@ -150,10 +150,6 @@ def _neighbours(numbers: np.ndarray) -> Iterator[tuple[int, int]]:
     for place, one in enumerate(numbers):
         for other in numbers[place + 1 : place + 1 + _NEIGHBOURS]:
             yield int(one), int(other)
-
-
-def _row(found: Pose, number: int) -> Pose:
-    return Pose(found.rotation[number], found.translation_m[number])
 
 
 def adjusted(
