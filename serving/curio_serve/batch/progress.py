@@ -9,7 +9,7 @@ from curio_serve.batch.results.formats import ImageLines
 from curio_serve.imaging.view import MOSTLY_SEARCHED
 
 if TYPE_CHECKING:
-    from curio_serve.batch.progress_bar import Bar
+    from rich.progress import Progress as Bar
 
 _NUM_PROBLEMS_SHOWN = 20
 
@@ -35,7 +35,7 @@ class Progress:
     """
 
     def __init__(self, num_before: int, num_errors_before: int, *, is_shown: bool) -> None:
-        self._bar = _bar(num_before, num_errors_before) if is_shown and sys.stderr.isatty() else None
+        self._bar = _started(num_before, num_errors_before) if is_shown and sys.stderr.isatty() else None
         self._num_before = num_before
         self._num_new = 0
         self._num_errors = num_errors_before
@@ -63,7 +63,7 @@ class Progress:
             if len(self._problems) < _NUM_PROBLEMS_SHOWN:
                 self._problems.append(f"{lines.image}: {lines.error}")
         if self._bar is not None:
-            self._bar.advance(self._num_errors)
+            self._bar.update(self._bar.task_ids[0], advance=1, num_errors=self._num_errors)
 
     def report(self, label: str) -> None:
         """Sums up, with the first problems of this run."""
@@ -94,10 +94,10 @@ class Progress:
             print(f"  ... and {self._num_errors - len(self._problems)} more", file=sys.stderr)
 
 
-def _bar(num_images: int, num_errors: int) -> "Bar":
-    from curio_serve.batch.progress_bar import Bar
+def _started(num_images: int, num_errors: int) -> "Bar":
+    from curio_serve.batch.progress_bar import started
 
-    return Bar(num_images, num_errors)
+    return started(num_images, num_errors)
 
 
 def _counted(num_images: int, of_one: str = "", of_several: str = "") -> str:
