@@ -53,6 +53,12 @@ def check_matrix(matrix: object, width: int, height: int, where: str = "camera m
         raise CameraError(f"{where}: {exc}") from exc
 
 
+def square_matrix(focal_px: float, side: int) -> np.ndarray:
+    """K [3, 3] of square pictures of so many pixels a side, whose middle is the principal point."""
+    middle = (side - 1) / 2
+    return np.array([[focal_px, 0, middle], [0, focal_px, middle], [0, 0, 1]])
+
+
 def load_intrinsics(path: Path) -> Intrinsics:
     """The one camera of a camera file, with its image size; see ``curio_serve.imaging.camera_files`` for the formats.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from curio_train.camera import Intrinsics
+from curio_train.camera import Intrinsics, square_matrix
 from curio_train.config import RunConfig, preset_recipe
 from curio_train.data.backgrounds import POOL_HEIGHT, POOL_WIDTH, ClutterBackgrounds
 from curio_train.errors import RendererError
@@ -26,11 +26,6 @@ _SMALL_PX = 32
 _STEPS, _NUM_IMAGES = 3, 64
 
 
-def _camera_matrix(side: int) -> np.ndarray:
-    centre = (side - 1) / 2
-    return np.array([[side, 0, centre], [0, side, centre], [0, 0, 1]], dtype=np.float64)
-
-
 def render_a_box() -> float:
     """Fraction of the pixels that a white box covers whose face fills a quarter of the picture.
 
@@ -41,7 +36,7 @@ def render_a_box() -> float:
     picture = renderer(
         torch.eye(3)[None, None],
         torch.tensor([[[0.0, 0.0, 2.005]]]),
-        camera_matrix=_camera_matrix(_SMALL_PX),
+        camera_matrix=square_matrix(_SMALL_PX, _SMALL_PX),
         backgrounds=torch.zeros(1, 3, _SMALL_PX, _SMALL_PX),
         light=torch.zeros(1, 3),
     )

@@ -5,6 +5,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from curio_train.camera import square_matrix
 from curio_train.meshes.meshes import Mesh
 from curio_train.rendering.renderer import Renderer
 from curio_train.worlds.single_object.viewpoints import AMBIENT
@@ -41,8 +42,7 @@ class TemplateRenderer:
             RendererError: The mesh cannot be rendered.
         """
         self._renderer = Renderer([mesh], [0], side, side, ambient=AMBIENT)
-        middle = (side - 1) / 2
-        self._matrix = np.array([[focal_px, 0, middle], [0, focal_px, middle], [0, 0, 1]])
+        self._matrix = square_matrix(focal_px, side)
         self._position = torch.tensor([0.0, 0.0, depth_m])
 
     def draw(self, rotations: Float[Tensor, "templates 3 3"], num_lamps: int = 1) -> Drawn:

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from curio_train.camera import square_matrix
 from curio_train.meshes.meshes import Mesh
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import Descriptors
@@ -88,8 +89,7 @@ def _surface_points(
 ) -> Float[Tensor, "templates 3 cells cells"]:
     """The point of the object, metres, that the centre of each cell of stride 4 sees."""
     surface = ObjectCoordinateMap(mesh, CROP_PX)
-    middle = (CROP_PX - 1) / 2
-    matrix = np.array([[focal_px, 0, middle], [0, focal_px, middle], [0, 0, 1]])
+    matrix = square_matrix(focal_px, CROP_PX)
     position = torch.tensor([0.0, 0.0, depth_m])
     found = [
         surface(some, position.expand(len(some), 3), np.broadcast_to(matrix, (len(some), 3, 3)))[0][

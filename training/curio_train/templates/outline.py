@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from curio_train.camera import square_matrix
 from curio_train.meshes.meshes import Mesh
 from curio_train.networks.templates.bank import NUM_OUTLINE_POINTS
 from curio_train.networks.templates.geometry import CROP_PX, FILL, Geometry
@@ -45,7 +46,7 @@ def outlines(mesh: Mesh, geometry: Geometry, num_points: int = NUM_OUTLINE_POINT
     focal_px = FILL * CROP_PX * depth / geometry.diameter_m
     renderer, surface = TemplateRenderer(mesh, depth, focal_px, CROP_PX), ObjectCoordinateMap(mesh, CROP_PX)
     middle = (CROP_PX - 1) / 2
-    matrix = np.array([[focal_px, 0, middle], [0, focal_px, middle], [0, 0, 1]])
+    matrix = square_matrix(focal_px, CROP_PX)
     centre = torch.tensor([0.0, 0.0, depth])
     points, outward = [], []
     for rotations in geometry.outline_rotations.split(_BATCH):

@@ -19,6 +19,7 @@ Codes are in the world frame. An exported model answers in the camera frame, whi
 import numpy as np
 import torch
 
+from curio_train.camera import square_matrix
 from curio_train.geometry import Pose, camera_looking_at
 from curio_train.meshes.meshes import Mesh
 from curio_train.scene_code import TRANSLATION, Field
@@ -45,13 +46,11 @@ def ground_setup() -> SceneSetup:
     up, across = np.sin(np.radians(ELEVATION_DEG)), np.cos(np.radians(ELEVATION_DEG))
     target = torch.tensor([0.0, TARGET_HEIGHT_M, 0.0], dtype=torch.float64)
     rotation, translation_m = camera_looking_at(target + DISTANCE_M * torch.tensor([0.0, up, across]), target)
-    middle = (SIDE_PX - 1) / 2
-    matrix = np.array([[FOCAL_PX, 0, middle], [0, FOCAL_PX, middle], [0, 0, 1]])
     elevation, azimuth = np.radians(SUN_ELEVATION_DEG), np.radians(SUN_AZIMUTH_DEG)
     level = np.cos(elevation)
     sun = SUN * np.array([-level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)])
     return SceneSetup(
-        Camera(SIDE_PX, SIDE_PX, matrix, is_default=True),
+        Camera(SIDE_PX, SIDE_PX, square_matrix(FOCAL_PX, SIDE_PX), is_default=True),
         Pose(rotation.numpy(), translation_m.numpy()),
         center_m=(0.0, 0.0, 0.0),
         up=(0.0, 1.0, 0.0),

@@ -12,8 +12,7 @@ The paper gives no numbers. Ours were fixed before any training:
 Codes are in the camera frame, which here is the world's. The heads are the paper's: linear positions, sigmoid colours.
 """
 
-import numpy as np
-
+from curio_train.camera import square_matrix
 from curio_train.geometry import Pose
 from curio_train.meshes.shapes import sphere
 from curio_train.scene_code import TRANSLATION, Field
@@ -38,10 +37,8 @@ POSITION_FIELD = Field(
 
 def spheres_setup() -> SceneSetup:
     """Camera and light of all worlds of spheres."""
-    middle = (SIDE_PX - 1) / 2
-    matrix = np.array([[FOCAL_PX, 0, middle], [0, FOCAL_PX, middle], [0, 0, 1]])
     return SceneSetup(
-        Camera(SIDE_PX, SIDE_PX, matrix, is_default=True),
+        Camera(SIDE_PX, SIDE_PX, square_matrix(FOCAL_PX, SIDE_PX), is_default=True),
         Pose.identity(),
         center_m=(0.0, 0.0, DISTANCE_M),
         up=(0.0, -1.0, 0.0),
