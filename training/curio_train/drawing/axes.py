@@ -5,8 +5,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from curio_train.color import linear_from_srgb
-from curio_train.drawing.pictures import LIGHT, SceneContext
-from curio_train.drawing.scenes import Scene
+from curio_train.drawing.pictures import SceneContext
 
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 """Turns OpenCV's camera axes to OpenGL's, which glTF and USD have, too."""
@@ -18,12 +17,6 @@ def root_from_camera(context: SceneContext) -> np.ndarray:
     """Rotation [4, 4] of the camera's axes that puts the scene's up direction along +y."""
     up = GL_FROM_CV @ np.asarray(context.up, dtype=np.float64)
     return embed(_rotation_onto(up, _Y) @ GL_FROM_CV)
-
-
-def light_of(scene: Scene, context: SceneContext) -> np.ndarray:
-    """Towards the light [3], camera frame: the scene's own, else the context's, else the usual one."""
-    light = scene.light if scene.light is not None else context.light
-    return np.array(LIGHT) if light is None else light
 
 
 def towards_light(light: np.ndarray) -> tuple[np.ndarray, float]:

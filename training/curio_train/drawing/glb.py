@@ -17,7 +17,7 @@ import trimesh
 from curio_serve.files import read_file
 from PIL import Image
 
-from curio_train.drawing.axes import GL_FROM_CV, embed, light_of, linear, root_from_camera, towards_light
+from curio_train.drawing.axes import GL_FROM_CV, embed, linear, root_from_camera, towards_light
 from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Placed, Scene, located
 from curio_train.errors import DataError
@@ -46,7 +46,7 @@ def to_glb(scene: Scene, context: SceneContext) -> bytes:
         name = f"{number:02d}-{item.kind}"
         geometry = _geometry(context.mesh(item.kind), item)
         out.add_geometry(geometry, geom_name=name, node_name=name, transform=matrix, metadata={_EXTRAS: extras})
-    light = light_of(scene, context)
+    light = context.light_of(scene)
 
     def add_camera_and_light(tree: dict[str, Any]) -> None:
         _add_camera(tree, scene, root, context.ambient)

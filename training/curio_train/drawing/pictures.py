@@ -74,6 +74,11 @@ class SceneContext:
             raise DataError(f"no mesh for object {kind!r}, only for {', '.join(self.meshes)}; add --mesh {kind}=FILE")
         return found
 
+    def light_of(self, scene: Scene) -> np.ndarray:
+        """Towards the light [3], camera frame: the scene's own, else this context's, else the usual one."""
+        light = scene.light if scene.light is not None else self.light
+        return np.array(LIGHT) if light is None else light
+
     def middle(self, item: Placed) -> np.ndarray:
         """Where the middle of an object's box is, camera frame, metres [3]; its origin may be anywhere.
 
@@ -125,7 +130,7 @@ def picture(
         DataError: An object without a mesh, a photograph that is missing or of another size, or a scene too large.
         RendererError: No usable libLLVM, or a mesh that cannot be rendered.
     """
-    scene, around = _resized(scene, options.height), _with_light(scene, around)
+    scene, around = _resized(scene, options.height), replace(around, light=around.light_of(scene))
     behind = _fitted(photograph, scene) if photograph is not None else None
     if options.over_photograph:
         behind = _photograph(scene)
@@ -151,11 +156,6 @@ def _resized(scene: Scene, height: int | None) -> Scene:
 
 def _too_large(width: int, height: int) -> str:
     return f"a picture of {width}x{height} pixels, expected at most {MAX_PIXELS:,} pixels"
-
-
-def _with_light(scene: Scene, around: SceneContext) -> SceneContext:
-    known = scene.light if scene.light is not None else around.light
-    return replace(around, light=np.array(LIGHT) if known is None else known)
 
 
 def _photograph(scene: Scene) -> np.ndarray:

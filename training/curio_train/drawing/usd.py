@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, Vt
 
-from curio_train.drawing.axes import GL_FROM_CV, embed, light_of, linear, root_from_camera, towards_light
+from curio_train.drawing.axes import GL_FROM_CV, embed, linear, root_from_camera, towards_light
 from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Placed, Scene
 from curio_train.meshes.meshes import Mesh
@@ -31,7 +31,7 @@ def to_usd(scene: Scene, context: SceneContext) -> bytes:
     for number, item in enumerate(scene.objects):
         _add_object(stage, number, item, context.mesh(item.kind), root @ item.pose.matrix)
     _add_camera(stage, scene, root)
-    _add_lights(stage, root[:3, :3] @ light_of(scene, context), context.ambient)
+    _add_lights(stage, root[:3, :3] @ context.light_of(scene), context.ambient)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.usdc"
         stage.GetRootLayer().Export(str(path))

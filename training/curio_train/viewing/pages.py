@@ -14,7 +14,7 @@ import torch
 from curio_train.drawing.album import MeshFiles, scene_context, scenes_of
 from curio_train.drawing.mesh_check import check_meshes
 from curio_train.drawing.photograph import photograph_of
-from curio_train.drawing.pictures import LIGHT, SceneContext
+from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Scene, mesh_world, scene_of_code
 from curio_train.errors import CurioError, DataError, UsageError
 from curio_train.evaluation.subject import load_subject
@@ -51,8 +51,7 @@ class Page:
     @property
     def light(self) -> np.ndarray:
         """The light that the scene is drawn under [3], camera frame; the usual one where neither knows it."""
-        known = self.scene.light if self.scene.light is not None else self.context.light
-        return np.array(LIGHT) if known is None else known
+        return self.context.light_of(self.scene)
 
 
 @dataclass(frozen=True)
