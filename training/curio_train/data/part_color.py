@@ -14,7 +14,7 @@ import torch
 from curio_train.camera import Intrinsics
 from curio_train.color import linear_from_srgb, srgb_from_linear
 from curio_train.data.background_difference import compare
-from curio_train.data.photographs import Photographs, read_frame, read_frames
+from curio_train.data.photographs import Photographs, read_frame, read_frames, spread
 from curio_train.meshes.meshes import Mesh
 
 _WIDTH_PX = 160
@@ -58,8 +58,7 @@ def find_color(photos: Path, background_image: Path, camera: Intrinsics) -> Foun
     Raises:
         DataError: One cannot be read, or is not of the camera's size.
     """
-    paths = Photographs(photos, (background_image,)).paths
-    chosen = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, _MOST_COMPARED).astype(int))]
+    chosen = spread(Photographs(photos, (background_image,)).paths, _MOST_COMPARED)
     height = max(1, round(_WIDTH_PX * camera.height / camera.width))
     empty = cv2.resize(read_frame(background_image, camera), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
     frames = read_frames(chosen, camera, _WIDTH_PX, height).transpose(0, 2, 3, 1)
