@@ -33,15 +33,11 @@ def _quota(cgroup: Path) -> float | None:
     return None
 
 
-def memory_limit(cgroup: Path = _CGROUP) -> int | None:
-    """Bytes that the container may use; None without a limit.
-
-    Args:
-        cgroup: Where control groups are mounted.
-    """
+def memory_limit() -> int | None:
+    """Bytes that the container may use; None without a limit."""
     for name in _MEMORY_FILES:
         try:
-            text = (cgroup / name).read_text().strip()
+            text = (_CGROUP / name).read_text().strip()
             return None if text in _UNLIMITED else int(text)
         except (OSError, ValueError):
             continue
