@@ -121,8 +121,7 @@ def real_answers(
     """What a network said of frames that show an object, and of those that do not."""
     targets = {(target.scene_id, target.image_id): target for target in scored_frames(dataset, kind.name).targets}
     shown = {(one.scene_id, one.image_id) for one in dataset.annotations(SPLIT, kind.name)}
-    vertices = dataset.mesh(kind.name).vertices_m
-    points = vertices[:: max(1, len(vertices) // _NUM_POINTS)]
+    points = dataset.mesh(kind.name).thinned_m(_NUM_POINTS)
     confidences, found, true, without = list[float](), list[Pose](), list[Pose](), list[float]()
     for frame, code in zip(frames, codes, strict=True):
         key = frame.scene_id, frame.image_id

@@ -25,8 +25,7 @@ def several_objects_scores(world: SeveralObjectsWorld, predicted: SceneCode, tru
         shown = there[:, slot]
         if not shown.any():
             continue
-        vertices = member.mesh.vertices_m
-        points = vertices[:: max(1, len(vertices) // _MOST_POINTS)]
+        points = member.mesh.thinned_m(_MOST_POINTS)
         found, wanted = (poses(index(code, shown), slot) for code in (predicted, true))
         each.append(pose_scores(found, wanted, points, member.kind.info))
         errors = add_errors(found, wanted, points, member.kind.info)

@@ -75,6 +75,10 @@ class Mesh:
         """Corners [8, 3] of the axis-aligned box, in the order of :func:`~curio_train.meshes.extent.box_corners`."""
         return box_corners(self.vertices_m)
 
+    def thinned_m(self, num: int) -> np.ndarray:
+        """About ``num`` of the vertices, or all if there are fewer: every n-th, [k, 3]."""
+        return self.vertices_m[:: max(1, len(self.vertices_m) // num)]
+
     def moved(self, by_m: np.ndarray) -> "Mesh":
         """This mesh with every vertex moved [3]; it is named after its file as before."""
         return dataclasses.replace(self, vertices_m=self.vertices_m + by_m)

@@ -50,6 +50,12 @@ def add_or_add_s_m(estimate: Pose, truth: Pose, points: np.ndarray, info: ModelI
     return (add_s_m if info.is_symmetric else add_m)(estimate, truth, points)
 
 
+def are_right(found: Sequence[Pose], true: Sequence[Pose], points: np.ndarray, info: ModelInfo) -> list[bool]:
+    """Whether ADD(-S) of each pose is below :data:`ADD_THRESHOLD` diameters."""
+    errors_m = [add_or_add_s_m(one, other, points, info) for one, other in zip(found, true, strict=True)]
+    return [error_m < ADD_THRESHOLD * info.diameter_m for error_m in errors_m]
+
+
 def symmetry_poses(info: ModelInfo, max_step: float = 0.01) -> list[Pose]:
     """All motions of the object that leave its appearance unchanged, the identity first; continuous ones in steps.
 

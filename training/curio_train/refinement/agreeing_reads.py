@@ -37,7 +37,7 @@ def all_agree(reads: Reads, one: Object, slot: int = 0) -> Bool[np.ndarray, " ph
         slot: Its slot in the scene codes of the reads.
     """
     read, num = poses(reads.code, slot), int(reads.photograph.max()) + 1
-    points = one.mesh.vertices_m[:: max(1, len(one.mesh.vertices_m) // _NUM_POINTS)]
+    points = one.mesh.thinned_m(_NUM_POINTS)
     symmetries = np.stack([pose.rotation for pose in symmetry_poses(one.kind.info, SYMMETRY_STEP)])
 
     def agree(some: Sequence[Pose]) -> bool:

@@ -182,7 +182,7 @@ def _correct(
     world: SeveralObjectsWorld, slot: int, found: list[Pose], labels: Pose[np.ndarray], rows: np.ndarray
 ) -> list[bool]:
     member = world.members[slot]
-    points = member.mesh.vertices_m[:: max(1, len(member.mesh.vertices_m) // _NUM_POINTS)]
+    points = member.mesh.thinned_m(_NUM_POINTS)
     labelled = [labels.rows(row) for row in rows]
     return [
         bool(np.isfinite(label.translation_m).all())

@@ -5,7 +5,6 @@ frames 1.9 % too far, so a factor from renderings moves real poses the wrong way
 """
 
 from collections.abc import Iterator
-from itertools import repeat
 from pathlib import Path
 
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from curio_train.geometry import Pose
 from curio_train.metrics.calibration import fit_calibration
-from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
+from curio_train.metrics.poses import are_right
 from curio_train.networks.templates.network import TemplateNetwork
 from curio_train.scene_code import poses
 from curio_train.threads import in_threads
@@ -33,7 +32,7 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, n
         DataError: The backgrounds cannot be read.
     """
     source, kind = world.source("validation", 0, with_code=True, cache=cache), world.object.kind
-    points = world.object.mesh.vertices_m[:: max(1, len(world.object.mesh.vertices_m) // _NUM_POINTS)]
+    points = world.object.mesh.thinned_m(_NUM_POINTS)
     steps = _NUM_FRAMES // _BATCH_SIZE
     true: list[Pose] = []
 
@@ -50,8 +49,7 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, n
     answers = list(in_threads(network.read, frames(), num_threads))
     found = [pose for code, _ in answers[::2] for pose in poses(code)]
     full, empty = ([features for _, features in some] for some in (answers[::2], answers[1::2]))
-    errors_m = map(add_or_add_s_m, found, true, repeat(points), repeat(kind.info))
-    right = [error_m < ADD_THRESHOLD * kind.diameter_m for error_m in errors_m]
+    right = are_right(found, true, points, kind.info)
     network.reader.pose_correct[0] = _fit([features.right[:, 0] for features in full], right)
     there = [True] * len(right) + [False] * len(right)
     network.reader.presence[0] = _fit([features.there[:, 0] for features in (*full, *empty)], there)

@@ -30,7 +30,7 @@ from curio_train.evaluation.subject import Predict
 from curio_train.geometry import Pose
 from curio_train.metrics.calibration import fit_pair_calibration
 from curio_train.metrics.conformal import LEVEL, conformal_quantile
-from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
+from curio_train.metrics.poses import are_right
 from curio_train.refinement.multi_view import estimate_scale
 from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, SceneCode, poses
 from curio_train.worlds.base import World
@@ -128,8 +128,7 @@ def _scale(objects: Sequence[Object], cameras: CameraPoses, code: SceneCode) -> 
 
 
 def _pairs(object_: Object, slot: int, code: SceneCode, cam_from_world: Pose, known: np.ndarray) -> Pairs:
-    kind, vertices = object_.kind, object_.mesh.vertices_m
-    points = vertices[:: max(1, len(vertices) // _NUM_POINTS)]
+    kind, points = object_.kind, object_.mesh.thinned_m(_NUM_POINTS)
     confidences, answers = code[CONFIDENCE][:, slot, 0].numpy(), poses(code, slot)
     first, second, moved = [], [], []
     for one, other in _neighbours(np.flatnonzero(known)):
@@ -137,12 +136,11 @@ def _pairs(object_: Object, slot: int, code: SceneCode, cam_from_world: Pose, kn
         second.append(other)
         moved.append(cam_from_world.rows(one) @ cam_from_world.rows(other).inverse() @ answers[other])
     own = [answers[one] for one in first]
-    errors = [add_or_add_s_m(one, other, points, kind.info) for one, other in zip(own, moved, strict=True)]
     return Pairs(
         kind.name,
         np.stack([confidences[first], confidences[second]], axis=1).astype(float),
         pose_errors(own, moved, kind),
-        np.array(errors) < ADD_THRESHOLD * kind.diameter_m,
+        np.array(are_right(own, moved, points, kind.info), bool),
     )
 
 

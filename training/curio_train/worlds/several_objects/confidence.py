@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from curio_train.metrics.calibration import fit_calibration
-from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
+from curio_train.metrics.poses import are_right
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.templates.reader import CalibrationFeatures
 from curio_train.scene_code import CONFIDENCE, SceneCode, poses
@@ -53,13 +53,10 @@ def calibrate(network: ObjectsNetwork, world: ObjectScenes, cache: Path) -> None
 
 def _correct(world: ObjectScenes, found: SceneCode, true: SceneCode) -> np.ndarray:
     """Which objects' poses are correct, [batch, objects]."""
-    by_object = []
-    for number, member in enumerate(world.members):
-        vertices = member.mesh.vertices_m
-        points = vertices[:: max(1, len(vertices) // _NUM_POINTS)]
-        pairs = zip(poses(found, number), poses(true, number), strict=True)
-        errors_m = [add_or_add_s_m(one, other, points, member.kind.info) for one, other in pairs]
-        by_object.append([error_m < ADD_THRESHOLD * member.kind.diameter_m for error_m in errors_m])
+    by_object = [
+        are_right(poses(found, number), poses(true, number), member.mesh.thinned_m(_NUM_POINTS), member.kind.info)
+        for number, member in enumerate(world.members)
+    ]
     return np.array(by_object).T
 
 

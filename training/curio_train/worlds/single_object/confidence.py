@@ -1,13 +1,12 @@
 """Calibration of a two-stage detector's confidence, on renderings after training."""
 
-from itertools import repeat
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from curio_train.metrics.calibration import fit_calibration
-from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
+from curio_train.metrics.poses import are_right
 from curio_train.networks.two_stage.network import CalibrationFeatures, TwoStageNetwork
 from curio_train.scene_code import poses
 from curio_train.worlds.single_object.world import SingleObjectWorld
@@ -32,8 +31,7 @@ def calibrate(network: TwoStageNetwork, world: SingleObjectWorld, cache: Path) -
         cache: Of backgrounds.
     """
     source, kind = world.source("validation", 0, with_code=True, cache=cache), world.object.kind
-    vertices = world.object.mesh.vertices_m
-    points = vertices[:: max(1, len(vertices) // _NUM_POINTS)]
+    points = world.object.mesh.thinned_m(_NUM_POINTS)
     network.eval()
     steps = NUM_FRAMES // _BATCH_SIZE
     with_object: list[CalibrationFeatures] = []
@@ -43,8 +41,7 @@ def calibrate(network: TwoStageNetwork, world: SingleObjectWorld, cache: Path) -
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
         code, features = network.uncalibrated(batch.images.clamp(0, 1))
-        errors = map(add_or_add_s_m, poses(code), poses(batch.code), repeat(points), repeat(kind.info))
-        correct += [error < ADD_THRESHOLD * kind.diameter_m for error in errors]
+        correct += are_right(poses(code), poses(batch.code), points, kind.info)
         with_object.append(features)
         empty = source.backgrounds(steps + step, _BATCH_SIZE)
         without.append(network.uncalibrated(empty.clamp(0, 1))[1])
