@@ -32,6 +32,16 @@ class Intrinsics:
     distortion: tuple[float, ...] = ()
     """OpenCV's (k1, k2, p1, p2, k3, …): none, 4, 5 or 8 values."""
 
+    @property
+    def lens(self) -> tuple[float, ...]:
+        """The distortion, in zeros where there is none."""
+        return self.distortion or (0.0,) * 5
+
+    def entry(self) -> dict[str, object]:
+        """The fields of camera files."""
+        matrix, distortion = self.matrix.tolist(), list(self.lens)
+        return {"camera_matrix": matrix, "width": self.width, "height": self.height, "distortion": distortion}
+
 
 def check_matrix(matrix: object, width: int, height: int, where: str = "camera matrix") -> np.ndarray:
     """K as a float64 array [3, 3], or a refusal.
@@ -84,14 +94,8 @@ def save_intrinsics(path: Path, camera: Intrinsics) -> None:
     Raises:
         CameraError: The file cannot be written.
     """
-    content = {
-        "camera_matrix": camera.matrix.tolist(),
-        "width": camera.width,
-        "height": camera.height,
-        "distortion": list(camera.distortion or (0.0,) * 5),
-    }
     try:
-        write_whole(path, json.dumps(content, indent=2) + "\n")
+        write_whole(path, json.dumps(camera.entry(), indent=2) + "\n")
     except OSError as exc:
         raise CameraError(f"{path}: cannot be written ({exc.strerror}); name another file: --camera-out") from exc
 

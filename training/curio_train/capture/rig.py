@@ -86,14 +86,7 @@ def save_rig(path: Path, rig: RigCalibration) -> None:
         CameraError: The file cannot be written.
     """
     entries = [
-        {
-            "name": name,
-            "camera_matrix": found.camera.matrix.tolist(),
-            "width": found.camera.width,
-            "height": found.camera.height,
-            "distortion": list(found.camera.distortion or (0.0,) * 5),
-            "cam_from_rig": pose.tolist(),
-        }
+        {"name": name, **found.camera.entry(), "cam_from_rig": pose.tolist()}
         for name, found, pose in zip(rig.names, rig.cameras, rig.cam_from_rig, strict=True)
     ]
     try:
@@ -183,23 +176,20 @@ def _turned(pairs: list[_Pair], reference: int, one: Calibration, two: Calibrati
 
 def _rotation(points: np.ndarray, pixels: np.ndarray, camera: Intrinsics) -> np.ndarray:
     """cam_from_board."""
-    is_found, rotation_vector, _ = cv2.solvePnP(
-        points, pixels, camera.matrix, np.array(camera.distortion or (0.0,) * 5)
-    )
+    is_found, rotation_vector, _ = cv2.solvePnP(points, pixels, camera.matrix, np.array(camera.lens))
     return np.asarray(cv2.Rodrigues(rotation_vector)[0]) if is_found else np.eye(3)
 
 
 def _solve(pairs: list[_Pair], one: Intrinsics, two: Intrinsics) -> tuple[np.ndarray, float]:
     points, mine, theirs = (list(values) for values in zip(*pairs, strict=True))
-    lenses = [np.array(camera.distortion or (0.0,) * 5) for camera in (one, two)]
     error, *_, rotation, translation, _, _ = cv2.stereoCalibrate(
         points,
         mine,
         theirs,
         one.matrix,
-        lenses[0],
+        np.array(one.lens),
         two.matrix,
-        lenses[1],
+        np.array(two.lens),
         (one.width, one.height),
         flags=cv2.CALIB_FIX_INTRINSIC,
     )
