@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from paper.results import markdown_table
+
 PAPER: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "sphere_real": {"noncur": (0.48, 0.41), "our": (0.33, 0.25)},
     "bunny": {"noncur": (0.46, 0.43), "our": (0.36, 0.31)},
@@ -66,7 +68,7 @@ def _errors(table: Table) -> str:
         lines.append(cells)
     backgrounds = [next(iter(rows.values()))["plate"] for rows in table.values()]
     lines.append(["empty background image", *(f"{value:.4f}" for plate in backgrounds for value in plate)])
-    return _grid(headings, lines)
+    return markdown_table(headings, lines)
 
 
 def _provenance(table: Table) -> str:
@@ -95,9 +97,4 @@ def _provenance(table: Table) -> str:
         for scene, rows in table.items()
         for method, row in rows.items()
     ]
-    return _grid([*headings, "commit"], lines)
-
-
-def _grid(headings: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    rows = [headings, ["---"] * len(headings), *lines]
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+    return markdown_table([*headings, "commit"], lines)

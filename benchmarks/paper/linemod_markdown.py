@@ -6,7 +6,7 @@ from statistics import mean
 from curio_train.data.bop import LINEMOD_CLASSES
 
 from paper.paper_tables import LINEMOD
-from paper.results import Results, Row
+from paper.results import Results, Row, markdown_table
 
 PUBLISHED: Mapping[str, tuple[float, float, int]] = {
     "ape": (46.1, 65.5, 58),
@@ -77,7 +77,7 @@ def _rows(rows: Mapping[str, Row]) -> str:
     lines.append(
         [f"**mean of {len(lines)}**", *_means([(name, rows[name]) for name in LINEMOD_CLASSES if name in rows])]
     )
-    return _table((*_HEAD, *(f"real: {name}" for name in _REAL)), lines)
+    return markdown_table((*_HEAD, *(f"real: {name}" for name in _REAL)), lines)
 
 
 def _cells(name: str, row: Row) -> list[str]:
@@ -154,7 +154,7 @@ def _frames(rows: Mapping[str, Row]) -> str:
         for frame in row["frames"]
     ]
     head = ("class", "scene/image", "rotation, degrees", "position, mm", "ADD(-S), diameters", "confidence")
-    return _table(head, lines) if lines else ""
+    return markdown_table(head, lines) if lines else ""
 
 
 def _paper(table: Results) -> str:
@@ -177,7 +177,7 @@ def _paper(table: Results) -> str:
         "ADD(-S) recall in per cent. The paper's rows are on LineMOD's own test frames, in which nothing hides the "
         "object; ours are on the data set that each names."
     )
-    return f"{note}\n\n{_table(head, lines)}"
+    return f"{note}\n\n{markdown_table(head, lines)}"
 
 
 def _percent(share: float | None) -> str:
@@ -193,7 +193,3 @@ def _interval(metrics: Mapping[str, float], name: str) -> str:
         return _NOTHING
     low, high = metrics[f"{name}_low"], metrics[f"{name}_high"]
     return f"{_percent(metrics[name])} ({100 * low:.0f}–{100 * high:.0f})"
-
-
-def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *lines))

@@ -219,3 +219,8 @@ def save_results(file: Path, results: Results) -> None:
         draft.replace(file)
     except OSError as exc:
         raise DataError(f"cannot write {file}: {exc.strerror}; name a file that can be written: --results") from exc
+
+
+def markdown_table(headings: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A table as Markdown has it, of cells that are text."""
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (headings, ["---"] * len(headings), *lines))

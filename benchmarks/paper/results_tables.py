@@ -6,7 +6,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from paper import paper_tables as paper
-from paper.results import ORDER, REFERENCE, WORLDS, Results, Row
+from paper.results import ORDER, REFERENCE, WORLDS, Results, Row, markdown_table
 
 _TITLES: Mapping[str, str] = {
     "position": "Position",
@@ -112,7 +112,7 @@ def _ratios(results: Results, methods: Sequence[str], read: Callable[[Row], floa
         theirs = dict(zip(paper.METHODS, printed.get(world, ()), strict=False))
         beside = [f" ({theirs[method]:g})" if method in theirs else "" for method in methods]
         lines.append([world, *(cell + text for cell, text in zip(cells, beside, strict=True))])
-    return _table(["world", *(f"`{method}`" for method in methods)], lines)
+    return markdown_table(["world", *(f"`{method}`" for method in methods)], lines)
 
 
 def _absolute(results: Results) -> str:
@@ -125,7 +125,7 @@ def _absolute(results: Results) -> str:
             cells = [_cell(parameters.get(name)) for name in _TITLES]
             cells[0] += unit or " m"
             lines.append([world, f"`{method}`", _cell(row["img"]), _cell(row["para"]), *cells])
-    return _table(["world", "method", "Img", "Para", *_TITLES.values()], lines)
+    return markdown_table(["world", "method", "Img", "Para", *_TITLES.values()], lines)
 
 
 def _making(results: Results) -> str:
@@ -146,7 +146,7 @@ def _making(results: Results) -> str:
         for method, row in rows.items()
     ]
     headings = ["world", "method", "images seen", "seeds", "Para from – to", "minutes a run"]
-    return _table([*headings, "label-free", "synthetic labels", "machine", "commit"], lines)
+    return markdown_table([*headings, "label-free", "synthetic labels", "machine", "commit"], lines)
 
 
 def _spread(values: Sequence[float]) -> str:
@@ -179,8 +179,3 @@ def _against_own_network(results: Results) -> Results:
 
 def _cell(value: float | None) -> str:
     return _NOTHING if value is None else f"{value:.3g}"
-
-
-def _table(headings: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    rows = [headings, ["---"] * len(headings), *lines]
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)

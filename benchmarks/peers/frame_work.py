@@ -12,7 +12,6 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read when onnxruntime is 
 import onnxruntime
 
 INPUT = "image"
-REDUCTION = 4  # the largest that leaves a 640x480 frame more pixels than the network's 128
 
 
 class FrameWork:
@@ -34,6 +33,7 @@ class FrameWork:
 
     def __call__(self, jpeg: bytes) -> np.ndarray:
         """Position in metres, float32 [3], of what the network sees in one frame."""
+        # By 4: the most that leaves a 640x480 frame more pixels than the network's 128.
         reduced = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_REDUCED_COLOR_4)
         rgb = cv2.cvtColor(reduced, cv2.COLOR_BGR2RGB)
         view = cv2.warpPerspective(
