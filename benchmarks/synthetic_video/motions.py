@@ -39,13 +39,6 @@ def wandering(num: int, random: np.random.Generator, depth_m: float = 0.8) -> Pa
     return poses(offset + np.array([0, 0, depth_m]), turned * _viewpoint(random), num)
 
 
-def leaving_and_back(num: int, random: np.random.Generator, depth_m: float = 0.8) -> Path6:
-    """An object that leaves the view to one side in the middle of the sequence and comes back the same way."""
-    phase = np.sin(np.pi * np.arange(num) / (num - 1))[:, None] ** 2
-    side = np.array([random.choice([-1.0, 1.0]), 0, 0])
-    return poses(np.array([0, 0, depth_m]) + 1.4 * depth_m * phase * side, _viewpoint(random), num)
-
-
 def side_by_side(num: int, random: np.random.Generator, depth_m: float = 0.9) -> tuple[Path6, Path6]:
     """Two objects that come near each other, never nearer than 0.17 m, and part again."""
     towards = np.sin(np.pi * np.arange(num) / (num - 1))[:, None] ** 2
