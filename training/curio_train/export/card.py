@@ -124,7 +124,10 @@ def _origin(version: int, spec: ModelSpec, made: Provenance) -> Iterable[tuple[s
             "to train it further",
             f"`curio-train {spec.world} --init models/{spec.name}/{version}`, other flags as above",
         )
-    yield "torch to onnxruntime", f"differ by at most {spec.parity_max_abs_error:.2g} in any output"
+    yield (
+        "torch to onnxruntime",
+        f"answers that rounding does not decide differ by at most {spec.parity_max_abs_error:.2g} in any output",
+    )
 
 
 def _sum(before: float, here: float, form: str) -> str:
