@@ -5,7 +5,9 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -13,8 +15,11 @@ import pytest
 import trimesh
 from curio_serve.models.runtime import available_providers, short_name
 from curio_train.commands import doctor as doctor_command
+from curio_train.config import Recipe, WorldOptions, preset_recipe
+from curio_train.doctor import abilities, trials
 from curio_train.doctor.examine import Subjects, examine_files
 from curio_train.doctor.machine import examine_machine
+from curio_train.meshes.shapes import sphere
 
 
 def run(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, str]]:
@@ -51,7 +56,26 @@ def test_good_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(entry["symmetries_discrete"]) == 3
 
 
-def test_a_fit_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.usefixtures("one_thread")  # which the timing would change
+def test_a_fit_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Training is timed in this process: in small steps, from few images and of a coarse sphere."""
+    of_its_own = abilities._trial
+
+    def trial(call: str) -> tuple[float | None, str]:
+        if call == "render_a_box()":
+            return of_its_own(call)
+        name, world = call.removesuffix("')").split("('")
+        speed = getattr(trials, name)(world)
+        assert speed > 0
+        return speed, ""
+
+    def small(preset: Literal["laptop"], kind: type[WorldOptions]) -> Recipe:
+        return replace(preset_recipe(preset, kind), batch_size=4, micro_batch_size=4)
+
+    monkeypatch.setattr(abilities, "_trial", trial)
+    monkeypatch.setattr(trials, "preset_recipe", small)
+    monkeypatch.setattr(trials, "_NUM_IMAGES", 8)
+    monkeypatch.setattr(trials, "sphere", lambda radius, subdivisions: sphere(radius, 2))
     status, findings = run(["--cache", str(tmp_path / "not" / "yet")], capsys)
     assert status == 0
     assert findings["rendering"].startswith("good")

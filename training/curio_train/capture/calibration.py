@@ -1,6 +1,6 @@
 """A camera's K and distortion from photographs of a flat board (Zhang 2000, by OpenCV)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +19,9 @@ _FEWEST_CORNERS = 6  # of a board that is partly seen
 _LARGEST_ERROR_PX = 1.5
 _LEAST_SPREAD_DEG = 10.0
 _LARGEST_UNCERTAINTY = 0.01  # of the focal length, one standard deviation
+
+Corners = tuple[np.ndarray, np.ndarray]
+"""Points of the board [n, 3], metres, and where they are seen [n, 2], pixels."""
 
 
 @dataclass(frozen=True)
@@ -67,18 +70,18 @@ class Board:
             return (self,)
         return tuple(board for board in (larger, self) if min(board.columns, board.rows) > _FEWEST_INNER)
 
-    def find(self, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def find(self, grey: np.ndarray) -> Corners | None:
         """The board's inner corners in an image.
 
         Args:
             grey: [height, width] uint8.
 
         Returns:
-            Points of the board [n, 3], metres, and where they are seen [n, 2], pixels; None where it is not seen.
+            None where it is not seen.
         """
         return self._find_plain(grey) if self.marker_m is None else self._find_charuco(grey, self.marker_m)
 
-    def _find_plain(self, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def _find_plain(self, grey: np.ndarray) -> Corners | None:
         inner = (self.columns - 1, self.rows - 1)
         found, corners = cv2.findChessboardCornersSB(grey, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if not found:
@@ -87,7 +90,7 @@ class Board:
         points = np.stack([column, row, np.zeros_like(row)], axis=-1).reshape(-1, 3) * self.square_m
         return points.astype(np.float32), corners.reshape(-1, 2)
 
-    def _find_charuco(self, grey: np.ndarray, marker_m: float) -> tuple[np.ndarray, np.ndarray] | None:
+    def _find_charuco(self, grey: np.ndarray, marker_m: float) -> Corners | None:
         board = self._charuco(marker_m)
         corners, numbers, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
         if numbers is None or len(numbers) < _FEWEST_CORNERS:
@@ -112,12 +115,17 @@ class Calibration:
     """Standard deviation of the focal length, as a fraction of it."""
     border_px: float
     """Standard deviation of where it sees a direction, at the worst place of the frame."""
-    num_views: int
-    """Photographs in which the board was found."""
+    seen: Mapping[Path, Corners]
+    """Photographs in which the board was found, and its corners there."""
     unused: tuple[Path, ...]
     """Photographs in which the board was not found."""
     board: Board
     """The board as it was found: its counts were given in squares, or in inner corners."""
+
+    @property
+    def num_views(self) -> int:
+        """Photographs in which the board was found."""
+        return len(self.seen)
 
     @property
     def doubt(self) -> str:
@@ -146,10 +154,10 @@ def calibrate(folder: Path, board: Board) -> Calibration:
             )
         size = (grey.shape[1], grey.shape[0])
     for reading in board.readings:
-        seen = {path: reading.find(grey) for path, grey in greys.items()}
-        views = [found for found in seen.values() if found is not None]
-        if len(views) >= _FEWEST_VIEWS:
-            return _solve(folder, views, size, tuple(path for path, found in seen.items() if found is None), reading)
+        found = {path: reading.find(grey) for path, grey in greys.items()}
+        seen = {path: corners for path, corners in found.items() if corners is not None}
+        if len(seen) >= _FEWEST_VIEWS:
+            return _solve(folder, seen, size, tuple(path for path in found if path not in seen), reading)
     counts = "nor of as many inner corners " if len(board.readings) > 1 else ""
     raise CameraError(
         f"{folder}: found no board of {board.columns}x{board.rows} squares {counts}in {_FEWEST_VIEWS} or more of "
@@ -160,12 +168,12 @@ def calibrate(folder: Path, board: Board) -> Calibration:
 
 def _solve(
     folder: Path,
-    views: Sequence[tuple[np.ndarray, np.ndarray]],
+    seen: Mapping[Path, Corners],
     size: tuple[int, int],
     unused: tuple[Path, ...],
     board: Board,
 ) -> Calibration:
-    points, pixels = zip(*views, strict=True)
+    points, pixels = zip(*seen.values(), strict=True)
     try:
         lens = fitted(points, pixels, size)
     except cv2.error as exc:
@@ -187,7 +195,7 @@ def _solve(
     camera = Intrinsics(
         check_matrix(matrix, width, height, str(folder)), width, height, tuple(lens.distortion.tolist())
     )
-    return Calibration(camera, error, uncertainty, lens.uncertainty_px, len(views), unused, board)
+    return Calibration(camera, error, uncertainty, lens.uncertainty_px, seen, unused, board)
 
 
 def _spread_deg(rotation_vectors: Sequence[np.ndarray]) -> float:

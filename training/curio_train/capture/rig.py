@@ -16,17 +16,13 @@ from curio_serve.consensus.poses import angles_deg
 from curio_serve.files import write_whole
 
 from curio_train.camera import Intrinsics
-from curio_train.capture.calibration import Board, Calibration, calibrate
-from curio_train.data.photographs import Photographs, read_photograph
+from curio_train.capture.calibration import Board, Calibration, Corners, calibrate
 from curio_train.errors import CameraError, DataError
 
 LEAST_CAMERAS, MOST_CAMERAS = 2, 16
 _FEWEST_INSTANTS = 4
 _FEWEST_POINTS = 6
 _LARGEST_ERROR_PX = 1.5
-
-Corners = tuple[np.ndarray, np.ndarray]
-"""Points of the board [n, 3], metres, and where they are seen [n, 2], pixels."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +62,7 @@ def calibrate_rig(folder: Path, board: Board) -> RigCalibration:
             "photographs of the same names"
         )
     cameras = [calibrate(path, board) for path in folders]
-    seen = [_corners(path, camera.board) for path, camera in zip(folders, cameras, strict=True)]
+    seen = [{path.stem: corners for path, corners in camera.seen.items()} for camera in cameras]
     poses, counts, errors = [np.eye(4)], [len(seen[0])], [0.0]
     for number in range(1, len(folders)):
         names = f"{folders[0].name} and {folders[number].name}"
@@ -93,15 +89,6 @@ def save_rig(path: Path, rig: RigCalibration) -> None:
         write_whole(path, json.dumps({"cameras": entries}, indent=2) + "\n")
     except OSError as exc:
         raise CameraError(f"{path}: cannot be written ({exc.strerror}); name another file: --rig-out") from exc
-
-
-def _corners(folder: Path, board: Board) -> dict[str, Corners]:
-    """The board's corners by the name of the photograph, where it is seen."""
-    found = {
-        path.stem: board.find(cv2.cvtColor(read_photograph(path), cv2.COLOR_RGB2GRAY))
-        for path in Photographs(folder).paths
-    }
-    return {name: corners for name, corners in found.items() if corners is not None}
 
 
 def _relative(
