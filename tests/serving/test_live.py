@@ -14,7 +14,7 @@ from curio_serve.batch.live import LatestFrame
 from curio_serve.errors import UsageError
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-NUM_FRAMES, RATE = 60, 10
+NUM_FRAMES, RATE = 30, 10
 
 
 def write_clip(path: Path, num_frames: int) -> Path:
@@ -28,7 +28,7 @@ def write_clip(path: Path, num_frames: int) -> Path:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six seconds."""
+    """Three seconds."""
     return write_clip(tmp_path_factory.mktemp("live") / "clip.mp4", NUM_FRAMES)
 
 
@@ -68,7 +68,7 @@ def test_a_video_is_shown_to_its_end(models_dir: Path, clip: Path) -> None:
 @pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine; .ci/run installs it")
 def test_the_page_shows_rates_and_detections(models_dir: Path, tmp_path: Path) -> None:
     playwright = pytest.importorskip("playwright.sync_api")
-    port, clip = free_port(), write_clip(tmp_path / "long.mp4", 3000)  # longer than a browser takes to start
+    port, clip = free_port(), write_clip(tmp_path / "long.mp4", 900)  # longer than a browser takes to start
     process = detect(models_dir / "flat", "--video", clip, "--port", port)
     assert process.stderr is not None
     assert f"http://127.0.0.1:{port}" in process.stderr.readline()

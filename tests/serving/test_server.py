@@ -174,7 +174,7 @@ def test_models_are_replaced_without_a_failed_call(
     with ThreadPoolExecutor(2) as pool:
         asking = [pool.submit(ask) for _ in range(2)]
         try:
-            for version in range(2, 6):
+            for version in range(2, 4):
                 write_folder(root / "flat", spot_onnx(False), version)
                 while version not in seen and not any(call.done() for call in asking):
                     done.wait(0.01)
@@ -185,7 +185,7 @@ def test_models_are_replaced_without_a_failed_call(
         finally:
             done.set()
         assert all(call.result() > 0 for call in asking)
-    assert {2, 3, 4, 5} <= seen
+    assert {2, 3} <= seen
     assert 9 not in seen
 
 

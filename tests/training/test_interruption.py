@@ -42,7 +42,10 @@ def test_a_signal_that_a_library_makes_an_error_of_is_still_a_signal(capsys: pyt
 
 
 def test_what_is_stopped_before_its_first_step_says_how_to_go_on(tmp_path: Path) -> None:
-    command = [Path(sys.executable).with_name("curio-train"), "spheres", "--out", "run", "--cache", "cache"]
+    few = "{'train': 100, 'validation': 50, 'test': 50}"  # spheres, which are drawn before
+    script = f"from curio_train.worlds import image_sets; image_sets.NUM_IMAGES = {few}"
+    script += "; from curio_train.commands.train import train; train()"
+    command = [sys.executable, "-c", script, "spheres", "--out", "run", "--cache", "cache"]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as training:
         deadline = time.monotonic() + 240
         while not (tmp_path / "run" / "config.json").exists() and time.monotonic() < deadline:

@@ -90,7 +90,10 @@ def test_nothing_is_downloaded_for_what_has_no_real_frames(
     assert not (tmp_path / "cache").exists()
 
 
-def test_a_budget_that_drawing_uses_up_is_no_training(data: Path, tmp_path: Path) -> None:
+def test_a_budget_that_drawing_uses_up_is_no_training(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("curio_train.data.backgrounds.POOL_SIZE", 10)
     config = RunConfig(LinemodOptions("ape", data, two_stage=True), method="sleep", minutes=1e-9)
     with pytest.raises(UsageError, match=r"--minutes 1e-09: drawing .* leaves nothing to learn in; give more"):
         learn(config, tmp_path / "run", Interruption(), resume=False, cache=tmp_path / "cache")
