@@ -2,7 +2,7 @@
 
     python benchmarks/endurance.py [--json] [--out FILE]
                                    [--requests 50000] [--replacements 50] [--connections 10000] [--fuzz 100000]
-                                   [--attacks 20] [--hostile 60]
+                                   [--attacks 20] [--hostile 60] [--pause 1]
 
 rss_growth            memory after all requests over memory after a tenth of them, after the same pause; at most 1.05
 failed_calls          calls of clients with retries that failed while a model was replaced so many times; none may
@@ -38,6 +38,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,8 @@ class Arguments:
     """Seconds of each attack."""
     hostile: float = 60.0
     """Seconds of hostile messages."""
+    pause: float = 1.0
+    """Seconds of rest before each look at memory."""
 
 
 def main() -> None:
@@ -92,11 +95,11 @@ def main() -> None:
         models = Path(name)
         write_model(models / MODEL, K, WIDTH)
         parts = (
-            ("rss_growth", memory, arguments.requests),
+            ("rss_growth", partial(memory, pause_s=arguments.pause), arguments.requests),
             ("connections_survived", connections, arguments.connections),
             ("failed_calls", replacements, arguments.replacements),
             ("attacked_mb", attacked, arguments.attacks),
-            ("hostile_codes", hostile_messages, arguments.hostile),
+            ("hostile_codes", partial(hostile_messages, pause_s=arguments.pause), arguments.hostile),
         )
         for figure, part, number in parts:
             if number and figure not in figures:
@@ -133,7 +136,7 @@ def _say(text: str) -> None:
     print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
 
 
-def memory(models: Path, frames: list[bytes], num_requests: int) -> dict[str, Any]:
+def memory(models: Path, frames: list[bytes], num_requests: int, pause_s: float) -> dict[str, Any]:
     """Resident memory after a tenth of the requests and after all."""
     cores = sorted(os.sched_getaffinity(0))
     with running_server(models, cores) as (address, pid), worker(cores) as load:
@@ -143,7 +146,7 @@ def memory(models: Path, frames: list[bytes], num_requests: int) -> dict[str, An
         for tenth in range(10):
             share = num_requests // 10 if tenth < 9 else num_requests - 9 * (num_requests // 10)
             codes.update(load(closed_loop_of, target, 4, share))
-            time.sleep(1)
+            time.sleep(pause_s)
             sizes_mb.append(memory_mb(pid)[0])
             _say(f"{codes.total()} of {num_requests} requests, {sizes_mb[-1]} MB")
     return {
@@ -249,7 +252,7 @@ def _memory_cgroup() -> Iterator[Path | None]:
     yield None
 
 
-def hostile_messages(models: Path, frames: list[bytes], seconds: float) -> dict[str, Any]:
+def hostile_messages(models: Path, frames: list[bytes], seconds: float, pause_s: float) -> dict[str, Any]:
     """Hostile messages in ten parts, a good call after each."""
     cores = sorted(os.sched_getaffinity(0))
     codes: Counter[str] = Counter()
@@ -263,7 +266,7 @@ def hostile_messages(models: Path, frames: list[bytes], seconds: float) -> dict[
         for part in range(10):
             codes.update(attacker(hostile, address, part, seconds / 10))
             assert client.detect(MODEL, frames[0], K).results
-            time.sleep(1)
+            time.sleep(pause_s)
             sizes_mb.append(memory_mb(pid)[0])
             _say(f"{codes.total()} hostile messages, {sizes_mb[-1]} MB, {dict(codes)}")
     num_tracebacks = log.read_text(errors="replace").count("Traceback")

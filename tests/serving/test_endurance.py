@@ -10,6 +10,7 @@ _SCRIPT = Path(__file__).parents[2] / "benchmarks" / "endurance.py"
 
 def test_a_server_survives_requests_connections_and_replacements() -> None:
     numbers = {"requests": 200, "connections": 100, "replacements": 2, "fuzz": 0, "attacks": 0, "hostile": 5}
+    numbers |= {"pause": 0.1}
     flags = [text for name, number in numbers.items() for text in (f"--{name}", str(number))]
     ended = subprocess.run(
         [sys.executable, str(_SCRIPT), "--json", *flags], capture_output=True, text=True, timeout=300, check=False

@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+import shutil
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +21,7 @@ from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.runs.provenance import SESSIONS, record_session, run_sessions
 from curio_train.learning.session import learn
 from curio_train.learning.state import TrainState
+from curio_train.worlds import image_sets
 from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.options import CirclesOptions, LinemodOptions
 from torch import Tensor
@@ -36,6 +38,21 @@ CONFIG = RunConfig(
         critic=ConvStack((8, 8, 16, 16, 1), (11, 5, 3, 3, 3), (4, 4, 2, 2, 2), (0, 0, 1, 1, 1)),
     ),
 )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    """A run of six steps, which many tests begin with; each has a copy of its own."""
+    path = tmp_path_factory.mktemp("trained") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(image_sets, "NUM_IMAGES", {"train": 100, "validation": 50, "test": 50})
+        train(path, cache)
+    return path
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(trained, tmp_path / "run")
 
 
 def train(path: Path, cache: Path, config: RunConfig = CONFIG, *, resume: bool = False) -> None:
@@ -108,16 +125,14 @@ def largest_file(num_bytes: int) -> Iterator[None]:
         signal.signal(signal.SIGXFSZ, before)
 
 
-def test_a_full_disk_costs_no_earlier_checkpoint(tmp_path: Path, cache: Path) -> None:
-    train(tmp_path / "run", cache)
-    run = RunFolder.open(tmp_path / "run")
-    before = last_tensors(run.path)
-    state = run.trained(Circles())
+def test_a_full_disk_costs_no_earlier_checkpoint(run: Path) -> None:
+    before, folder = last_tensors(run), RunFolder.open(run)
+    state = folder.trained(Circles())
     state.progress.step += 1
     with largest_file(50_000), pytest.raises(CheckpointError, match=r"cannot write checkpoint .*00000006 is intact"):
-        run.save(state)
-    assert [path.name for path in run.path.joinpath("checkpoints").iterdir()] == ["00000006"]
-    assert_same(before, last_tensors(run.path))
+        folder.save(state)
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["00000006"]
+    assert_same(before, last_tensors(run))
 
 
 def test_a_full_disk_ends_training_with_that_error(tmp_path: Path, cache: Path) -> None:
@@ -126,13 +141,12 @@ def test_a_full_disk_ends_training_with_that_error(tmp_path: Path, cache: Path) 
         train(tmp_path / "run", cache)
 
 
-def test_what_a_killed_writer_left_is_no_checkpoint(tmp_path: Path, cache: Path) -> None:
-    train(tmp_path / "run", cache)
-    draft = tmp_path / "run/checkpoints/draft.tmp"
+def test_what_a_killed_writer_left_is_no_checkpoint(run: Path, cache: Path) -> None:
+    draft = run / "checkpoints/draft.tmp"
     draft.mkdir()
     (draft / "tensors.safetensors").write_bytes(b"half")
-    train(tmp_path / "run", cache, replace(CONFIG, images=56), resume=True)
-    assert RunFolder.open(tmp_path / "run").checkpoints()[-1].name == "00000007"
+    train(run, cache, replace(CONFIG, images=56), resume=True)
+    assert RunFolder.open(run).checkpoints()[-1].name == "00000007"
     assert not draft.exists()
 
 
@@ -144,58 +158,53 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again(tmp_path: Path, c
 
 
 @pytest.mark.parametrize("file", ["tensors.safetensors", "course.json"])
-def test_a_damaged_checkpoint_is_named(tmp_path: Path, cache: Path, file: str) -> None:
-    train(tmp_path / "run", cache)
-    damaged = tmp_path / "run/checkpoints/00000006" / file
+def test_a_damaged_checkpoint_is_named(run: Path, cache: Path, file: str) -> None:
+    damaged = run / "checkpoints/00000006" / file
     damaged.write_bytes(damaged.read_bytes()[:-7])
     with pytest.raises(CheckpointError, match=r"00000006 cannot be read .*delete this folder to go on"):
-        train(tmp_path / "run", cache, resume=True)
+        train(run, cache, resume=True)
 
 
-def test_a_flipped_bit_is_found(tmp_path: Path, cache: Path) -> None:
-    train(tmp_path / "run", cache)
-    file = tmp_path / "run/checkpoints/00000006/tensors.safetensors"
+def test_a_flipped_bit_is_found(run: Path, cache: Path) -> None:
+    file = run / "checkpoints/00000006/tensors.safetensors"
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     file.write_bytes(data)
     with pytest.raises(CheckpointError, match="not what SHA256SUMS says"):
-        train(tmp_path / "run", cache, resume=True)
+        train(run, cache, resume=True)
 
 
 @pytest.mark.parametrize("value", ['"7"', "-5", "1e30", "NaN", "null", "[" * 100_000])
 @pytest.mark.parametrize("field", ["step", "seconds"])
-def test_impossible_progress_is_refused(tmp_path: Path, cache: Path, field: str, value: str) -> None:
-    train(tmp_path / "run", cache)
-    last = tmp_path / "run/checkpoints/00000006"
+def test_impossible_progress_is_refused(run: Path, cache: Path, field: str, value: str) -> None:
+    last = run / "checkpoints/00000006"
     (last / "SHA256SUMS").unlink(missing_ok=True)  # as earlier versions wrote it
     progress = json.loads((last / "course.json").read_text()) | {field: "@"}
     (last / "course.json").write_text(json.dumps(progress).replace('"@"', value))
     with pytest.raises(CheckpointError, match="00000006 cannot be read"):
-        train(tmp_path / "run", cache, resume=True)
+        train(run, cache, resume=True)
 
 
-def test_files_that_are_pipes_or_endless_are_refused(tmp_path: Path, cache: Path) -> None:
-    train(tmp_path / "run", cache)
-    tensors = tmp_path / "run/checkpoints/00000006/tensors.safetensors"
+def test_files_that_are_pipes_or_endless_are_refused(run: Path, cache: Path) -> None:
+    tensors = run / "checkpoints/00000006/tensors.safetensors"
     os.truncate(tensors, 50 << 30)
     with pytest.raises(CheckpointError, match="at most"):
-        train(tmp_path / "run", cache, resume=True)
-    (tmp_path / "run/config.json").unlink()
-    os.mkfifo(tmp_path / "run/config.json")
+        train(run, cache, resume=True)
+    (run / "config.json").unlink()
+    os.mkfifo(run / "config.json")
     with pytest.raises(CheckpointError, match="not a regular file"):
-        load_config(tmp_path / "run")
+        load_config(run)
 
 
-def test_a_history_that_is_a_pipe_or_endless_is_refused(tmp_path: Path, cache: Path) -> None:
-    train(tmp_path / "run", cache)
-    file = tmp_path / "run/history.jsonl"
+def test_a_history_that_is_a_pipe_or_endless_is_refused(run: Path, cache: Path) -> None:
+    file = run / "history.jsonl"
     os.truncate(file, 50 << 30)
     with pytest.raises(CheckpointError, match=r"history\.jsonl cannot be read .*at most"):
-        train(tmp_path / "run", cache, resume=True)
+        train(run, cache, resume=True)
     file.unlink()
     os.mkfifo(file)
     with pytest.raises(CheckpointError, match=r"history\.jsonl cannot be read .*not a regular file"):
-        train(tmp_path / "run", cache, resume=True)
+        train(run, cache, resume=True)
 
 
 def test_sessions_that_are_a_pipe_or_endless_are_refused(tmp_path: Path) -> None:
@@ -215,31 +224,28 @@ def test_sessions_that_are_a_pipe_or_endless_are_refused(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe}\n", b"[]}\n", b'{"images": 8}\n', b"[" * 100_000 + b"}\n"])
-def test_a_damaged_history_is_named(tmp_path: Path, cache: Path, content: bytes) -> None:
-    train(tmp_path / "run", cache)
-    (tmp_path / "run/history.jsonl").write_bytes(content)
+def test_a_damaged_history_is_named(run: Path, cache: Path, content: bytes) -> None:
+    (run / "history.jsonl").write_bytes(content)
     with pytest.raises(CheckpointError, match=r"history.jsonl cannot be read .*delete it"):
-        train(tmp_path / "run", cache, resume=True)
+        train(run, cache, resume=True)
 
 
-def test_two_processes_do_not_train_one_run(tmp_path: Path, cache: Path) -> None:
-    train(tmp_path / "run", cache)
+def test_two_processes_do_not_train_one_run(run: Path, cache: Path) -> None:
     wanted = replace(CONFIG, images=56)
     with (
-        RunFolder(tmp_path / "run", CONFIG).lock(),
+        RunFolder(run, CONFIG).lock(),
         pytest.raises(CheckpointError, match=r"another process trains .*run: `.*`, started 20"),
     ):
-        train(tmp_path / "run", cache, wanted, resume=True)
-    assert load_config(tmp_path / "run") == CONFIG
-    train(tmp_path / "run", cache, wanted, resume=True)
+        train(run, cache, wanted, resume=True)
+    assert load_config(run) == CONFIG
+    train(run, cache, wanted, resume=True)
 
 
-def test_history_has_no_line_twice_after_a_kill(tmp_path: Path, cache: Path) -> None:
-    train(tmp_path / "run", cache)
-    with (tmp_path / "run/history.jsonl").open("a") as file:
+def test_history_has_no_line_twice_after_a_kill(run: Path, cache: Path) -> None:
+    with (run / "history.jsonl").open("a") as file:
         file.write('{"step": 7, "images": 56, "seconds": 1.0, "image": 1.0}\n{"step": 8, "ima')
-    train(tmp_path / "run", cache, replace(CONFIG, images=64), resume=True)
-    rows = [json.loads(line) for line in (tmp_path / "run/history.jsonl").read_text().splitlines()]
+    train(run, cache, replace(CONFIG, images=64), resume=True)
+    rows = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows if "image" in row] == [6, 8]
     assert [row["step"] for row in rows if "image_dssim" in row] == [6, 8]
 

@@ -1,7 +1,9 @@
 """Faults planted one by one in files that are good: each is found by its name, and nothing is found without it."""
 
+import functools
 import json
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +24,7 @@ WIDTH, HEIGHT, NUM_PHOTOS = 160, 120, 84
 K = [[180.0, 0.0, 81.0], [0.0, 180.0, 58.0], [0.0, 0.0, 1.0]]
 
 
+@functools.cache
 def plate() -> np.ndarray:
     """An empty scene in RGB: a warm table of fine grain, a cupboard behind it."""
     random = np.random.default_rng(0)
@@ -31,10 +34,11 @@ def plate() -> np.ndarray:
     return (scene + random.normal(0, 10, (HEIGHT, WIDTH, 1))).clip(0, 255).astype(np.uint8)
 
 
+@functools.cache
 def photo(number: int) -> np.ndarray:
     """The scene with a box somewhere on it."""
     random = np.random.default_rng(number + 1)
-    image = plate()
+    image = plate().copy()
     left, top = int(random.integers(0, WIDTH - 40)), int(random.integers(0, HEIGHT - 40))
     image[top : top + 32, left : left + 36] = random.integers(40, 220, (1, 1, 3))
     return (image + random.normal(0, 2, image.shape)).clip(0, 255).astype(np.uint8)
@@ -81,18 +85,25 @@ def write_camera(path: Path, matrix: Sequence[Sequence[float]] = K, **other: obj
     path.write_text(json.dumps(content | other))
 
 
-@pytest.fixture
-def files(tmp_path: Path) -> Files:
-    (tmp_path / "photos").mkdir()
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files before any test spoils them."""
+    folder = tmp_path_factory.mktemp("good")
+    (folder / "photos").mkdir()
     for number in range(NUM_PHOTOS):
-        save(tmp_path / "photos" / f"{number:03}.png", photo(number))
-    found = Files(tmp_path)
+        save(folder / "photos" / f"{number:03}.png", photo(number))
+    found = Files(folder)
     solid = trimesh.creation.box((40, 60, 90))
     solid.visual.vertex_colors = np.tile([200, 150, 40, 255], (8, 1)).astype(np.uint8)
     solid.export(found.mesh)
     write_camera(found.camera)
     save(found.plate, plate())
-    return found
+    return folder
+
+
+@pytest.fixture
+def files(good: Path, tmp_path: Path) -> Files:
+    return Files(Path(shutil.copytree(good, tmp_path, dirs_exist_ok=True)))
 
 
 def alarms(subjects: Subjects) -> list[Finding]:

@@ -1,6 +1,9 @@
 """``curio-export --int8``: smaller, told on the card, and refused where it costs accuracy."""
 
+import io
 import shutil
+from collections.abc import Iterator
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +24,32 @@ from curio_train.scene_code import TRANSLATION
 from curio_train.worlds.generated.circles import Circles
 
 
-@pytest.fixture(autouse=True)
-def _few_images(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def _few_images() -> Iterator[None]:
     """8 images to calibrate with and 50 to judge by instead of 64 and 500."""
-    monkeypatch.setattr(reduction, "NUM_CALIBRATION", 8)
-    monkeypatch.setattr(reduction, "NUM_HELD_OUT", 50)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reduction, "NUM_CALIBRATION", 8)
+        patch.setattr(reduction, "NUM_HELD_OUT", 50)
+        yield
+
+
+@pytest.fixture(scope="module")
+def reduced(
+    circles_run: Path,
+    circles_models: tuple[Exported, Exported],
+    cache: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    _few_images: None,
+) -> tuple[Path, str]:
+    """The models with version 3 in int8 and 4 with all else as half, and what the command said of version 3."""
+    models = Path(shutil.copytree(circles_models[0].path.parents[1], tmp_path_factory.mktemp("int8") / "models"))
+    told = []
+    for half in ([], ["--half"]):
+        with pytest.raises(SystemExit) as exit_, redirect_stdout(io.StringIO()) as out:
+            export_command.export([str(circles_run), "--out", str(models), "--int8", *half, "--cache", str(cache)])
+        assert not exit_.value.code
+        told.append(out.getvalue())
+    return models, told[0]
 
 
 @pytest.fixture
@@ -33,17 +57,15 @@ def models(circles_models: tuple[Exported, Exported], tmp_path: Path) -> Path:
     return Path(shutil.copytree(circles_models[0].path.parents[1], tmp_path / "models"))
 
 
-def test_a_version_in_int8(circles_run: Path, models: Path, cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as exit_:
-        export_command.export([str(circles_run), "--out", str(models), "--int8", "--cache", str(cache)])
-    assert not exit_.value.code
+def test_a_version_in_int8(reduced: tuple[Path, str]) -> None:
+    models, said = reduced
     path = models / "circles" / "3"
     size, float_size = ((models / "circles" / n / "model.onnx").stat().st_size for n in ("3", "1"))
     assert size < 0.5 * float_size
     types = {node.op_type for node in onnx.load(path / "model.onnx").graph.node}
     assert {"QuantizeLinear", "DequantizeLinear"} <= types
     told = "accuracy on 50 held-out renderings 0.0% in int8, 0.0% in float32"
-    assert told in capsys.readouterr().out
+    assert told in said
     assert f"| weights | int8 convolutions, else float32; {told} |" in (models / "circles" / "CARD.md").read_text()
 
     served = load_version(models / "circles", 3)
@@ -67,11 +89,8 @@ def test_what_costs_more_than_a_point_is_refused_with_both_figures(
     assert sorted(models.rglob("*")) == before
 
 
-def test_what_is_not_quantised_can_be_stored_as_half(circles_run: Path, models: Path, cache: Path) -> None:
-    for half in ([], ["--half"]):
-        with pytest.raises(SystemExit) as exit_:
-            export_command.export([str(circles_run), "--out", str(models), "--int8", *half, "--cache", str(cache)])
-        assert not exit_.value.code
+def test_what_is_not_quantised_can_be_stored_as_half(reduced: tuple[Path, str]) -> None:
+    models, _ = reduced
     graphs = [onnx.load(models / "circles" / number / "model.onnx").graph for number in ("3", "4")]
     assert [any(one.data_type == onnx.TensorProto.FLOAT16 for one in of.initializer) for of in graphs] == [False, True]
     assert "int8 convolutions, else float16" in (models / "circles" / "CARD.md").read_text()
@@ -107,11 +126,10 @@ def test_accuracy_is_the_share_within_a_tenth_of_the_diameter(off: float, expect
 
 
 def test_stored_answers_do_not_hang_on_how_float32_is_rounded(
-    circles_run: Path, models: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+    circles_run: Path, models: Path, reduced: tuple[Path, str], cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pixels become 0 to 1 in float32 before they are quantised, so their last digits can move whole steps."""
-    reduce = reduction.int8(cache, half=False)
-    path = export(circles_run, models, reduce=reduce).path
+    path = reduced[0] / "circles" / "3"
     golden = np.load(path / "golden.npz")
     stored = golden[TRANSLATION]
     others = list(int8.rounded_otherwise(onnx.load(path / "model.onnx")))
@@ -123,4 +141,4 @@ def test_stored_answers_do_not_hang_on_how_float32_is_rounded(
     monkeypatch.setattr(write_model, "_LARGEST_STEP", 1e-5)  # the network has learned nothing, and says hardly anything
     monkeypatch.setattr(int8, "_ROUNDING", (-1.0,))  # all that is quantised is 0
     with pytest.raises(ExportError, match="every answer to check images hangs on rounding"):
-        export(circles_run, models, reduce=reduce)
+        export(circles_run, models, reduce=reduction.int8(cache, half=False))
