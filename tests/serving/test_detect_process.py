@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-NUM_MANY = 3000  # enough that no machine is done before it is stopped
+NUM_MANY = 1500  # enough that no machine is done before it is stopped
 
 
 def command(*arguments: str | Path) -> list[str]:

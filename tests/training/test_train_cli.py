@@ -59,17 +59,17 @@ def assert_same_end(one: Path, other: Path) -> None:
 
 
 def test_a_run_killed_outright_goes_on_as_if_uninterrupted(tmp_path: Path, cache: Path, call: Call) -> None:
-    common = ["circles", "--images", 96, "--cache", cache, *SMALL]
+    common = ["circles", "--images", 64, "--cache", cache, *SMALL]
     assert call(*common, "--out", tmp_path / "whole")[0] == 0
     killed = tmp_path / "killed"
     process = start(*common, "--out", killed, "--checkpoint-minutes", 0)
-    wait_for_checkpoint(process, killed, 5)
+    wait_for_checkpoint(process, killed, 3)
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    assert checkpoints(killed)[-1].name < "00000024"
+    assert checkpoints(killed)[-1].name < "00000016"
     status, output, _ = call("circles", "--resume", killed, "--cache", cache)
     assert status == 0
-    assert f"{killed}: the budget is spent after 96 images" in output
+    assert f"{killed}: the budget is spent after 64 images" in output
     assert_same_end(tmp_path / "whole", killed)
 
 
