@@ -19,6 +19,8 @@ from curio_train.commands.evaluate import evaluate
 from curio_train.commands.export import export
 from curio_train.commands.train import train
 from curio_train.data import backgrounds
+from curio_train.evaluation import evaluate as evaluation
+from curio_train.evaluation.reporting import report
 from curio_train.export import graph
 from curio_train.learning.runs.configuration import load_config
 from curio_train.networks.templates import geometry
@@ -32,6 +34,7 @@ if not os.environ.get("CURIO_DATA"):
 
 DATA = Path(os.environ.get("CURIO_DATA", "")) / "lmo"
 FRAMES = DATA / "test" / "000002" / "rgb"
+TARGETS, APE_ID = "test_targets_bop19.json", 1
 Call = Callable[..., "subprocess.CompletedProcess[str]"]
 APE = ["linemod", "--class", "ape", "--data", DATA]
 SMALL = ["--images", "16", "--batch-size", "8", "--micro-batch-size", "8"]
@@ -46,11 +49,16 @@ def status_of(command: Callable[[list[str]], None], *arguments: object) -> int |
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Where runs, models and caches are; backgrounds, calibration and the check of stability are small meanwhile."""
+    """Where runs, models and caches are; meanwhile few whole frames are rendered and read beside those asked for."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(backgrounds, "POOL_SIZE", 10)
-        patch.setattr(confidence, "NUM_FRAMES", 25)
+        patch.setattr(confidence, "NUM_FRAMES", 5)
+        patch.setattr(confidence, "_BATCH_SIZE", 5)
+        patch.setattr(evaluation, "_BATCH_SIZE", 10)
+        patch.setattr(evaluation, "_NUM_EMPTY", 10)
+        patch.setattr(graph, "_NUM_CHECK_IMAGES", 2)
         patch.setattr(graph, "NUM_JITTERED", 2)
+        patch.setattr(report, "_NUM_COMPARED", 6)
         yield tmp_path_factory.mktemp("linemod")
 
 
@@ -77,9 +85,28 @@ def result(run: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def detected(folder: Path, model: Path, call: Call) -> list[dict[str, Any]]:
-    """What curio-detect finds in every frame, with drawings in FOLDER/overlays."""
-    done = call("curio-detect", model, FRAMES, "--camera", DATA / "camera.json", "--overlays", folder / "overlays")
+def fifth(folder: Path) -> Path:
+    """The data with every fifth frame in FOLDER/frames and the targets of these, as reading all takes longer."""
+    data, frames = folder / "lmo", folder / "frames"
+    data.mkdir()
+    frames.mkdir()
+    for path in DATA.iterdir():
+        (data / path.name).symlink_to(path)
+    chosen = sorted(FRAMES.iterdir())[::5]
+    for path in chosen:
+        (frames / path.name).symlink_to(path)
+    targets = json.loads((DATA / TARGETS).read_text())
+    numbers = {int(path.stem) for path in chosen}
+    (data / TARGETS).unlink()
+    (data / TARGETS).write_text(json.dumps([target for target in targets if target["im_id"] in numbers]))
+    return data
+
+
+@pytest.fixture(scope="module")
+def detected(folder: Path, fifth: Path, model: Path, call: Call) -> list[dict[str, Any]]:
+    """What curio-detect finds in each of these frames, with drawings in FOLDER/overlays."""
+    flags = ["--camera", DATA / "camera.json", "--overlays", folder / "overlays"]
+    done = call("curio-detect", model, folder / "frames", *flags)
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
@@ -90,7 +117,8 @@ def test_training_and_evaluation_leave_a_report(run: Path, result: dict) -> None
 
 
 def test_every_real_frame_gets_an_answer_and_a_drawing(folder: Path, detected: list[dict[str, Any]]) -> None:
-    frames = sorted(FRAMES.iterdir())
+    frames = sorted((folder / "frames").iterdir())
+    assert len(frames) == 20
     assert [Path(row["image"]) for row in detected] == frames
     for row in detected:
         (found,) = row["detections"]
@@ -103,15 +131,17 @@ def test_every_real_frame_gets_an_answer_and_a_drawing(folder: Path, detected: l
 
 
 def test_evaluation_sees_frames_as_serving_does(
-    model: Path, detected: list[dict[str, Any]], folder: Path, tmp_path: Path
+    model: Path, detected: list[dict[str, Any]], fifth: Path, folder: Path, tmp_path: Path
 ) -> None:
     """The exported model's own results file against curio-detect's answers: two implementations of one view."""
-    flags = ["--data", DATA, "--bop-results", tmp_path, "--num-images", "2", "--cache", folder / "cache"]
+    flags = ["--data", fifth, "--bop-results", tmp_path, "--num-images", "2", "--cache", folder / "cache"]
     assert status_of(evaluate, model, *flags) == 0
     with next(tmp_path.glob("*_lmo-test.csv")).open() as file:
         rows = list(csv.DictReader(file))
     served = {int(Path(row["image"]).stem): row["detections"][0] for row in detected}
-    assert len(rows) == 89
+    targets = json.loads((fifth / TARGETS).read_text())
+    assert [int(row["im_id"]) for row in rows] == [target["im_id"] for target in targets if target["obj_id"] == APE_ID]
+    assert len(rows) > 15
     for row in rows:
         found = served[int(row["im_id"])]
         assert np.array(row["t"].split(), float) / 1000 == pytest.approx(found["translation_m"], abs=1e-4)

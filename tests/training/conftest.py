@@ -11,19 +11,41 @@ from curio_train.camera import Intrinsics
 from curio_train.config import RunConfig, WorldOptions
 from curio_train.data.backgrounds import ClutterBackgrounds
 from curio_train.data.photographs import UnlabelledPhotographs
+from curio_train.evaluation import evaluate
+from curio_train.evaluation.reporting import report
 from curio_train.export import graph
 from curio_train.export.write_model import Exported, export
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.provenance import record_session
 from curio_train.learning.state import TrainingProgress, TrainState
+from curio_train.meshes.meshes import Mesh
 from curio_train.meshes.shapes import box
+from curio_train.meshes.symmetries import Symmetries, find_symmetries
 from curio_train.networks import outline_alignment
+from curio_train.networks.templates import geometry
 from curio_train.worlds import build, image_sets
 from curio_train.worlds.base import ObjectKind
 from curio_train.worlds.options import CirclesOptions
 from curio_train.worlds.single_object import confidence
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 from curio_train.worlds.single_object.world import Object
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _symmetries_found_once() -> Iterator[None]:
+    """The symmetries of a shape are searched once, which takes seconds; test_symmetries.py asks the search itself."""
+    known: dict[tuple[bytes, bytes], Symmetries] = {}
+
+    def find(mesh: Mesh) -> Symmetries:
+        shape = (mesh.vertices_m.tobytes(), mesh.faces.tobytes())
+        if shape not in known:
+            known[shape] = find_symmetries(mesh)
+        return known[shape]
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("worlds.capture", "worlds.tabletop.files", "doctor.mesh_file", "doctor.examine"):
+            patch.setattr(f"curio_train.{module}.find_symmetries", find)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -78,11 +100,22 @@ def small_image_sets(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def small_checks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Calibration on 25 frames instead of 300; 2 rounds of the check of numerical stability instead of 8; and one of
-    the alignment with outlines instead of 4, because these take long to trace.
+    """What comes after training, in small, because whole frames take long to render and to read.
+
+    Calibration on 5 frames instead of 300; outlines of 24 views instead of 220; 2 images of a kind and 2 rounds of
+    jitter in the check of numerical stability instead of 4 and 8; evaluation in batches of 5 and on 5 empty frames; 6
+    images and 3 photographs in reports; and one round of the alignment with outlines instead of 4, which take long to
+    trace.
     """
-    monkeypatch.setattr(confidence, "NUM_FRAMES", 25)
+    monkeypatch.setattr(confidence, "NUM_FRAMES", 5)
+    monkeypatch.setattr(confidence, "_BATCH_SIZE", 5)
+    monkeypatch.setattr(geometry, "NUM_VIEWS", 24)
+    monkeypatch.setattr(graph, "_NUM_CHECK_IMAGES", 2)
     monkeypatch.setattr(graph, "NUM_JITTERED", 2)
+    monkeypatch.setattr(evaluate, "_BATCH_SIZE", 5)
+    monkeypatch.setattr(evaluate, "_NUM_EMPTY", 5)
+    monkeypatch.setattr(report, "_NUM_COMPARED", 6)
+    monkeypatch.setattr(report, "_NUM_PHOTOGRAPHS", 3)
     monkeypatch.setattr(outline_alignment, "_REACHES_PX", (4.0,))
 
 

@@ -1,9 +1,10 @@
-"""``curio-train capture --calibrate`` as it is typed; from a scene's photographs in test_structure.py."""
+"""``curio-train capture`` as it is typed: --calibrate, of a scene's photographs in test_structure.py, and --project."""
 
 from pathlib import Path
 
 import pytest
 from curio_train.commands import train as train_command
+from curio_train.commands.command_line.project_file import with_project
 
 
 def call(capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[int, str, str]:
@@ -58,3 +59,8 @@ def test_no_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     status, _, err = call(capsys, "--images", tmp_path / "none", "--board", 9, 6)
     assert status == 1
     assert "there is no such folder" in err
+
+
+def test_a_project_file_may_follow_an_equals_sign(tmp_path: Path) -> None:
+    (tmp_path / "part.toml").write_text("minutes = 3\n")
+    assert with_project(["capture", f"--project={tmp_path / 'part.toml'}"], ()) == ["capture", "--minutes=3"]
