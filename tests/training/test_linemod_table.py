@@ -6,7 +6,7 @@ import importlib.util
 import json
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,6 +17,7 @@ import pytest
 import trimesh
 from curio_train.data.bop import LINEMOD_CLASSES
 from curio_train.errors import DataError, UsageError
+from curio_train.evaluation import evaluate
 from curio_train.evaluation.unlabelled.candidates import candidates
 from curio_train.worlds.options import LinemodOptions
 from paper.linemod_markdown import markdown
@@ -70,18 +71,22 @@ def data(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def settings(folder: Path, data: Path, benchmark: ModuleType, write_run: WriteRun) -> Any:
+def settings(folder: Path, data: Path, benchmark: ModuleType, write_run: WriteRun) -> Iterator[Any]:
+    """Few frames are rendered: none in a batch beyond those that are scored, and as many without the object."""
     options = LinemodOptions("ape", data, folder / "photographs", gaze=False)
     write_run(folder / "runs" / "first", options=options)
-    return benchmark.Settings(
-        runs=folder / "runs",
-        data=data,
-        frames=data,
-        sheets=folder / "sheets",
-        num_images=4,
-        results=folder / "linemod.json",
-        cache=folder / "cache",
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "_BATCH_SIZE", 4)
+        patch.setattr(evaluate, "_NUM_EMPTY", 4)
+        yield benchmark.Settings(
+            runs=folder / "runs",
+            data=data,
+            frames=data,
+            sheets=folder / "sheets",
+            num_images=4,
+            results=folder / "linemod.json",
+            cache=folder / "cache",
+        )
 
 
 @pytest.fixture(scope="module")

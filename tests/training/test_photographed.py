@@ -21,10 +21,11 @@ from curio_train.networks import outline_alignment
 from curio_train.networks.crop_camera import cut_crops
 from curio_train.networks.outline_alignment import OutlineAlignment
 from curio_train.networks.several_objects.network import ObjectsNetwork
+from curio_train.networks.templates import geometry as template_geometry
 from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import Descriptors
-from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS, NUM_VIEWS
+from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS, num_views
 from curio_train.networks.templates.reader import PoseReader
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
 from curio_train.refinement.agreeing_reads import NUM_READS_BY_TEMPLATES
@@ -63,7 +64,8 @@ def with_random_templates(world: SeveralObjectsWorld) -> ObjectsNetwork:
     assert isinstance(network, ObjectsNetwork)
     network.locator.trunk.load_state_dict(Trunk.pretrained().state_dict())
     random, cells = torch.Generator().manual_seed(0), CROP_PX // COARSE_STRIDE
-    num = NUM_VIEWS * NUM_ROLLS
+    views = num_views(any_side=False)
+    num = views * NUM_ROLLS
     for slot in range(2):
         network.reader.banks.put(
             slot,
@@ -74,8 +76,8 @@ def with_random_templates(world: SeveralObjectsWorld) -> ObjectsNetwork:
                 torch.randn(num, RANK, generator=random) * 0.05,
                 (torch.rand(num, NUM_POINTS, 3, generator=random) - 0.5) * 0.5,
                 torch.nn.functional.normalize(torch.randn(num, NUM_POINTS, FINE_WIDTH, generator=random), dim=2),
-                torch.randn(NUM_VIEWS, NUM_OUTLINE_POINTS, 3, generator=random) * 0.3,
-                torch.nn.functional.normalize(torch.randn(NUM_VIEWS, NUM_OUTLINE_POINTS, 3, generator=random), dim=2),
+                torch.randn(views, NUM_OUTLINE_POINTS, 3, generator=random) * 0.3,
+                torch.nn.functional.normalize(torch.randn(views, NUM_OUTLINE_POINTS, 3, generator=random), dim=2),
             ),
         )
     return network.eval()
@@ -158,7 +160,7 @@ class _Graph(torch.nn.Module):
 
 def chair_outlines(network: ObjectsNetwork) -> OutlineAlignment:
     """The chair's for the first object; the second one's turns the other way."""
-    found, geometry = OutlineAlignment(NUM_VIEWS, 2), network.geometries[0]
+    found, geometry = OutlineAlignment(num_views(any_side=False), 2), network.geometries[0]
     points, outward = outlines(MESH, geometry, outline_alignment.NUM_POINTS)
     for slot, sign in enumerate((1, -1)):
         found.put(sign * geometry.outline_rotations[:, 2], sign * points, sign * outward, slot)
@@ -169,6 +171,8 @@ def test_the_exported_graph_equals_torch_whichever_objects_are_asked_for(
     world: SeveralObjectsWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(outline_alignment, "_REACHES_PX", (6.0,))  # four rounds take long to trace
+    # With 220 each image is compared with 1,540 templates; with half of 48 the confidence hangs on rounding.
+    monkeypatch.setattr(template_geometry, "NUM_VIEWS", 48)
     network = with_random_templates(world)
     network.outline = chair_outlines(network)
     steps = PoseReader(network.geometries, (1, 0, 0))
@@ -181,7 +185,7 @@ def test_the_exported_graph_equals_torch_whichever_objects_are_asked_for(
     coarse = torch.rand(3, 3, 60, 80, generator=torch.Generator().manual_seed(2))
     smooth = torch.nn.functional.interpolate(coarse, (480, 640), mode="bicubic").clamp(0, 1)
     images = (255 * smooth).round().byte().permute(0, 2, 3, 1).contiguous()
-    for batch, slots in ((3, None), (3, [0, 1]), (2, [1, 0]), (1, [0]), (3, [1])):
+    for batch, slots in ((3, None), (2, [0, 1]), (2, [1, 0]), (1, [0]), (2, [1])):
         given = {"image": images[:batch].numpy()} | ({} if slots is None else {"slots": np.array(slots)})
         with torch.no_grad():
             expected = dict(zip(names, graph(images[:batch], torch.tensor(slots or [0, 1])), strict=True))

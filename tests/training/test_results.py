@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from curio_train.commands.train import parse
-from curio_train.errors import DataError
+from curio_train.errors import DataError, UsageError
 from curio_train.learning.runs.configuration import to_json
 from curio_train.worlds.options import CaptureOptions
 from paper.captures_table import PAPER
@@ -144,16 +144,20 @@ def command(folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(line, capture_output=True, text=True, timeout=600, check=False)
 
 
-def test_the_command_fills_the_table_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    flags = ["--only", "circles", "--methods", "super_1.0", "noncur", "--images", "64", "--seeds", "0"]
+def test_the_command_fills_the_table_and_goes_on_where_it_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module = benchmark_module("results", monkeypatch)
+    places = {"runs": tmp_path / "runs", "results": tmp_path / "worlds.json"}
+    settings = module.Settings(only=("circles",), methods=("super_1.0", "noncur"), images=64, seeds=(0,), **places)
     busy = tmp_path / "runs" / "circles-laptop-64" / "noncur-0.log"
     busy.parent.mkdir(parents=True)
     with busy.open("wb") as log:
         fcntl.flock(log, fcntl.LOCK_EX)
-        first = command(tmp_path, *flags)
-    assert first.returncode == 1
-    assert "circles noncur seed 0, 64 images: another process is at work on it" in first.stderr
+        assert module.main(settings) == 1
+    assert "circles noncur seed 0, 64 images: another process is at work on it" in capsys.readouterr().err
     assert list(json.loads((tmp_path / "worlds.json").read_text())["circles"]) == ["super_1.0"]
+    flags = ["--only", "circles", "--methods", "super_1.0", "noncur", "--images", "64", "--seeds", "0"]
     second = command(tmp_path, *flags)
     assert second.returncode == 0, second.stderr
     assert "1 of 2 runs are done" in second.stderr
@@ -187,10 +191,11 @@ def test_what_begins_as_another_run_sees_as_many_images_again(tmp_path: Path, mo
     assert list(merge(old, collect([found]))["spheres"]) == ["super_1.0", "our_cells", "our_found_cells"]
 
 
-def test_an_unknown_row_is_refused(tmp_path: Path) -> None:
-    done = command(tmp_path, "--methods", "ours")
-    assert done.returncode == 2
-    assert "--methods ours: there is no such row" in done.stderr
+def test_an_unknown_row_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = benchmark_module("results", monkeypatch)
+    with pytest.raises(UsageError, match="--methods ours: there is no such row") as caught:
+        module.main(module.Settings(methods=("ours",), runs=tmp_path, results=tmp_path / "worlds.json"))
+    assert caught.value.exit_status == 2
 
 
 def benchmark_module(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:

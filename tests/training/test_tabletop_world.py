@@ -303,7 +303,9 @@ def call(*words: object) -> int:
     return int(exit_.value.code or 0)
 
 
-def test_from_files_to_a_model_by_a_project_file(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_from_files_to_a_model_by_a_project_file(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_checks: None
+) -> None:
     """The whole way, three steps long: train, resume, judge, export, and a row of the table."""
     monkeypatch.setattr("curio_train.worlds.image_sets.NUM_IMAGES", {"train": 4, "validation": 4, "test": 4})
     project = folder / "table.toml"

@@ -79,9 +79,9 @@ def free_port() -> int:
 class Command:
     """A running ``curio-view``."""
 
-    def __init__(self, *arguments: str | Path, **environment: str) -> None:
+    def __init__(self, *arguments: str | Path, before: str = "", **environment: str) -> None:
         self.port = free_port()
-        script = "from curio_train.commands.view import view; view()"
+        script = f"{before}\nfrom curio_train.commands.view import view; view()"
         given = [sys.executable, "-c", script, *map(str, arguments), "--port", str(self.port)]
         full = {**os.environ, **environment}
         self.process = subprocess.Popen(given, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=full)
@@ -89,22 +89,27 @@ class Command:
         self.url = f"http://127.0.0.1:{self.port}"
         assert f"{self.url}, for this machine alone" in self.process.stderr.readline()
 
-    def end(self) -> None:
-        self.process.terminate()
-        assert self.process.wait(20) == 143
+
+@pytest.fixture(scope="module")
+def terminated() -> Iterator[list[Command]]:
+    """Commands that were told to end. They take a second or two for it, in which the next test begins."""
+    commands: list[Command] = []
+    yield commands
+    assert [command.process.wait(20) for command in commands] == [143] * len(commands)
 
 
 @pytest.fixture
-def view() -> Iterator[Callable[..., Command]]:
+def view(terminated: list[Command]) -> Iterator[Callable[..., Command]]:
     started: list[Command] = []
 
-    def start(*arguments: str | Path, **environment: str) -> Command:
-        started.append(Command(*arguments, **environment))
+    def start(*arguments: str | Path, before: str = "", **environment: str) -> Command:
+        started.append(Command(*arguments, before=before, **environment))
         return started[-1]
 
     yield start
     for command in started:
-        command.end()
+        command.process.terminate()
+        terminated.append(command)
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +209,8 @@ def test_newer_checkpoints_leave_what_is_not_saved(
     tmp_path: Path, write_run: Callable[..., Path], view: Callable[..., Command], browser: Any
 ) -> None:
     run = write_run(tmp_path / "run", SpheresOptions())
-    page = opened(browser, view(run, "--out", tmp_path / "edited.jsonl", "--cache", tmp_path).url)
+    few = "from curio_train.worlds import image_sets; image_sets.NUM_IMAGES |= {'validation': 8}"
+    page = opened(browser, view(run, "--out", tmp_path / "edited.jsonl", "--cache", tmp_path, before=few).url)
     (checkpoint,) = (run / "checkpoints").iterdir()
     across = page.get_by_label("position (mm)")
     read = across.input_value()

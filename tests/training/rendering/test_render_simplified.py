@@ -34,6 +34,11 @@ def rendering(mesh: Mesh, codes: Any, matrix: np.ndarray) -> Callable[[Moved, in
     return render
 
 
+@pytest.fixture(scope="module")
+def simpler_meshes(fine_meshes) -> dict[str, Mesh]:
+    return {name: simplified(mesh, MIN_FACES) for name, mesh in fine_meshes.items()}
+
+
 @pytest.mark.parametrize("name", ["root", "ring"])
 def test_fine_mesh_looks_and_pulls_as_it_does_in_full(
     fine_meshes, name: str, draw, camera_matrix, monkeypatch: pytest.MonkeyPatch
@@ -61,17 +66,16 @@ def test_small_meshes_are_untouched(meshes) -> None:
 
 
 @pytest.mark.parametrize("name", ["root", "ring"])
-def test_a_simplified_mesh_keeps_shape_and_name(fine_meshes, name: str) -> None:
-    mesh = fine_meshes[name]
-    simpler = simplified(mesh, MIN_FACES)
+def test_a_simplified_mesh_keeps_shape_and_name(fine_meshes, simpler_meshes, name: str) -> None:
+    mesh, simpler = fine_meshes[name], simpler_meshes[name]
     assert len(simpler.faces) == pytest.approx(MIN_FACES, rel=0.01)
     assert simpler.sha256 == mesh.sha256
     assert simpler.diameter_m == pytest.approx(mesh.diameter_m, rel=2e-3)
     assert (simpler.uv is None) == (mesh.uv is None)
 
 
-def test_colors_are_those_of_the_nearest_points(fine_meshes) -> None:
-    simpler = simplified(fine_meshes["root"], MIN_FACES)
+def test_colors_are_those_of_the_nearest_points(simpler_meshes) -> None:
+    simpler = simpler_meshes["root"]
     expected = 0.5 + 0.4 * np.sin(40 * simpler.vertices_m + [0, 1, 2])
     np.testing.assert_allclose(simpler.vertex_colors_srgb, expected, atol=1e-3)
 
@@ -81,9 +85,9 @@ def test_simplifying_little_loses_nothing(fine_meshes) -> None:
     assert len(simplified(fine_meshes["root"], 150_000).faces) == pytest.approx(150_000, rel=0.01)
 
 
-def test_texture_is_not_smeared_across_a_seam(fine_meshes) -> None:
+def test_texture_is_not_smeared_across_a_seam(simpler_meshes) -> None:
     """No face spans the texture from one side to the other, as it would with both sides of a seam in its corners."""
-    simpler = simplified(fine_meshes["ring"], MIN_FACES)
+    simpler = simpler_meshes["ring"]
     assert simpler.uv is not None
     assert float(np.ptp(simpler.uv[simpler.faces], axis=1).max()) < 0.2
 
