@@ -68,7 +68,7 @@ def serving(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Iterator[
 
 @pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory, call: Call) -> Path:
-    """Twenty steps of learning from images alone."""
+    """Ten steps of learning from images alone."""
     folder = tmp_path_factory.mktemp("train")
     flags = ["--method", "noncur", "--images", "640", "--cache", folder / "cache", "--out", folder / "run"]
     done = call("curio-train", "circles", *flags)

@@ -1,7 +1,14 @@
-"""From images without labels to poses over gRPC, through the commands a user types."""
+"""From images without labels to poses over gRPC, through the commands a user types.
+
+Then serving and detection where nothing that the base install leaves out can be imported: in one file with the others,
+so that one process of the tests trains the run that both look at.
+"""
 
 import json
-from collections.abc import Callable
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import cv2
@@ -9,11 +16,36 @@ import numpy as np
 import pytest
 import torch
 from curio_serve.client import PoseClient
+from curio_train.commands.evaluate import evaluate
 from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.scene_code import TRANSLATION
 from curio_train.worlds import build
 
 TOLERANCE = 1e-5  # image widths
+ROOT = Path(__file__).parents[2]
+BLOCKED = (
+    "torch",
+    "mitsuba",
+    "drjit",
+    "onnx",
+    "onnxscript",
+    "trimesh",
+    "scipy",
+    "skimage",
+    "matplotlib",
+    "PIL",
+    "curio_train",
+)
+REFUSING = f"""
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {BLOCKED}:
+            raise ImportError(name + " is blocked in this test")
+
+sys.meta_path.insert(0, Blocked())
+"""
 
 
 @pytest.fixture(scope="module")
@@ -71,11 +103,15 @@ def test_detection_through_the_server_says_the_same(
     assert np.array(found) == pytest.approx(expected, abs=TOLERANCE)
 
 
-def test_run_and_model_get_the_same_marks(run: Path, models: Path, call: Callable[..., object], tmp_path: Path) -> None:
-    flags = ["--num-images", "60", "--cache", run.parent / "cache", "--json"]
-    of_run, of_model = (
-        json.loads(call("curio-eval", path, *flags).stdout.splitlines()[-1]) for path in (run, models / "circles")
-    )
+def test_run_and_model_get_the_same_marks(
+    run: Path, models: Path, call: Callable[..., object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--num-images", "60", "--cache", str(run.parent / "cache"), "--json"]
+    of_run = json.loads(call("curio-eval", run, *flags).stdout.splitlines()[-1])
+    with pytest.raises(SystemExit) as exit_:  # the second time in this process, which spares the imports
+        evaluate([str(models / "circles"), *flags])
+    assert not exit_.value.code
+    of_model = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert of_run["num_images"] == of_model["num_images"] == 60
     for name, value in of_run["metrics"].items():
         assert of_model["metrics"][name] == pytest.approx(value, rel=1e-4), name
@@ -83,3 +119,59 @@ def test_run_and_model_get_the_same_marks(run: Path, models: Path, call: Callabl
     assert of_run["untrained"] != of_run["metrics"]
     kept = json.loads((run / "evaluation.json").read_text())
     assert kept == of_run
+
+
+@pytest.fixture(scope="module")
+def blocked(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
+    """Environment variables under which every Python process refuses these packages."""
+    folder = tmp_path_factory.mktemp("hook")
+    (folder / "sitecustomize.py").write_text(REFUSING)
+    return {"PYTHONPATH": str(folder)}
+
+
+@pytest.mark.parametrize("package", BLOCKED)
+def test_the_block_holds(blocked: Mapping[str, str], package: str) -> None:
+    command = [sys.executable, "-c", f"import {package}"]
+    done = subprocess.run(command, env=os.environ | blocked, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "is blocked in this test" in done.stderr
+
+
+def test_detection_works(
+    models: Path,
+    frames: list[Path],
+    blocked: Mapping[str, str],
+    call: Callable[..., "subprocess.CompletedProcess[str]"],
+) -> None:
+    done = call("curio-detect", models / "circles", frames[0].parent, extra=blocked)
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [len(row["detections"]) for row in rows] == [1] * len(frames)
+
+
+def test_the_server_works(
+    models: Path, frames: list[Path], blocked: Mapping[str, str], serving: Callable[..., object]
+) -> None:
+    with serving(models, extra=blocked) as address, PoseClient(address) as client:
+        assert len(client.detect("circles", frames[0]).results[0].detections) == 1
+
+
+@pytest.mark.parametrize("through", ["track", "rig"])
+def test_following_and_rigs_work(
+    through: str, tmp_path: Path, blocked: Mapping[str, str], call: Callable[..., "subprocess.CompletedProcess[str]"]
+) -> None:
+    samples = ROOT / "samples"
+    flags: list[str | Path] = [samples, "--camera", samples / "camera.json", "--track"]
+    if through == "rig":
+        camera = json.loads((samples / "camera.json").read_text())
+        cameras = [camera | {"name": str(x), "cam_from_rig": beside(x)} for x in (0.0, 0.1)]
+        (tmp_path / "rig.json").write_text(json.dumps({"cameras": cameras}))
+        flags = [samples / "00.jpg", samples / "01.jpg", "--rig", tmp_path / "rig.json"]
+    done = call("curio-detect", ROOT / "models" / "ape", *flags, extra=blocked)
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(rows) == (1 if through == "rig" else 4)
+    assert all(row["detections"] for row in rows)
+
+
+def beside(x_m: float) -> list[list[float]]:
+    """cam_from_rig, [4][4], of a camera that looks along the rig's axis, x_m to the left of it."""
+    return [[1, 0, 0, x_m], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

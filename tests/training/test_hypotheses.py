@@ -1,6 +1,9 @@
 """Scenes that are found by image loss among rendered hypotheses, and the method that teaches them."""
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -12,6 +15,7 @@ from curio_train.learning.trainer import Trainer
 from curio_train.metrics.assignment import each_parameter_error, scene_error
 from curio_train.scene_code import CONFIDENCE, TRANSLATION, YAW
 from curio_train.worlds import WORLDS, build
+from curio_train.worlds.base import Explainer
 from curio_train.worlds.generated.generated_world import GeneratedWorld
 from curio_train.worlds.generated.hypotheses.descent import image_losses
 from curio_train.worlds.image_sets import StoredImages
@@ -22,10 +26,17 @@ from torch import Tensor
 CELLS = NetworkConfig(reading="cells")
 
 
+@functools.cache
 def world_of(name: str) -> GeneratedWorld:
     world = build(WORLDS[name]())
     assert isinstance(world, GeneratedWorld)
     return world
+
+
+@functools.cache
+def explainer_of(name: str) -> Explainer:
+    """That of a world, whose bank of renderings takes seconds."""
+    return world_of(name).explainer()
 
 
 @torch.no_grad()
@@ -39,13 +50,32 @@ def error(world: GeneratedWorld, found: dict[str, Tensor], code: dict[str, Tenso
     return float(scene_error(world.layout, found, code, groups).median())
 
 
+class Searched(NamedTuple):
+    """Scenes, their images, and what was found by these."""
+
+    code: dict[str, Tensor]
+    images: Tensor
+    found: dict[str, Tensor]
+
+
+@pytest.fixture(scope="module")
+def searched() -> Callable[[str], Searched]:
+    """``searched(name)``: scenes of a world, searched once."""
+
+    @functools.cache
+    def search(name: str) -> Searched:
+        code = world_of(name).sample(12 if name == "multi" else 8, (8,))
+        images = photographed(world_of(name), code)
+        return Searched(code, images, explainer_of(name).explain(images))
+
+    return search
+
+
 @pytest.mark.parametrize("name", ["chairs", "multi"])
-def test_scenes_are_found_from_their_images_alone(name: str) -> None:
-    world = world_of(name)
-    code = world.sample(8, (5,))
-    found = world.explainer().explain(photographed(world, code))
+def test_scenes_are_found_from_their_images_alone(searched: Callable[[str], Searched], name: str) -> None:
+    world, (code, _, found) = world_of(name), searched(name)
     assert found[CONFIDENCE].mean() > 0.9  # both worlds show all of their objects
-    assert error(world, found, code) < 0.3 * error(world, world.sample(8, (6,)), code)
+    assert error(world, found, code) < 0.3 * error(world, world.sample(len(code[TRANSLATION]), (6,)), code)
 
 
 def test_a_sun_that_moves_is_found_with_the_scene() -> None:
@@ -57,13 +87,13 @@ def test_a_sun_that_moves_is_found_with_the_scene() -> None:
     assert off.median() < 2
 
 
-def test_objects_that_explain_nothing_are_searched_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = world_of("multi")
-    images = photographed(world, world.sample(12, (8,)))
-    explainer = world.explainer()
-    after = image_losses(world, explainer.explain(images), images)
+def test_objects_that_explain_nothing_are_searched_for_again(
+    searched: Callable[[str], Searched], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world, (_, images, found) = world_of("multi"), searched("multi")
+    after = image_losses(world, found, images)
     monkeypatch.setattr("curio_train.worlds.generated.hypotheses.search._REACHES_M", ())
-    before = image_losses(world, explainer.explain(images), images)
+    before = image_losses(world, explainer_of("multi").explain(images), images)
     assert (after < before + 2).all()  # outlines are sampled: equal scenes differ by less
     assert after.mean() < 0.95 * before.mean()
 
@@ -71,13 +101,13 @@ def test_objects_that_explain_nothing_are_searched_for_again(monkeypatch: pytest
 def test_an_empty_image_has_no_objects() -> None:
     world = world_of("multi")
     code = world.sample(2, (0,)) | {CONFIDENCE: torch.zeros(2, world.layout.num_slots, 1)}
-    found = world.explainer().explain(photographed(world, code))
+    found = explainer_of("multi").explain(photographed(world, code))
     assert found[CONFIDENCE].max() == 0
 
 
 def test_found_objects_stand_on_the_ground_and_yaws_have_unit_length() -> None:
     world = world_of("chairs")
-    found = world.explainer().explain(photographed(world, world.sample(4, (7,))))
+    found = explainer_of("chairs").explain(photographed(world, world.sample(4, (7,))))
     assert found[TRANSLATION][..., 1].abs().max() == 0
     assert torch.isfinite(found[YAW]).all()
 
@@ -116,7 +146,7 @@ def test_the_method_learns_and_the_label_file_is_never_opened(tmp_path: Path) ->
     images = StoredImages(
         world.source("train", 0, with_code=False, cache=cache).images[:8], None, seed=0, shuffle=False
     )
-    found = images.with_code(explained(world.explainer(), images.images, tmp_path)[0])
+    found = images.with_code(explained(explainer_of("chairs"), images.images, tmp_path)[0])
     recipe = Recipe(batch_size=8, micro_batch_size=8, learning_rate=3e-3)
     config = RunConfig(WORLDS["chairs"](), method="hypotheses", network=CELLS, recipe=recipe)
     trainer = Trainer(config, world, [found], Ranks(0, 1, torch.device("cpu")))
