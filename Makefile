@@ -51,9 +51,10 @@ demo: $(READY)
 	@$(BIN)/python benchmarks/demo.py
 
 # Two processes of one thread each: the tests train tiny networks beside the renderer's own threads, which waiting threads
-# would only slow down.
+# would only slow down. They start hundreds of processes, each of which would compile the sources anew where the
+# environment forbids to write compiled ones.
 test: $(READY)
-	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -n 2 --dist loadfile
+	@PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -n 2 --dist loadfile
 
 check: $(READY)
 	@$(BIN)/ruff check .
