@@ -4,10 +4,9 @@
 
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
-10c6bff; models/lmo/5 has seen them), and no label of a frame is opened in training. What is finished is kept, a run
-that was cut off goes on. The last line is the result, also in OUT/halves.json: means of both halves, by one read, by
-nine, and by one and three of the model that ``curio-export --fast`` makes; as served, and refined by
-render-and-compare.
+10c6bff; models/lmo/5 has seen them), and no label of a frame is opened in training. A call goes on with
+what is there. The last line, also in OUT/halves.json, is of both halves: by one read, by nine, and by one and three of
+``curio-export --fast``; as served, after render-and-compare, and with ``--plane objects`` (one read and nine).
 """
 
 import argparse
@@ -48,6 +47,7 @@ def main() -> None:
         others = _scored(out / f"scored-{1 - half}", data, {int(frame.stem) for frame in frames[1 - half :: 2]})
         scores.append({"reads_1": _evaluate(run, others, 1), "reads_9": _evaluate(run, others, 9)})
         fast = _fast(run, out / f"fast-{half}")
+        scores[-1] |= {f"reads_{reads}_plane": _evaluate(run, others, reads, on_plane=True) for reads in (1, 9)}
         scores[-1] |= {"fast": _evaluate(fast, others, 1), "fast_reads_3": _evaluate(fast, others, 3)}
     result = {name: _mean([one[name] for one in scores]) for name in scores[0]} | {
         "init": "/".join(arguments.init.parts[-2:]),
@@ -94,15 +94,15 @@ def _fast(run: Path, models: Path) -> Path:
     return model
 
 
-def _evaluate(run: Path, data: Path, reads: int) -> dict[str, Any]:
-    """What ``curio-eval --json`` says of a run or a model and the frames, as read and refined; kept in OUT."""
-    kept = data.parent / f"{data.name}-{run.name}-reads-{reads}.json"
+def _evaluate(run: Path, data: Path, reads: int, *, on_plane: bool = False) -> dict[str, Any]:
+    """What ``curio-eval --json`` says of the frames, as read, and refined or moved onto a plane; kept in OUT."""
+    kept = data.parent / f"{data.name}-{run.name}-reads-{reads}{'-plane' * on_plane}.json"
     if not kept.exists():
-        often = ["--reads", reads] if reads > 1 else []
-        line = _call("curio-eval", run, "--data", data, "--refine", "--num-images", _RENDERINGS, "--json", *often)
+        how = ["--reads", reads, "--num-images", _RENDERINGS, *(["--plane", "objects"] if on_plane else ["--refine"])]
+        line = _call("curio-eval", run, "--data", data, "--json", *how)
         kept.write_text(line.splitlines()[-1] + "\n", encoding="utf-8")
     found: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
-    return {"served": found["real"], "refined": found["refined"]["real"]}
+    return {"served": found["real"]} | ({} if on_plane else {"refined": found["refined"]["real"]})
 
 
 def _call(command: str, *words: Any) -> str:
@@ -128,7 +128,7 @@ def _mean(halves: list[dict[str, Any]]) -> dict[str, Any]:
                 for name in halves[0][kind]["objects"]
             }
         }
-        for kind in ("served", "refined")
+        for kind in halves[0]
     }
 
 

@@ -9,6 +9,7 @@ import pytest
 from curio_train.camera import load_intrinsics, save_intrinsics
 from curio_train.capture.calibration import Board, calibrate
 from curio_train.capture.options import CalibrateCommand
+from curio_train.capture.plane import CameraPoseFile
 from curio_train.commands.calibrate import run
 from curio_train.commands.train import train
 from curio_train.errors import CameraError, DataError, UsageError
@@ -141,6 +142,24 @@ def test_photographs_of_two_sizes(tmp_path: Path) -> None:
 def test_boards_that_cannot_be(values: tuple[int, int, float]) -> None:
     with pytest.raises(CameraError, match="expected"):
         Board(*values)
+
+
+def test_the_last_photograph_says_where_the_camera_stands_over_the_board(tmp_path: Path) -> None:
+    (tmp_path / "boards").mkdir()
+    folder = write(tmp_path / "boards", PLAIN, 12)
+    turn = Rotation.from_euler("xyz", [-40, 5, 10], degrees=True).as_matrix()
+    middle_m = np.array([0.02, -0.01, 0.6])
+    cv2.imwrite(str(folder / "table.png"), photograph(picture(PLAIN), turn, middle_m))
+    outputs = {"camera_out": tmp_path / "camera.json", "plane_out": tmp_path / "plane.json"}
+    told = run(CalibrateCommand(images=folder, board=(9, 6), **outputs), lambda *_: pytest.fail("no structure"))
+    found = CameraPoseFile.read(tmp_path / "plane.json").plane(tmp_path / "any.png")
+    normal = -turn[:, 2] * np.sign(turn[:, 2] @ middle_m)
+    assert found.normal @ normal > np.cos(np.radians(0.5))
+    assert found.offset_m == pytest.approx(normal @ middle_m, abs=0.003)
+    assert f"stands {-found.offset_m:.3f} m above the board and looks" in told
+    cv2.imwrite(str(folder / "zebra.png"), np.full((HEIGHT, WIDTH), 90, np.uint8))
+    with pytest.raises(CameraError, match=r"zebra\.png, the last photograph, does not show the whole board"):
+        run(CalibrateCommand(images=folder, board=(9, 6), **outputs), lambda *_: pytest.fail("no structure"))
 
 
 def test_the_camera_file_is_read_as_written(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from curio_train.scene_code import CONFIDENCE, SceneCode
 from curio_train.worlds.several_objects.scenes import ObjectScenes
 from curio_train.worlds.single_object.two_stage import TwoStageWorld, frame_camera
 from curio_train.worlds.single_object.world import Object, pose_layout, position_field
+from google.protobuf import json_format
 from scipy.spatial.transform import Rotation
 
 
@@ -127,7 +128,7 @@ def test_the_file_beside_a_model(circles_models: tuple[Exported, Exported], tmp_
     found = Reliability(level=0.9, objects=[_reliability(name).objects[0] for name in names])
     version = folder.versions()[-1]
     for _ in range(2):  # a second measurement takes the place of the first
-        path = folder.put_reliability(version, found)
+        path = folder.put_beside(version, "reliability.json", json_format.MessageToJson(found))
     assert (folder.path / "SHA256SUMS").read_text().count("reliability.json") == 1
     assert path in folder.files()
     assert open_model(folder.path).spec.reliability == found

@@ -172,11 +172,6 @@ def rotation_between(
     return identity + skew + skew @ skew / (1 + cos).clamp(min=_SHORTEST)
 
 
-def is_rotation(matrix: np.ndarray, tolerance: float) -> bool:
-    """Whether a matrix [3, 3] is a rotation; the product with its transpose may be so far from the identity."""
-    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= tolerance and np.linalg.det(matrix) >= 0)
-
-
 def rotation_angle_deg(a: Float[Tensor, "*#batch 3 3"], b: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "..."]:
     """Angle of the relative rotation, in [0, 180] degrees.
 

@@ -25,19 +25,19 @@ _sym_db = _symbol_database.Default()
 from curio_proto.v1 import model_spec_pb2 as curio__proto_dot_v1_dot_model__spec__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1d\x63urio_proto/v1/detector.proto\x12\x08\x63urio.v1\x1a\x1f\x63urio_proto/v1/model_spec.proto\".\n\rModelSelector\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\r\"n\n\x08RawImage\x12%\n\x06\x66ormat\x18\x01 \x01(\x0e\x32\x15.curio.v1.PixelFormat\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\x0e\n\x06stride\x18\x04 \x01(\r\x12\x0c\n\x04\x64\x61ta\x18\x05 \x01(\x0c\"R\n\x06\x43\x61mera\x12\x15\n\rcamera_matrix\x18\x01 \x03(\x01\x12\x12\n\ndistortion\x18\x02 \x03(\x01\x12\r\n\x05width\x18\x03 \x01(\r\x12\x0e\n\x06height\x18\x04 \x01(\r\"=\n\x06Region\x12\t\n\x01x\x18\x01 \x01(\x02\x12\t\n\x01y\x18\x02 \x01(\x02\x12\r\n\x05width\x18\x03 \x01(\x02\x12\x0e\n\x06height\x18\x04 \x01(\x02\"\xfb\x03\n\rDetectRequest\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\'\n\x06models\x18\x02 \x03(\x0b\x32\x17.curio.v1.ModelSelector\x12\x11\n\x07\x65ncoded\x18\x03 \x01(\x0cH\x00\x12!\n\x03raw\x18\x04 \x01(\x0b\x32\x12.curio.v1.RawImageH\x00\x12 \n\x06\x63\x61mera\x18\x05 \x01(\x0b\x32\x10.curio.v1.Camera\x12!\n\x07regions\x18\x06 \x03(\x0b\x32\x10.curio.v1.Region\x12\x1b\n\x0emin_confidence\x18\x07 \x01(\x02H\x01\x88\x01\x01\x12\x1b\n\x0emax_detections\x18\x08 \x01(\rH\x02\x88\x01\x01\x12\x1b\n\x13\x61pply_exif_rotation\x18\t \x01(\x08\x12&\n\x05track\x18\n \x01(\x0b\x32\x12.curio.v1.TrackingH\x03\x88\x01\x01\x12\x1a\n\rmax_instances\x18\x0b \x01(\rH\x04\x88\x01\x01\x12\x1d\n\x05views\x18\x0c \x03(\x0b\x32\x0e.curio.v1.View\x12\x12\n\x05reads\x18\r \x01(\rH\x05\x88\x01\x01\x12\x0f\n\x07objects\x18\x0e \x03(\tB\x07\n\x05imageB\x11\n\x0f_min_confidenceB\x11\n\x0f_max_detectionsB\x08\n\x06_trackB\x10\n\x0e_max_instancesB\x08\n\x06_reads\"}\n\x04View\x12\x11\n\x07\x65ncoded\x18\x01 \x01(\x0cH\x00\x12!\n\x03raw\x18\x02 \x01(\x0b\x32\x12.curio.v1.RawImageH\x00\x12 \n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x10.curio.v1.Camera\x12\x14\n\x0c\x63\x61m_from_rig\x18\x04 \x03(\x01\x42\x07\n\x05image\"\x95\x01\n\x08Tracking\x12\x13\n\x06time_s\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x13\n\x06keep_s\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12\x18\n\x0bnum_objects\x18\x03 \x01(\rH\x02\x88\x01\x01\x12\x0e\n\x06search\x18\x04 \x01(\x08\x12\x0f\n\x07restart\x18\x05 \x01(\x08\x42\t\n\x07_time_sB\t\n\x07_keep_sB\x0e\n\x0c_num_objects\"W\n\x0cPoseInterval\x12\r\n\x05level\x18\x01 \x01(\x01\x12\x11\n\tlateral_m\x18\x02 \x01(\x01\x12\x0f\n\x07\x64\x65pth_m\x18\x03 \x01(\x01\x12\x14\n\x0crotation_deg\x18\x04 \x01(\x01\"\xc8\x02\n\tDetection\x12\x0e\n\x06object\x18\x01 \x01(\t\x12\x12\n\nconfidence\x18\x02 \x01(\x02\x12\x15\n\rtranslation_m\x18\x03 \x03(\x01\x12\x13\n\x0brotation_6d\x18\x04 \x03(\x01\x12\x10\n\x08rotation\x18\x05 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x06 \x03(\x01\x12\r\n\x05\x63olor\x18\x07 \x03(\x01\x12\x0e\n\x06\x62ox_px\x18\x08 \x03(\x01\x12\x1d\n\x15outside_trained_range\x18\t \x01(\x08\x12\x1e\n\x05track\x18\n \x01(\x0b\x32\x0f.curio.v1.Track\x12\r\n\x05views\x18\x0b \x03(\r\x12)\n\x06status\x18\x0c \x01(\x0e\x32\x19.curio.v1.DetectionStatus\x12(\n\x08interval\x18\r \x01(\x0b\x32\x16.curio.v1.PoseInterval\"\xd7\x01\n\x05Track\x12\x10\n\x08track_id\x18\x01 \x01(\x04\x12\r\n\x05\x61ge_s\x18\x02 \x01(\x01\x12\x10\n\x08unseen_s\x18\x03 \x01(\x01\x12\x11\n\tpredicted\x18\x04 \x01(\x08\x12\x15\n\rtranslation_m\x18\x05 \x03(\x01\x12\x10\n\x08rotation\x18\x06 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x07 \x03(\x01\x12\x14\n\x0cvelocity_m_s\x18\x08 \x03(\x01\x12\x16\n\x0eposition_std_m\x18\t \x03(\x01\x12\x18\n\x10rotation_std_rad\x18\n \x01(\x01\"\xa4\x01\n\x0cRegionResult\x12\r\n\x05model\x18\x01 \x01(\t\x12\x15\n\rmodel_version\x18\x02 \x01(\r\x12\x0e\n\x06region\x18\x03 \x01(\r\x12&\n\x06status\x18\x04 \x01(\x0e\x32\x16.curio.v1.RegionStatus\x12\'\n\ndetections\x18\x05 \x03(\x0b\x32\x13.curio.v1.Detection\x12\r\n\x05light\x18\x06 \x03(\x01\"@\n\x0cMilliseconds\x12\r\n\x05queue\x18\x01 \x01(\x01\x12\x0e\n\x06\x64\x65\x63ode\x18\x02 \x01(\x01\x12\x11\n\tinference\x18\x03 \x01(\x01\";\n\nFrameError\x12\x0c\n\x04\x63ode\x18\x01 \x01(\r\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x0f\n\x07message\x18\x03 \x01(\t\"\xbf\x01\n\x0e\x44\x65tectResponse\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\'\n\x07results\x18\x04 \x03(\x0b\x32\x16.curio.v1.RegionResult\x12,\n\x0cmilliseconds\x18\x05 \x01(\x0b\x32\x16.curio.v1.Milliseconds\x12#\n\x05\x65rror\x18\x06 \x01(\x0b\x32\x14.curio.v1.FrameError\"\x13\n\x11ListModelsRequest\"K\n\tModelInfo\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x10\n\x08versions\x18\x02 \x03(\r\x12\r\n\x05world\x18\x03 \x01(\t\x12\x0f\n\x07objects\x18\x04 \x03(\t\"9\n\x12ListModelsResponse\x12#\n\x06models\x18\x01 \x03(\x0b\x32\x13.curio.v1.ModelInfo\"9\n\x0fGetModelRequest\x12&\n\x05model\x18\x01 \x01(\x0b\x32\x17.curio.v1.ModelSelector\"F\n\x10GetModelResponse\x12!\n\x04spec\x18\x01 \x01(\x0b\x32\x13.curio.v1.ModelSpec\x12\x0f\n\x07version\x18\x02 \x01(\r*q\n\x0bPixelFormat\x12\x1c\n\x18PIXEL_FORMAT_UNSPECIFIED\x10\x00\x12\x15\n\x11PIXEL_FORMAT_RGB8\x10\x01\x12\x15\n\x11PIXEL_FORMAT_BGR8\x10\x02\x12\x16\n\x12PIXEL_FORMAT_GRAY8\x10\x03*\xa1\x01\n\x0cRegionStatus\x12\x1d\n\x19REGION_STATUS_UNSPECIFIED\x10\x00\x12\x1a\n\x16REGION_STATUS_DETECTED\x10\x01\x12\x1b\n\x17REGION_STATUS_NO_OBJECT\x10\x02\x12\x1f\n\x1bREGION_STATUS_OUTSIDE_FRAME\x10\x03\x12\x18\n\x14REGION_STATUS_UNSURE\x10\x04*k\n\x0f\x44\x65tectionStatus\x12 \n\x1c\x44\x45TECTION_STATUS_UNSPECIFIED\x10\x00\x12\x19\n\x15\x44\x45TECTION_STATUS_SURE\x10\x01\x12\x1b\n\x17\x44\x45TECTION_STATUS_UNSURE\x10\x02\x32\x9e\x02\n\x0cPoseDetector\x12;\n\x06\x44\x65tect\x12\x17.curio.v1.DetectRequest\x1a\x18.curio.v1.DetectResponse\x12\x45\n\x0c\x44\x65tectStream\x12\x17.curio.v1.DetectRequest\x1a\x18.curio.v1.DetectResponse(\x01\x30\x01\x12G\n\nListModels\x12\x1b.curio.v1.ListModelsRequest\x1a\x1c.curio.v1.ListModelsResponse\x12\x41\n\x08GetModel\x12\x19.curio.v1.GetModelRequest\x1a\x1a.curio.v1.GetModelResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1d\x63urio_proto/v1/detector.proto\x12\x08\x63urio.v1\x1a\x1f\x63urio_proto/v1/model_spec.proto\".\n\rModelSelector\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\r\"n\n\x08RawImage\x12%\n\x06\x66ormat\x18\x01 \x01(\x0e\x32\x15.curio.v1.PixelFormat\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\x0e\n\x06stride\x18\x04 \x01(\r\x12\x0c\n\x04\x64\x61ta\x18\x05 \x01(\x0c\"R\n\x06\x43\x61mera\x12\x15\n\rcamera_matrix\x18\x01 \x03(\x01\x12\x12\n\ndistortion\x18\x02 \x03(\x01\x12\r\n\x05width\x18\x03 \x01(\r\x12\x0e\n\x06height\x18\x04 \x01(\r\"=\n\x06Region\x12\t\n\x01x\x18\x01 \x01(\x02\x12\t\n\x01y\x18\x02 \x01(\x02\x12\r\n\x05width\x18\x03 \x01(\x02\x12\x0e\n\x06height\x18\x04 \x01(\x02\"\xaa\x04\n\rDetectRequest\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\'\n\x06models\x18\x02 \x03(\x0b\x32\x17.curio.v1.ModelSelector\x12\x11\n\x07\x65ncoded\x18\x03 \x01(\x0cH\x00\x12!\n\x03raw\x18\x04 \x01(\x0b\x32\x12.curio.v1.RawImageH\x00\x12 \n\x06\x63\x61mera\x18\x05 \x01(\x0b\x32\x10.curio.v1.Camera\x12!\n\x07regions\x18\x06 \x03(\x0b\x32\x10.curio.v1.Region\x12\x1b\n\x0emin_confidence\x18\x07 \x01(\x02H\x01\x88\x01\x01\x12\x1b\n\x0emax_detections\x18\x08 \x01(\rH\x02\x88\x01\x01\x12\x1b\n\x13\x61pply_exif_rotation\x18\t \x01(\x08\x12&\n\x05track\x18\n \x01(\x0b\x32\x12.curio.v1.TrackingH\x03\x88\x01\x01\x12\x1a\n\rmax_instances\x18\x0b \x01(\rH\x04\x88\x01\x01\x12\x1d\n\x05views\x18\x0c \x03(\x0b\x32\x0e.curio.v1.View\x12\x12\n\x05reads\x18\r \x01(\rH\x05\x88\x01\x01\x12\x0f\n\x07objects\x18\x0e \x03(\t\x12#\n\x05plane\x18\x0f \x01(\x0b\x32\x0f.curio.v1.PlaneH\x06\x88\x01\x01\x42\x07\n\x05imageB\x11\n\x0f_min_confidenceB\x11\n\x0f_max_detectionsB\x08\n\x06_trackB\x10\n\x0e_max_instancesB\x08\n\x06_readsB\x08\n\x06_plane\"(\n\x05Plane\x12\x0f\n\x07point_m\x18\x01 \x03(\x01\x12\x0e\n\x06normal\x18\x02 \x03(\x01\"}\n\x04View\x12\x11\n\x07\x65ncoded\x18\x01 \x01(\x0cH\x00\x12!\n\x03raw\x18\x02 \x01(\x0b\x32\x12.curio.v1.RawImageH\x00\x12 \n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x10.curio.v1.Camera\x12\x14\n\x0c\x63\x61m_from_rig\x18\x04 \x03(\x01\x42\x07\n\x05image\"\x95\x01\n\x08Tracking\x12\x13\n\x06time_s\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x13\n\x06keep_s\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12\x18\n\x0bnum_objects\x18\x03 \x01(\rH\x02\x88\x01\x01\x12\x0e\n\x06search\x18\x04 \x01(\x08\x12\x0f\n\x07restart\x18\x05 \x01(\x08\x42\t\n\x07_time_sB\t\n\x07_keep_sB\x0e\n\x0c_num_objects\"W\n\x0cPoseInterval\x12\r\n\x05level\x18\x01 \x01(\x01\x12\x11\n\tlateral_m\x18\x02 \x01(\x01\x12\x0f\n\x07\x64\x65pth_m\x18\x03 \x01(\x01\x12\x14\n\x0crotation_deg\x18\x04 \x01(\x01\"\xda\x02\n\tDetection\x12\x0e\n\x06object\x18\x01 \x01(\t\x12\x12\n\nconfidence\x18\x02 \x01(\x02\x12\x15\n\rtranslation_m\x18\x03 \x03(\x01\x12\x13\n\x0brotation_6d\x18\x04 \x03(\x01\x12\x10\n\x08rotation\x18\x05 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x06 \x03(\x01\x12\r\n\x05\x63olor\x18\x07 \x03(\x01\x12\x0e\n\x06\x62ox_px\x18\x08 \x03(\x01\x12\x1d\n\x15outside_trained_range\x18\t \x01(\x08\x12\x1e\n\x05track\x18\n \x01(\x0b\x32\x0f.curio.v1.Track\x12\r\n\x05views\x18\x0b \x03(\r\x12)\n\x06status\x18\x0c \x01(\x0e\x32\x19.curio.v1.DetectionStatus\x12(\n\x08interval\x18\r \x01(\x0b\x32\x16.curio.v1.PoseInterval\x12\x10\n\x08on_plane\x18\x0e \x01(\x08\"\xd7\x01\n\x05Track\x12\x10\n\x08track_id\x18\x01 \x01(\x04\x12\r\n\x05\x61ge_s\x18\x02 \x01(\x01\x12\x10\n\x08unseen_s\x18\x03 \x01(\x01\x12\x11\n\tpredicted\x18\x04 \x01(\x08\x12\x15\n\rtranslation_m\x18\x05 \x03(\x01\x12\x10\n\x08rotation\x18\x06 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x07 \x03(\x01\x12\x14\n\x0cvelocity_m_s\x18\x08 \x03(\x01\x12\x16\n\x0eposition_std_m\x18\t \x03(\x01\x12\x18\n\x10rotation_std_rad\x18\n \x01(\x01\"\xc4\x01\n\x0cRegionResult\x12\r\n\x05model\x18\x01 \x01(\t\x12\x15\n\rmodel_version\x18\x02 \x01(\r\x12\x0e\n\x06region\x18\x03 \x01(\r\x12&\n\x06status\x18\x04 \x01(\x0e\x32\x16.curio.v1.RegionStatus\x12\'\n\ndetections\x18\x05 \x03(\x0b\x32\x13.curio.v1.Detection\x12\r\n\x05light\x18\x06 \x03(\x01\x12\x1e\n\x05plane\x18\x07 \x01(\x0b\x32\x0f.curio.v1.Plane\"@\n\x0cMilliseconds\x12\r\n\x05queue\x18\x01 \x01(\x01\x12\x0e\n\x06\x64\x65\x63ode\x18\x02 \x01(\x01\x12\x11\n\tinference\x18\x03 \x01(\x01\";\n\nFrameError\x12\x0c\n\x04\x63ode\x18\x01 \x01(\r\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x0f\n\x07message\x18\x03 \x01(\t\"\xbf\x01\n\x0e\x44\x65tectResponse\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\'\n\x07results\x18\x04 \x03(\x0b\x32\x16.curio.v1.RegionResult\x12,\n\x0cmilliseconds\x18\x05 \x01(\x0b\x32\x16.curio.v1.Milliseconds\x12#\n\x05\x65rror\x18\x06 \x01(\x0b\x32\x14.curio.v1.FrameError\"\x13\n\x11ListModelsRequest\"K\n\tModelInfo\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x10\n\x08versions\x18\x02 \x03(\r\x12\r\n\x05world\x18\x03 \x01(\t\x12\x0f\n\x07objects\x18\x04 \x03(\t\"9\n\x12ListModelsResponse\x12#\n\x06models\x18\x01 \x03(\x0b\x32\x13.curio.v1.ModelInfo\"9\n\x0fGetModelRequest\x12&\n\x05model\x18\x01 \x01(\x0b\x32\x17.curio.v1.ModelSelector\"F\n\x10GetModelResponse\x12!\n\x04spec\x18\x01 \x01(\x0b\x32\x13.curio.v1.ModelSpec\x12\x0f\n\x07version\x18\x02 \x01(\r*q\n\x0bPixelFormat\x12\x1c\n\x18PIXEL_FORMAT_UNSPECIFIED\x10\x00\x12\x15\n\x11PIXEL_FORMAT_RGB8\x10\x01\x12\x15\n\x11PIXEL_FORMAT_BGR8\x10\x02\x12\x16\n\x12PIXEL_FORMAT_GRAY8\x10\x03*\xa1\x01\n\x0cRegionStatus\x12\x1d\n\x19REGION_STATUS_UNSPECIFIED\x10\x00\x12\x1a\n\x16REGION_STATUS_DETECTED\x10\x01\x12\x1b\n\x17REGION_STATUS_NO_OBJECT\x10\x02\x12\x1f\n\x1bREGION_STATUS_OUTSIDE_FRAME\x10\x03\x12\x18\n\x14REGION_STATUS_UNSURE\x10\x04*k\n\x0f\x44\x65tectionStatus\x12 \n\x1c\x44\x45TECTION_STATUS_UNSPECIFIED\x10\x00\x12\x19\n\x15\x44\x45TECTION_STATUS_SURE\x10\x01\x12\x1b\n\x17\x44\x45TECTION_STATUS_UNSURE\x10\x02\x32\x9e\x02\n\x0cPoseDetector\x12;\n\x06\x44\x65tect\x12\x17.curio.v1.DetectRequest\x1a\x18.curio.v1.DetectResponse\x12\x45\n\x0c\x44\x65tectStream\x12\x17.curio.v1.DetectRequest\x1a\x18.curio.v1.DetectResponse(\x01\x30\x01\x12G\n\nListModels\x12\x1b.curio.v1.ListModelsRequest\x1a\x1c.curio.v1.ListModelsResponse\x12\x41\n\x08GetModel\x12\x19.curio.v1.GetModelRequest\x1a\x1a.curio.v1.GetModelResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'curio_proto.v1.detector_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_PIXELFORMAT']._serialized_start=2586
-  _globals['_PIXELFORMAT']._serialized_end=2699
-  _globals['_REGIONSTATUS']._serialized_start=2702
-  _globals['_REGIONSTATUS']._serialized_end=2863
-  _globals['_DETECTIONSTATUS']._serialized_start=2865
-  _globals['_DETECTIONSTATUS']._serialized_end=2972
+  _globals['_PIXELFORMAT']._serialized_start=2725
+  _globals['_PIXELFORMAT']._serialized_end=2838
+  _globals['_REGIONSTATUS']._serialized_start=2841
+  _globals['_REGIONSTATUS']._serialized_end=3002
+  _globals['_DETECTIONSTATUS']._serialized_start=3004
+  _globals['_DETECTIONSTATUS']._serialized_end=3111
   _globals['_MODELSELECTOR']._serialized_start=76
   _globals['_MODELSELECTOR']._serialized_end=122
   _globals['_RAWIMAGE']._serialized_start=124
@@ -47,35 +47,37 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_REGION']._serialized_start=320
   _globals['_REGION']._serialized_end=381
   _globals['_DETECTREQUEST']._serialized_start=384
-  _globals['_DETECTREQUEST']._serialized_end=891
-  _globals['_VIEW']._serialized_start=893
-  _globals['_VIEW']._serialized_end=1018
-  _globals['_TRACKING']._serialized_start=1021
-  _globals['_TRACKING']._serialized_end=1170
-  _globals['_POSEINTERVAL']._serialized_start=1172
-  _globals['_POSEINTERVAL']._serialized_end=1259
-  _globals['_DETECTION']._serialized_start=1262
-  _globals['_DETECTION']._serialized_end=1590
-  _globals['_TRACK']._serialized_start=1593
-  _globals['_TRACK']._serialized_end=1808
-  _globals['_REGIONRESULT']._serialized_start=1811
-  _globals['_REGIONRESULT']._serialized_end=1975
-  _globals['_MILLISECONDS']._serialized_start=1977
-  _globals['_MILLISECONDS']._serialized_end=2041
-  _globals['_FRAMEERROR']._serialized_start=2043
-  _globals['_FRAMEERROR']._serialized_end=2102
-  _globals['_DETECTRESPONSE']._serialized_start=2105
-  _globals['_DETECTRESPONSE']._serialized_end=2296
-  _globals['_LISTMODELSREQUEST']._serialized_start=2298
-  _globals['_LISTMODELSREQUEST']._serialized_end=2317
-  _globals['_MODELINFO']._serialized_start=2319
-  _globals['_MODELINFO']._serialized_end=2394
-  _globals['_LISTMODELSRESPONSE']._serialized_start=2396
-  _globals['_LISTMODELSRESPONSE']._serialized_end=2453
-  _globals['_GETMODELREQUEST']._serialized_start=2455
-  _globals['_GETMODELREQUEST']._serialized_end=2512
-  _globals['_GETMODELRESPONSE']._serialized_start=2514
-  _globals['_GETMODELRESPONSE']._serialized_end=2584
-  _globals['_POSEDETECTOR']._serialized_start=2975
-  _globals['_POSEDETECTOR']._serialized_end=3261
+  _globals['_DETECTREQUEST']._serialized_end=938
+  _globals['_PLANE']._serialized_start=940
+  _globals['_PLANE']._serialized_end=980
+  _globals['_VIEW']._serialized_start=982
+  _globals['_VIEW']._serialized_end=1107
+  _globals['_TRACKING']._serialized_start=1110
+  _globals['_TRACKING']._serialized_end=1259
+  _globals['_POSEINTERVAL']._serialized_start=1261
+  _globals['_POSEINTERVAL']._serialized_end=1348
+  _globals['_DETECTION']._serialized_start=1351
+  _globals['_DETECTION']._serialized_end=1697
+  _globals['_TRACK']._serialized_start=1700
+  _globals['_TRACK']._serialized_end=1915
+  _globals['_REGIONRESULT']._serialized_start=1918
+  _globals['_REGIONRESULT']._serialized_end=2114
+  _globals['_MILLISECONDS']._serialized_start=2116
+  _globals['_MILLISECONDS']._serialized_end=2180
+  _globals['_FRAMEERROR']._serialized_start=2182
+  _globals['_FRAMEERROR']._serialized_end=2241
+  _globals['_DETECTRESPONSE']._serialized_start=2244
+  _globals['_DETECTRESPONSE']._serialized_end=2435
+  _globals['_LISTMODELSREQUEST']._serialized_start=2437
+  _globals['_LISTMODELSREQUEST']._serialized_end=2456
+  _globals['_MODELINFO']._serialized_start=2458
+  _globals['_MODELINFO']._serialized_end=2533
+  _globals['_LISTMODELSRESPONSE']._serialized_start=2535
+  _globals['_LISTMODELSRESPONSE']._serialized_end=2592
+  _globals['_GETMODELREQUEST']._serialized_start=2594
+  _globals['_GETMODELREQUEST']._serialized_end=2651
+  _globals['_GETMODELRESPONSE']._serialized_start=2653
+  _globals['_GETMODELRESPONSE']._serialized_end=2723
+  _globals['_POSEDETECTOR']._serialized_start=3114
+  _globals['_POSEDETECTOR']._serialized_end=3400
 # @@protoc_insertion_point(module_scope)

@@ -88,7 +88,7 @@ class Region(_message.Message):
     def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., width: _Optional[float] = ..., height: _Optional[float] = ...) -> None: ...
 
 class DetectRequest(_message.Message):
-    __slots__ = ("request_id", "models", "encoded", "raw", "camera", "regions", "min_confidence", "max_detections", "apply_exif_rotation", "track", "max_instances", "views", "reads", "objects")
+    __slots__ = ("request_id", "models", "encoded", "raw", "camera", "regions", "min_confidence", "max_detections", "apply_exif_rotation", "track", "max_instances", "views", "reads", "objects", "plane")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     MODELS_FIELD_NUMBER: _ClassVar[int]
     ENCODED_FIELD_NUMBER: _ClassVar[int]
@@ -103,6 +103,7 @@ class DetectRequest(_message.Message):
     VIEWS_FIELD_NUMBER: _ClassVar[int]
     READS_FIELD_NUMBER: _ClassVar[int]
     OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    PLANE_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     models: _containers.RepeatedCompositeFieldContainer[ModelSelector]
     encoded: bytes
@@ -117,7 +118,16 @@ class DetectRequest(_message.Message):
     views: _containers.RepeatedCompositeFieldContainer[View]
     reads: int
     objects: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, request_id: _Optional[str] = ..., models: _Optional[_Iterable[_Union[ModelSelector, _Mapping]]] = ..., encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., regions: _Optional[_Iterable[_Union[Region, _Mapping]]] = ..., min_confidence: _Optional[float] = ..., max_detections: _Optional[int] = ..., apply_exif_rotation: bool = ..., track: _Optional[_Union[Tracking, _Mapping]] = ..., max_instances: _Optional[int] = ..., views: _Optional[_Iterable[_Union[View, _Mapping]]] = ..., reads: _Optional[int] = ..., objects: _Optional[_Iterable[str]] = ...) -> None: ...
+    plane: Plane
+    def __init__(self, request_id: _Optional[str] = ..., models: _Optional[_Iterable[_Union[ModelSelector, _Mapping]]] = ..., encoded: _Optional[bytes] = ..., raw: _Optional[_Union[RawImage, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., regions: _Optional[_Iterable[_Union[Region, _Mapping]]] = ..., min_confidence: _Optional[float] = ..., max_detections: _Optional[int] = ..., apply_exif_rotation: bool = ..., track: _Optional[_Union[Tracking, _Mapping]] = ..., max_instances: _Optional[int] = ..., views: _Optional[_Iterable[_Union[View, _Mapping]]] = ..., reads: _Optional[int] = ..., objects: _Optional[_Iterable[str]] = ..., plane: _Optional[_Union[Plane, _Mapping]] = ...) -> None: ...
+
+class Plane(_message.Message):
+    __slots__ = ("point_m", "normal")
+    POINT_M_FIELD_NUMBER: _ClassVar[int]
+    NORMAL_FIELD_NUMBER: _ClassVar[int]
+    point_m: _containers.RepeatedScalarFieldContainer[float]
+    normal: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, point_m: _Optional[_Iterable[float]] = ..., normal: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class View(_message.Message):
     __slots__ = ("encoded", "raw", "camera", "cam_from_rig")
@@ -158,7 +168,7 @@ class PoseInterval(_message.Message):
     def __init__(self, level: _Optional[float] = ..., lateral_m: _Optional[float] = ..., depth_m: _Optional[float] = ..., rotation_deg: _Optional[float] = ...) -> None: ...
 
 class Detection(_message.Message):
-    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range", "track", "views", "status", "interval")
+    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range", "track", "views", "status", "interval", "on_plane")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     TRANSLATION_M_FIELD_NUMBER: _ClassVar[int]
@@ -172,6 +182,7 @@ class Detection(_message.Message):
     VIEWS_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
     INTERVAL_FIELD_NUMBER: _ClassVar[int]
+    ON_PLANE_FIELD_NUMBER: _ClassVar[int]
     object: str
     confidence: float
     translation_m: _containers.RepeatedScalarFieldContainer[float]
@@ -185,7 +196,8 @@ class Detection(_message.Message):
     views: _containers.RepeatedScalarFieldContainer[int]
     status: DetectionStatus
     interval: PoseInterval
-    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ..., track: _Optional[_Union[Track, _Mapping]] = ..., views: _Optional[_Iterable[int]] = ..., status: _Optional[_Union[DetectionStatus, str]] = ..., interval: _Optional[_Union[PoseInterval, _Mapping]] = ...) -> None: ...
+    on_plane: bool
+    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ..., track: _Optional[_Union[Track, _Mapping]] = ..., views: _Optional[_Iterable[int]] = ..., status: _Optional[_Union[DetectionStatus, str]] = ..., interval: _Optional[_Union[PoseInterval, _Mapping]] = ..., on_plane: bool = ...) -> None: ...
 
 class Track(_message.Message):
     __slots__ = ("track_id", "age_s", "unseen_s", "predicted", "translation_m", "rotation", "quaternion_xyzw", "velocity_m_s", "position_std_m", "rotation_std_rad")
@@ -212,20 +224,22 @@ class Track(_message.Message):
     def __init__(self, track_id: _Optional[int] = ..., age_s: _Optional[float] = ..., unseen_s: _Optional[float] = ..., predicted: bool = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., velocity_m_s: _Optional[_Iterable[float]] = ..., position_std_m: _Optional[_Iterable[float]] = ..., rotation_std_rad: _Optional[float] = ...) -> None: ...
 
 class RegionResult(_message.Message):
-    __slots__ = ("model", "model_version", "region", "status", "detections", "light")
+    __slots__ = ("model", "model_version", "region", "status", "detections", "light", "plane")
     MODEL_FIELD_NUMBER: _ClassVar[int]
     MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
     REGION_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
     DETECTIONS_FIELD_NUMBER: _ClassVar[int]
     LIGHT_FIELD_NUMBER: _ClassVar[int]
+    PLANE_FIELD_NUMBER: _ClassVar[int]
     model: str
     model_version: int
     region: int
     status: RegionStatus
     detections: _containers.RepeatedCompositeFieldContainer[Detection]
     light: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, model: _Optional[str] = ..., model_version: _Optional[int] = ..., region: _Optional[int] = ..., status: _Optional[_Union[RegionStatus, str]] = ..., detections: _Optional[_Iterable[_Union[Detection, _Mapping]]] = ..., light: _Optional[_Iterable[float]] = ...) -> None: ...
+    plane: Plane
+    def __init__(self, model: _Optional[str] = ..., model_version: _Optional[int] = ..., region: _Optional[int] = ..., status: _Optional[_Union[RegionStatus, str]] = ..., detections: _Optional[_Iterable[_Union[Detection, _Mapping]]] = ..., light: _Optional[_Iterable[float]] = ..., plane: _Optional[_Union[Plane, _Mapping]] = ...) -> None: ...
 
 class Milliseconds(_message.Message):
     __slots__ = ("queue", "decode", "inference")

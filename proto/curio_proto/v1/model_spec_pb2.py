@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1f\x63urio_proto/v1/model_spec.proto\x12\x08\x63urio.v1\"\xe0\x02\n\tModelSpec\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x0c\n\x04name\x18\x02 \x01(\t\x12\r\n\x05world\x18\x03 \x01(\t\x12\x11\n\tnum_slots\x18\x04 \x01(\r\x12\x1f\n\x06\x66ields\x18\x05 \x03(\x0b\x32\x0f.curio.v1.Field\x12&\n\x07objects\x18\x06 \x03(\x0b\x32\x15.curio.v1.ObjectModel\x12)\n\x06\x63\x61mera\x18\x07 \x01(\x0b\x32\x19.curio.v1.CanonicalCamera\x12\x1c\n\x14parity_max_abs_error\x18\x08 \x01(\x01\x12\x0e\n\x06recipe\x18\t \x01(\t\x12\x0e\n\x06\x63ommit\x18\n \x01(\t\x12\x13\n\x0bimages_seen\x18\x0b \x01(\x04\x12\x18\n\x10training_seconds\x18\x0c \x01(\x01\x12*\n\x0breliability\x18\r \x01(\x0b\x32\x15.curio.v1.Reliability\"\xc2\x01\n\x0bReliability\x12\r\n\x05level\x18\x01 \x01(\x01\x12\x12\n\nnum_images\x18\x02 \x01(\r\x12,\n\x07objects\x18\x03 \x03(\x0b\x32\x1b.curio.v1.ObjectReliability\x12\x17\n\x0fnum_photographs\x18\x04 \x01(\r\x12\x13\n\x0b\x63\x61libration\x18\x05 \x03(\x01\x12\x19\n\x11position_widening\x18\x06 \x01(\x01\x12\x19\n\x11rotation_widening\x18\x07 \x01(\x01\"a\n\x11ObjectReliability\x12\x0e\n\x06object\x18\x01 \x01(\t\x12\x16\n\x0emin_confidence\x18\x02 \x01(\x01\x12$\n\x06\x62ounds\x18\x03 \x03(\x0b\x32\x14.curio.v1.PoseBounds\"e\n\nPoseBounds\x12\x16\n\x0emin_confidence\x18\x01 \x01(\x01\x12\x11\n\tlateral_m\x18\x02 \x01(\x01\x12\x16\n\x0e\x64\x65pth_fraction\x18\x03 \x01(\x01\x12\x14\n\x0crotation_deg\x18\x04 \x01(\x01\"\x86\x01\n\x05\x46ield\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0c\n\x04size\x18\x02 \x01(\r\x12\x12\n\nper_object\x18\x03 \x01(\x08\x12\x0c\n\x04unit\x18\x04 \x01(\t\x12\r\n\x05\x66rame\x18\x05 \x01(\t\x12\r\n\x05lower\x18\x06 \x03(\x01\x12\r\n\x05upper\x18\x07 \x03(\x01\x12\x12\n\nactivation\x18\x08 \x01(\t\"\xa4\x01\n\x0bObjectModel\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x13\n\x0bmesh_sha256\x18\x02 \x01(\t\x12\x12\n\ndiameter_m\x18\x03 \x01(\x01\x12\x15\n\rbox_corners_m\x18\x04 \x03(\x01\x12&\n\nsymmetries\x18\x05 \x03(\x0b\x32\x12.curio.v1.Symmetry\x12\r\n\x05slots\x18\x06 \x03(\r\x12\x10\n\x08\x63\x65nter_m\x18\x07 \x03(\x01\"=\n\x08Symmetry\x12\x11\n\ttransform\x18\x01 \x03(\x01\x12\x0c\n\x04\x61xis\x18\x02 \x03(\x01\x12\x10\n\x08offset_m\x18\x03 \x03(\x01\"[\n\x0f\x43\x61nonicalCamera\x12\r\n\x05width\x18\x01 \x01(\r\x12\x0e\n\x06height\x18\x02 \x01(\r\x12\x15\n\rcamera_matrix\x18\x03 \x03(\x01\x12\x12\n\nis_default\x18\x04 \x01(\x08\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1f\x63urio_proto/v1/model_spec.proto\x12\x08\x63urio.v1\"\x8d\x03\n\tModelSpec\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x0c\n\x04name\x18\x02 \x01(\t\x12\r\n\x05world\x18\x03 \x01(\t\x12\x11\n\tnum_slots\x18\x04 \x01(\r\x12\x1f\n\x06\x66ields\x18\x05 \x03(\x0b\x32\x0f.curio.v1.Field\x12&\n\x07objects\x18\x06 \x03(\x0b\x32\x15.curio.v1.ObjectModel\x12)\n\x06\x63\x61mera\x18\x07 \x01(\x0b\x32\x19.curio.v1.CanonicalCamera\x12\x1c\n\x14parity_max_abs_error\x18\x08 \x01(\x01\x12\x0e\n\x06recipe\x18\t \x01(\t\x12\x0e\n\x06\x63ommit\x18\n \x01(\t\x12\x13\n\x0bimages_seen\x18\x0b \x01(\x04\x12\x18\n\x10training_seconds\x18\x0c \x01(\x01\x12*\n\x0breliability\x18\r \x01(\x0b\x32\x15.curio.v1.Reliability\x12+\n\x0cstable_poses\x18\x0e \x01(\x0b\x32\x15.curio.v1.StablePoses\";\n\x0bStablePoses\x12,\n\x07objects\x18\x01 \x03(\x0b\x32\x1b.curio.v1.ObjectStablePoses\"?\n\x11ObjectStablePoses\x12\x0e\n\x06object\x18\x01 \x01(\t\x12\x0e\n\x06hull_m\x18\x02 \x03(\x01\x12\n\n\x02up\x18\x03 \x03(\x01\"\xc2\x01\n\x0bReliability\x12\r\n\x05level\x18\x01 \x01(\x01\x12\x12\n\nnum_images\x18\x02 \x01(\r\x12,\n\x07objects\x18\x03 \x03(\x0b\x32\x1b.curio.v1.ObjectReliability\x12\x17\n\x0fnum_photographs\x18\x04 \x01(\r\x12\x13\n\x0b\x63\x61libration\x18\x05 \x03(\x01\x12\x19\n\x11position_widening\x18\x06 \x01(\x01\x12\x19\n\x11rotation_widening\x18\x07 \x01(\x01\"a\n\x11ObjectReliability\x12\x0e\n\x06object\x18\x01 \x01(\t\x12\x16\n\x0emin_confidence\x18\x02 \x01(\x01\x12$\n\x06\x62ounds\x18\x03 \x03(\x0b\x32\x14.curio.v1.PoseBounds\"e\n\nPoseBounds\x12\x16\n\x0emin_confidence\x18\x01 \x01(\x01\x12\x11\n\tlateral_m\x18\x02 \x01(\x01\x12\x16\n\x0e\x64\x65pth_fraction\x18\x03 \x01(\x01\x12\x14\n\x0crotation_deg\x18\x04 \x01(\x01\"\x86\x01\n\x05\x46ield\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0c\n\x04size\x18\x02 \x01(\r\x12\x12\n\nper_object\x18\x03 \x01(\x08\x12\x0c\n\x04unit\x18\x04 \x01(\t\x12\r\n\x05\x66rame\x18\x05 \x01(\t\x12\r\n\x05lower\x18\x06 \x03(\x01\x12\r\n\x05upper\x18\x07 \x03(\x01\x12\x12\n\nactivation\x18\x08 \x01(\t\"\xa4\x01\n\x0bObjectModel\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x13\n\x0bmesh_sha256\x18\x02 \x01(\t\x12\x12\n\ndiameter_m\x18\x03 \x01(\x01\x12\x15\n\rbox_corners_m\x18\x04 \x03(\x01\x12&\n\nsymmetries\x18\x05 \x03(\x0b\x32\x12.curio.v1.Symmetry\x12\r\n\x05slots\x18\x06 \x03(\r\x12\x10\n\x08\x63\x65nter_m\x18\x07 \x03(\x01\"=\n\x08Symmetry\x12\x11\n\ttransform\x18\x01 \x03(\x01\x12\x0c\n\x04\x61xis\x18\x02 \x03(\x01\x12\x10\n\x08offset_m\x18\x03 \x03(\x01\"[\n\x0f\x43\x61nonicalCamera\x12\r\n\x05width\x18\x01 \x01(\r\x12\x0e\n\x06height\x18\x02 \x01(\r\x12\x15\n\rcamera_matrix\x18\x03 \x03(\x01\x12\x12\n\nis_default\x18\x04 \x01(\x08\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,19 +32,23 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'curio_proto.v1.model_spec_p
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_MODELSPEC']._serialized_start=46
-  _globals['_MODELSPEC']._serialized_end=398
-  _globals['_RELIABILITY']._serialized_start=401
-  _globals['_RELIABILITY']._serialized_end=595
-  _globals['_OBJECTRELIABILITY']._serialized_start=597
-  _globals['_OBJECTRELIABILITY']._serialized_end=694
-  _globals['_POSEBOUNDS']._serialized_start=696
-  _globals['_POSEBOUNDS']._serialized_end=797
-  _globals['_FIELD']._serialized_start=800
-  _globals['_FIELD']._serialized_end=934
-  _globals['_OBJECTMODEL']._serialized_start=937
-  _globals['_OBJECTMODEL']._serialized_end=1101
-  _globals['_SYMMETRY']._serialized_start=1103
-  _globals['_SYMMETRY']._serialized_end=1164
-  _globals['_CANONICALCAMERA']._serialized_start=1166
-  _globals['_CANONICALCAMERA']._serialized_end=1257
+  _globals['_MODELSPEC']._serialized_end=443
+  _globals['_STABLEPOSES']._serialized_start=445
+  _globals['_STABLEPOSES']._serialized_end=504
+  _globals['_OBJECTSTABLEPOSES']._serialized_start=506
+  _globals['_OBJECTSTABLEPOSES']._serialized_end=569
+  _globals['_RELIABILITY']._serialized_start=572
+  _globals['_RELIABILITY']._serialized_end=766
+  _globals['_OBJECTRELIABILITY']._serialized_start=768
+  _globals['_OBJECTRELIABILITY']._serialized_end=865
+  _globals['_POSEBOUNDS']._serialized_start=867
+  _globals['_POSEBOUNDS']._serialized_end=968
+  _globals['_FIELD']._serialized_start=971
+  _globals['_FIELD']._serialized_end=1105
+  _globals['_OBJECTMODEL']._serialized_start=1108
+  _globals['_OBJECTMODEL']._serialized_end=1272
+  _globals['_SYMMETRY']._serialized_start=1274
+  _globals['_SYMMETRY']._serialized_end=1335
+  _globals['_CANONICALCAMERA']._serialized_start=1337
+  _globals['_CANONICALCAMERA']._serialized_end=1428
 # @@protoc_insertion_point(module_scope)

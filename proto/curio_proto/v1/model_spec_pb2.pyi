@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class ModelSpec(_message.Message):
-    __slots__ = ("schema_version", "name", "world", "num_slots", "fields", "objects", "camera", "parity_max_abs_error", "recipe", "commit", "images_seen", "training_seconds", "reliability")
+    __slots__ = ("schema_version", "name", "world", "num_slots", "fields", "objects", "camera", "parity_max_abs_error", "recipe", "commit", "images_seen", "training_seconds", "reliability", "stable_poses")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     WORLD_FIELD_NUMBER: _ClassVar[int]
@@ -21,6 +21,7 @@ class ModelSpec(_message.Message):
     IMAGES_SEEN_FIELD_NUMBER: _ClassVar[int]
     TRAINING_SECONDS_FIELD_NUMBER: _ClassVar[int]
     RELIABILITY_FIELD_NUMBER: _ClassVar[int]
+    STABLE_POSES_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     name: str
     world: str
@@ -34,7 +35,24 @@ class ModelSpec(_message.Message):
     images_seen: int
     training_seconds: float
     reliability: Reliability
-    def __init__(self, schema_version: _Optional[int] = ..., name: _Optional[str] = ..., world: _Optional[str] = ..., num_slots: _Optional[int] = ..., fields: _Optional[_Iterable[_Union[Field, _Mapping]]] = ..., objects: _Optional[_Iterable[_Union[ObjectModel, _Mapping]]] = ..., camera: _Optional[_Union[CanonicalCamera, _Mapping]] = ..., parity_max_abs_error: _Optional[float] = ..., recipe: _Optional[str] = ..., commit: _Optional[str] = ..., images_seen: _Optional[int] = ..., training_seconds: _Optional[float] = ..., reliability: _Optional[_Union[Reliability, _Mapping]] = ...) -> None: ...
+    stable_poses: StablePoses
+    def __init__(self, schema_version: _Optional[int] = ..., name: _Optional[str] = ..., world: _Optional[str] = ..., num_slots: _Optional[int] = ..., fields: _Optional[_Iterable[_Union[Field, _Mapping]]] = ..., objects: _Optional[_Iterable[_Union[ObjectModel, _Mapping]]] = ..., camera: _Optional[_Union[CanonicalCamera, _Mapping]] = ..., parity_max_abs_error: _Optional[float] = ..., recipe: _Optional[str] = ..., commit: _Optional[str] = ..., images_seen: _Optional[int] = ..., training_seconds: _Optional[float] = ..., reliability: _Optional[_Union[Reliability, _Mapping]] = ..., stable_poses: _Optional[_Union[StablePoses, _Mapping]] = ...) -> None: ...
+
+class StablePoses(_message.Message):
+    __slots__ = ("objects",)
+    OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    objects: _containers.RepeatedCompositeFieldContainer[ObjectStablePoses]
+    def __init__(self, objects: _Optional[_Iterable[_Union[ObjectStablePoses, _Mapping]]] = ...) -> None: ...
+
+class ObjectStablePoses(_message.Message):
+    __slots__ = ("object", "hull_m", "up")
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    HULL_M_FIELD_NUMBER: _ClassVar[int]
+    UP_FIELD_NUMBER: _ClassVar[int]
+    object: str
+    hull_m: _containers.RepeatedScalarFieldContainer[float]
+    up: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, object: _Optional[str] = ..., hull_m: _Optional[_Iterable[float]] = ..., up: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Reliability(_message.Message):
     __slots__ = ("level", "num_images", "objects", "num_photographs", "calibration", "position_widening", "rotation_widening")

@@ -5,12 +5,14 @@ from functools import lru_cache
 import numpy as np
 from curio_proto.v1.detector_pb2 import PIXEL_FORMAT_BGR8, PIXEL_FORMAT_GRAY8, PIXEL_FORMAT_RGB8, RawImage
 from curio_proto.v1.detector_pb2 import Camera as CameraMessage
+from curio_proto.v1.detector_pb2 import Plane as PlaneMessage
 from curio_proto.v1.detector_pb2 import Region as RegionMessage
 
 from curio_serve.errors import CameraError, ImageError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.image import Frame, RawFormat, from_raw
 from curio_serve.imaging.view import Region
+from curio_serve.planes.plane import FIND_PLANE, AnyPlane, Plane
 
 _RAW_FORMATS: dict[int, RawFormat] = {PIXEL_FORMAT_RGB8: "RGB8", PIXEL_FORMAT_BGR8: "BGR8", PIXEL_FORMAT_GRAY8: "GRAY8"}
 
@@ -35,6 +37,17 @@ def _camera(data: bytes) -> PinholeCamera:
     if any(size) and not all(size):
         raise CameraError(f"camera.width and camera.height are {size[0]} and {size[1]}; expected both, or neither")
     return PinholeCamera(np.reshape(values, (3, 3)), tuple(message.distortion), size if all(size) else None)
+
+
+def plane_from_message(message: PlaneMessage) -> AnyPlane:
+    """The plane of a request, or that it is to be found.
+
+    Raises:
+        ArgumentError: It is impossible, or has a point or a normal alone.
+    """
+    if not message.point_m and not message.normal:
+        return FIND_PLANE
+    return Plane.of(message.point_m, message.normal)
 
 
 def region_from_message(message: RegionMessage) -> Region:

@@ -12,7 +12,7 @@ from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorServicer
 
 from curio_serve.api.admission import WorkQueue, check_is_wanted
-from curio_serve.api.messages import camera_from_message, frame_from_raw, region_from_message
+from curio_serve.api.messages import camera_from_message, frame_from_raw, plane_from_message, region_from_message
 from curio_serve.api.registration import only_message
 from curio_serve.api.rig_request import check_views, refuse_many_pixels, rig_view
 from curio_serve.api.status import CallLog, frame_error
@@ -29,7 +29,7 @@ from curio_serve.tracking.stream import FollowingStream
 
 Context = grpc.ServicerContext
 _MAX_ID_LENGTH = 128
-_NOT_WITH_TRACK = ("max_detections", "max_instances", "reads")
+_NOT_WITH_TRACK = ("max_detections", "max_instances", "reads", "plane")
 _ID_PREFIX, _ID_NUMBERS = secrets.token_hex(8), itertools.count()
 
 
@@ -127,6 +127,7 @@ class PoseService(PoseDetectorServicer):
         regions = list(map(region_from_message, request.regions))
         min_confidence = request.min_confidence if request.HasField("min_confidence") else limits.min_confidence
         check_min_confidence(min_confidence)
+        plane = plane_from_message(request.plane) if request.HasField("plane") else None
         if request.views:
             return self._detect_views(request, detectors, waited_s, context)
         if request.HasField("track"):
@@ -154,6 +155,7 @@ class PoseService(PoseDetectorServicer):
                     min_confidence=min_confidence,
                     max_detections=request.max_detections or None,
                     max_instances=request.max_instances if request.HasField("max_instances") else None,
+                    plane=plane,
                     reduction=frame.reduction,
                     results=answer.results,
                     before_run=before_run,
@@ -258,7 +260,8 @@ def _check_following(request: messages.DetectRequest, following: FollowingStream
         raise ArgumentError("track is set in a single call; objects are followed in DetectStream")
     if request.regions or any(map(request.HasField, _NOT_WITH_TRACK)):
         raise ArgumentError(
-            "regions, max_detections, max_instances and reads are not for following; leave them out, or leave out track"
+            "regions, max_detections, max_instances, reads and plane are not for following; leave them out, or leave "
+            "out track"
         )
     return following
 

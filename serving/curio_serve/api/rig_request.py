@@ -11,7 +11,7 @@ from curio_serve.models.detector import Detector
 from curio_serve.rigs.detect_views import RigView
 from curio_serve.rigs.rig import LEAST_VIEWS, MOST_VIEWS, check_cam_from_rig
 
-_NOT_WITH_VIEWS = ("encoded", "raw", "camera", "track", "max_instances", "reads")
+_NOT_WITH_VIEWS = ("encoded", "raw", "camera", "track", "max_instances", "reads", "plane")
 
 
 def check_views(request: DetectRequest, num_models: int, most_runs: int) -> None:

@@ -68,6 +68,9 @@ class DetectArguments:
     reads: int = 1
     """Read each image that many times, 1 to 9, through slightly turned and zoomed cameras, and answer what most reads
     agree on: better poses in photographs, in as many times the time."""
+    plane: Annotated[str | None, tyro.conf.arg(metavar="FILE|objects")] = None
+    """Objects stand on this plane: move each pose along its line of sight until it does. A file of curio-train capture
+    --calibrate, or objects: the plane on which most of an image's objects stand."""
     track: bool = False
     """Follow objects through the frames of each video, or of each folder's images in order: JSON Lines have tracks."""
     track_objects: int = 1

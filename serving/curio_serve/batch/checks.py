@@ -21,6 +21,7 @@ from curio_serve.batch.images.sources import (
 )
 from curio_serve.errors import UsageError
 from curio_serve.models.repeated import MAX_READS
+from curio_serve.planes.camera_poses import CameraPoseFile
 
 
 def check_numbers(arguments: DetectArguments) -> None:
@@ -109,6 +110,29 @@ def check_camera(arguments: DetectArguments, estimator: Estimator, recordings: S
         raise UsageError(
             f"model {estimator.name} needs the intrinsics of the camera that took the images; give --camera FILE "
             "(camera JSON, BOP's camera.json or scene_camera.json, or YAML of OpenCV or ROS)"
+        )
+
+
+def check_plane(arguments: DetectArguments, estimator: Estimator) -> None:
+    """Refuse a plane that a model has no use for, or that is not known in every image's camera.
+
+    Raises:
+        UsageError: Says why.
+    """
+    if arguments.plane is None:
+        return
+    if not estimator.spec.HasField("stable_poses"):
+        raise UsageError(
+            f"--plane: model {estimator.name} does not say how its objects stand; leave it out, or export the model's "
+            "run again (of worlds that are flat, or whose parts all stand, none says it)"
+        )
+    poses = estimator.settings.plane
+    if isinstance(poses, CameraPoseFile) and arguments.exif_rotation:
+        raise UsageError(f"--plane {arguments.plane} is of the stored pixels' camera; leave out --exif-rotation")
+    if isinstance(poses, CameraPoseFile) and poses.of_all is None and arguments.video is not None:
+        raise UsageError(
+            f'--plane {arguments.plane} has poses of named photographs; expected {{"cam_from_world": [4x4]}} of the '
+            "camera that --video shows"
         )
 
 

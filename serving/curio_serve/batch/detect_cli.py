@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from curio_serve.batch.results.formats import ImageLines, ResultFormat
     from curio_serve.batch.results.recorded_poses import Detection3DArrays
     from curio_serve.client import PoseClient
+    from curio_serve.planes.camera_poses import GivenPlane
 
 
 def main() -> NoReturn:
@@ -58,7 +59,7 @@ def run(arguments: DetectArguments) -> int:
     # Heavy packages only now: --help does without.
     import cv2
 
-    from curio_serve.batch.checks import check_camera, check_numbers, named_recordings
+    from curio_serve.batch.checks import check_camera, check_numbers, check_plane, named_recordings
     from curio_serve.batch.cluster import over_cluster
     from curio_serve.batch.images.parallel import in_order
     from curio_serve.batch.images.read_ahead import read_ahead
@@ -89,6 +90,7 @@ def run(arguments: DetectArguments) -> int:
     outlining(arguments, models, estimators)
     for estimator in estimators:
         check_camera(arguments, estimator, recordings)
+        check_plane(arguments, estimator)
     if arguments.video is not None:
         return _live(arguments, estimators)
     form = result_format(arguments, estimators)
@@ -169,7 +171,20 @@ def _settings(arguments: DetectArguments) -> "Settings":
         arguments.max_instances,
         arguments.reads,
         arguments.object_names,
+        _plane(arguments),
     )
+
+
+def _plane(arguments: DetectArguments) -> "GivenPlane":
+    from curio_serve.planes.camera_poses import CameraPoseFile
+    from curio_serve.planes.plane import FIND_PLANE
+
+    if arguments.plane in (None, FIND_PLANE):
+        return None if arguments.plane is None else FIND_PLANE
+    try:
+        return CameraPoseFile.read(Path(arguments.plane))
+    except CameraError as exc:
+        raise UsageError(str(exc)) from exc
 
 
 def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "Settings") -> "list[Estimator]":

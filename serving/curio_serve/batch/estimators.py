@@ -29,6 +29,7 @@ from curio_serve.imaging.silhouette import Surface
 from curio_serve.imaging.view import searched_fraction
 from curio_serve.models.detector import Detector
 from curio_serve.models.model import Model, canonical_camera
+from curio_serve.planes.camera_poses import GivenPlane, plane_of
 from curio_serve.tracking.stream import FollowingStream
 
 if TYPE_CHECKING:
@@ -64,6 +65,8 @@ class Settings:
     """How often each image is read."""
     objects: tuple[str, ...] = ()
     """Kinds of objects that are looked for; none: all that a model knows."""
+    plane: GivenPlane = None
+    """On which objects stand, in the frame of each image's camera."""
 
 
 @dataclass(frozen=True)
@@ -259,6 +262,7 @@ class LocalEstimator(Estimator):
                 min_confidence=self.settings.min_confidence,
                 max_detections=self.settings.max_detections,
                 max_instances=self.settings.max_instances,
+                plane=plane_of(self.settings.plane, image.name),
                 reduction=frame.reduction,
             )
         else:
@@ -318,6 +322,7 @@ class RemoteEstimator(Estimator):
             max_detections=self.settings.max_detections,
             max_instances=self.settings.max_instances,
             reads=self.settings.num_reads if self.settings.num_reads > 1 else None,
+            plane=plane_of(self.settings.plane, image.name),
             objects=self._wanted,
             apply_exif_rotation=is_turned,
         )

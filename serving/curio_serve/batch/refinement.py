@@ -89,12 +89,14 @@ def refining(arguments: DetectArguments, model: str, estimators: list[Estimator]
     """Let the one estimator refine its answers, where the call wants that.
 
     Raises:
-        UsageError: The call names several models, a cluster, a video or tracks; or as of :func:`load_refiner`.
+        UsageError: The call names several models, a cluster, a video, tracks or a plane; or as of :func:`load_refiner`.
     """
     if not arguments.refine:
         return None
     if arguments.ray is not None or arguments.video is not None or arguments.track:
         raise UsageError("--refine takes seconds a pose, in this process alone: leave out --ray, --video and --track")
+    if arguments.plane is not None:
+        raise UsageError("--refine and --plane both correct distances, each in its own way; leave one of them out")
     if len(estimators) != 1:
         raise UsageError(f"--refine needs the meshes of one model, found {len(estimators)} models; name one")
     refiner = load_refiner(estimators[0].spec, model, arguments.mesh, arguments.mesh_unit)

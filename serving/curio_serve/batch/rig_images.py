@@ -101,6 +101,7 @@ def read_rig(arguments: DetectArguments, models: Sequence[str]) -> list[RigCamer
         "--exif-rotation": arguments.exif_rotation,
         "--max-instances": arguments.max_instances,
         "--reads": arguments.reads != 1,
+        "--plane": arguments.plane,
         "--refine": arguments.refine,
         "--mesh": arguments.mesh,
         "--mesh-unit": arguments.mesh_unit,

@@ -42,10 +42,11 @@ def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectA
             "--track follows on one machine and writes JSON Lines; leave out --ray, --refine and --format, and name "
             "--out so"
         )
-    if arguments.max_detections is not None or arguments.max_instances is not None or arguments.reads != 1:
+    whole = arguments.max_detections, arguments.max_instances, arguments.plane
+    if any(given is not None for given in whole) or arguments.reads != 1:
         raise UsageError(
-            "--track: say by --track-objects how many are followed, and leave out --max-detections, --max-instances "
-            "and --reads"
+            "--track: say by --track-objects how many are followed, and leave out --max-detections, --max-instances, "
+            "--reads and --plane"
         )
     if not 1 <= arguments.track_objects <= MAX_OBJECTS:
         raise UsageError(f"--track-objects {arguments.track_objects}: expected 1 to {MAX_OBJECTS}")

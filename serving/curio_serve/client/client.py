@@ -25,6 +25,7 @@ from curio_serve.client.retries import Attempts, deadline_s, error_from_call
 from curio_serve.deferred import DeferredError
 from curio_serve.errors import UsageError
 from curio_serve.files import read_given
+from curio_serve.planes.plane import AnyPlane
 
 # Connect again soon after a server was replaced; gRPC's own first pause is a second.
 _CHANNEL_OPTIONS = (("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_reconnect_backoff_ms", 2000))
@@ -113,6 +114,7 @@ class PoseClient(_Client):
         max_detections: int | None = None,
         max_instances: int | None = None,
         reads: int | None = None,
+        plane: AnyPlane | None = None,
         apply_exif_rotation: bool = False,
         color: Literal["rgb", "bgr"] = "rgb",
         request_id: str = "",
@@ -133,6 +135,7 @@ class PoseClient(_Client):
             max_detections=max_detections,
             max_instances=max_instances,
             reads=reads,
+            plane=plane,
             apply_exif_rotation=apply_exif_rotation,
             color=color,
             request_id=request_id,

@@ -15,6 +15,7 @@ from curio_serve.imaging.camera_files import read_camera_file
 from curio_serve.imaging.image import MAX_FILE_BYTES
 from curio_serve.imaging.image_header import read_header
 from curio_serve.imaging.view import Region
+from curio_serve.planes.plane import FIND_PLANE, AnyPlane, Plane
 
 ImageLike: TypeAlias = str | Path | bytes | np.ndarray
 CameraLike: TypeAlias = str | Path | PinholeCamera | np.ndarray | Sequence[Sequence[float]] | None
@@ -34,6 +35,7 @@ def detect_request(
     max_detections: int | None = None,
     max_instances: int | None = None,
     reads: int | None = None,
+    plane: AnyPlane | None = None,
     apply_exif_rotation: bool = False,
     color: Literal["rgb", "bgr"] = "rgb",
     request_id: str = "",
@@ -53,6 +55,8 @@ def detect_request(
         max_instances: Most of each kind of object and region, 1 to 16, by further runs of a network that reads one
             pose; None: what one run gives.
         reads: How often the image is read, 1 to 9, by as many runs of the network; None: once.
+        plane: On which objects stand, in the camera's frame, or "objects": the one on which most of the detected ones
+            do. Poses are moved along their lines of sight until they stand there.
         apply_exif_rotation: Turn the pixels as EXIF says, and K with them.
         color: Order of the channels of pixels; OpenCV reads images as ``bgr``.
         request_id: Comes back with the answer; empty: the server makes one up.
@@ -73,6 +77,7 @@ def detect_request(
             max_detections=max_detections,
             max_instances=max_instances,
             reads=reads,
+            plane=_plane(plane),
             apply_exif_rotation=apply_exif_rotation,
             track=track,
         )
@@ -145,6 +150,14 @@ def selector(model: str) -> messages.ModelSelector:
     if slash and not _VERSION.fullmatch(version):
         raise ArgumentError(f"model {model!r}: expected name or name/version with a version from 1 to 999999999")
     return messages.ModelSelector(name=name, version=int(version or 0))
+
+
+def _plane(plane: AnyPlane | None) -> messages.Plane | None:
+    if isinstance(plane, Plane):
+        return messages.Plane(point_m=plane.point_m, normal=plane.normal)
+    if plane not in (None, FIND_PLANE):
+        raise ArgumentError(f"plane {plane!r}: expected a Plane, {FIND_PLANE!r} or None")
+    return None if plane is None else messages.Plane()
 
 
 def _names(objects: Iterable[str]) -> list[str]:

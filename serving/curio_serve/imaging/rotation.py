@@ -63,3 +63,8 @@ def rotation_vector(rotation: Array) -> Array:
     sine = math.hypot(x, y, z)
     result: Array = np.array([x, y, z]) * (2 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0)
     return result
+
+
+def is_rotation(matrix: Array, tolerance: float) -> bool:
+    """Whether a matrix [3, 3] is a rotation; the product with its transpose may be so far from the identity."""
+    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= tolerance and np.linalg.det(matrix) >= 0)

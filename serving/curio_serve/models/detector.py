@@ -1,10 +1,9 @@
 """Detects a model's objects in the regions of a frame. No gRPC here."""
 
 import math
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from curio_proto.v1.detector_pb2 import (
@@ -16,14 +15,15 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 
 from curio_serve.errors import ArgumentError, CameraError, CameraMissing, ImageError
 from curio_serve.imaging.camera import PinholeCamera
-from curio_serve.imaging.rotation import quaternion_xyzw
-from curio_serve.imaging.view import Crop, FlatFrame, PinholeFrame, Region
+from curio_serve.imaging.view import FlatFrame, PinholeFrame, Region
+from curio_serve.models.answers import UPRIGHT, Limits, check_can_stand, fill, move_onto_plane
 from curio_serve.models.instances import InstanceSearch, Rows, Values, check_instances
-from curio_serve.models.model import Model, Outputs, Slot
+from curio_serve.models.model import Model, Outputs
 from curio_serve.models.object_frames import transformed
 from curio_serve.models.reliability import add_interval, calibrated, region_status, status_of, uncalibrated
 from curio_serve.models.repeated import AGREEMENT_POWER, RepeatedReader
 from curio_serve.models.stages.crop_stage import CropPose
+from curio_serve.planes.plane import AnyPlane
 
 if TYPE_CHECKING:
     from google.protobuf.internal.containers import RepeatedCompositeFieldContainer
@@ -34,15 +34,6 @@ Array = np.ndarray
 _REDUCTIONS = (8, 4, 2)
 _MAX_BATCH = 8
 _DEPTH_TOLERANCE = 0.01  # of the range: an object at its end is as likely beyond it
-_UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-
-
-class _Limits(NamedTuple):
-    """Limits beyond which detections are left out of an answer."""
-
-    min_confidence: float
-    max_detections: int | None
-    max_instances: int | None
 
 
 class Detector:
@@ -75,6 +66,7 @@ class Detector:
         min_confidence: float = 0.0,
         max_detections: int | None = None,
         max_instances: int | None = None,
+        plane: AnyPlane | None = None,
         reduction: int = 1,
         results: "Results | None" = None,
         before_run: Callable[[], None] = lambda: None,
@@ -89,6 +81,8 @@ class Detector:
             max_detections: Most detections a region; None: all.
             max_instances: Most instances of each kind of object a region, by a further run of the network for each of
                 them where it reads one pose; None: what one run gives.
+            plane: On which objects stand, camera frame, or the one on which most of the detected objects do: poses are
+                moved along their lines of sight until they stand there.
             reduction: How much smaller than the frame the pixels were decoded.
             results: The field of a response to which results are added; None: a new one.
             before_run: Called before each run of the network; what it raises ends the detection.
@@ -100,7 +94,8 @@ class Detector:
             CameraMissing: The model needs K.
             CameraError: K cannot be this frame's, or gives a pose that is not finite.
             ImageError: The pixels are not uint8 RGB.
-            ArgumentError: A region, threshold or number is out of range, or ``max_instances`` of a flat world.
+            ArgumentError: A region, threshold or number is out of range, ``max_instances`` of a flat world, or a plane
+                for a model that does not say how its objects stand.
             InternalError: The network failed.
         """
         _check_arguments(pixels, regions, min_confidence)
@@ -109,7 +104,9 @@ class Detector:
         if max_detections is not None and max_detections < 1:
             raise ArgumentError(f"max_detections is {max_detections}; expected at least 1, or None for all")
         check_instances(self.model, max_instances)
-        limits = _Limits(min_confidence, max_detections, max_instances)
+        if plane is not None:
+            check_can_stand(self.model)
+        limits = Limits(min_confidence, max_detections, max_instances)
         frame = self._frame(pixels, camera, reduction)
         crops = [
             frame.crop(region) if region.overlaps(frame.width, frame.height) else None
@@ -119,12 +116,19 @@ class Detector:
             self._predictions([crop.image for crop in crops if crop is not None], max_instances, before_run)
         )
         results = DetectResponse().results if results is None else results
-        for index, crop in enumerate(crops):
-            result = results.add(model=self.model.name, model_version=self.model.version, region=index)
+        own = [
+            results.add(model=self.model.name, model_version=self.model.version, region=index)
+            for index in range(len(crops))
+        ]
+        for result, crop in zip(own, crops, strict=True):
             if crop is None:
                 result.status = REGION_STATUS_OUTSIDE_FRAME
             else:
-                _fill(result, crop, next(predictions), limits, self.depths_m)
+                fill(result, crop, next(predictions), limits, self.depths_m)
+        if plane is not None:
+            move_onto_plane(own, crops, self.model, plane)
+        for result, crop in zip(own, crops, strict=True):
+            if crop is not None:
                 self._judge(result)
         return results
 
@@ -176,7 +180,7 @@ class Detector:
             confidence = self._of_one_read(detection.confidence)
             detection.status = status_of(reliability, detection.object, confidence)
             center = [center_of[detection.object]]
-            (middle,) = transformed(center, detection.rotation or _UPRIGHT, detection.translation_m)
+            (middle,) = transformed(center, detection.rotation or UPRIGHT, detection.translation_m)
             add_interval(detection, reliability, confidence, math.hypot(*middle))
         result.status = region_status(result.detections)
 
@@ -286,59 +290,3 @@ def _check_arguments(pixels: Array, regions: Sequence[Region], min_confidence: f
                 f"regions[{index}] has (x, y, width, height) = {values}; "
                 "expected pixels within ±1e6, width and height at least 1"
             )
-
-
-def _first_of_each(rows: list[int], slots: Sequence[Slot], count: int) -> list[int]:
-    """The first rows of each kind of object, at most that many, in their order."""
-    numbers = Counter[str]()
-    kept = []
-    for row in rows:
-        numbers[slots[row].object] += 1
-        if numbers[slots[row].object] <= count:
-            kept.append(row)
-    return kept
-
-
-def _fill(
-    result: RegionResult,
-    crop: Crop,
-    found: Rows,
-    limits: _Limits,
-    depths_m: tuple[float, float],
-) -> None:
-    """Write the most confident detections of one crop into a result, best first, in the frame's camera.
-
-    Raises:
-        CameraError: A pose is not finite in the frame's camera.
-    """
-    values, slots = found
-    if "light" in values:
-        result.light.extend(crop.rotate([[value] for value in values["light"]]))
-    confidences = [min(max(c, 0.0), 1.0) for c in values.get("confidence", [1.0] * len(slots))]
-    confident = [row for row, confidence in enumerate(confidences) if confidence >= limits.min_confidence]
-    confident.sort(key=confidences.__getitem__, reverse=True)
-    if limits.max_instances is not None:
-        confident = _first_of_each(confident, slots, limits.max_instances)
-    for row in confident[: limits.max_detections]:
-        translation = crop.translation(values["translation_m"][row])
-        rotation = crop.rotate(values["rotation"][row]) if "rotation" in values else ()
-        if not all(map(math.isfinite, (*translation, *rotation, *result.light))):
-            raise CameraError("the camera gives a pose that is not finite; check K and the distortion")
-        result.detections.add(
-            object=slots[row].object,
-            confidence=confidences[row],
-            translation_m=translation,
-            rotation_6d=[*rotation[0::3], *rotation[1::3]],
-            rotation=rotation,
-            quaternion_xyzw=quaternion_xyzw(rotation) if rotation else (),
-            color=values["color"][row] if "color" in values else (),
-            box_px=crop.project(transformed(slots[row].box_corners, rotation or _UPRIGHT, translation)),
-            outside_trained_range=not depths_m[0] <= _depth_m(values, row, slots[row]) <= depths_m[1],
-        )
-
-
-def _depth_m(values: Values, row: int, slot: Slot) -> float:
-    """Depth of an object's middle along the canonical camera's axis, metres."""
-    towards = values["rotation"][row][2] if "rotation" in values else _UPRIGHT[6:]
-    depth_m: float = values["translation_m"][row][2] + sum(map(float.__mul__, towards, slot.center))
-    return depth_m

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from curio_serve.errors import ModelError, Unavailable, UsageError
+from curio_serve.models.model import BESIDE
 from curio_serve.models.model_folder import CONFIG_FILE, MODEL_FILE, SUMS_FILE, listed_sums
-from curio_serve.models.reliability import RELIABILITY_FILE
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -31,7 +31,7 @@ _FETCHED = [
     "*/SHA256SUMS",
     f"*/*/{MODEL_FILE}",
     "*/*/golden.npz",
-    f"*/*/{RELIABILITY_FILE}",
+    *(f"*/*/{file}" for file in BESIDE),
 ]
 
 

@@ -22,6 +22,7 @@ from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime, open_session, r
 from curio_serve.models.spec import check_known, part_of, read_metadata, read_spec, wanted_slots
 from curio_serve.models.stages.crop_stage import CROP_STAGE_KEY, CropStage, CropStageNote
 from curio_serve.models.stages.outline_stage import OUTLINE_STAGE_KEY, OutlineStage, OutlineStageNote
+from curio_serve.planes.stable_poses import STABLE_POSES_FILE, parse_stable_poses
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -31,7 +32,13 @@ SLOTS = "slots"
 """An input that some graphs have beside the image, int64: which slots to answer, all where it is left out."""
 
 MAX_BYTES = 1 << 30
-_MAX_RELIABILITY_BYTES = 1 << 20
+BESIDE = {
+    RELIABILITY_FILE: ("reliability", parse_reliability),
+    STABLE_POSES_FILE: ("stable_poses", parse_stable_poses),
+}
+"""Files beside the ONNX file: for each the field of the specification that holds what it says, and its reader."""
+
+_MAX_BESIDE_BYTES = 8 << 20
 _MOST_PARTS = 64  # of a model of many objects, which are kept
 Outputs = Mapping[str, np.ndarray]
 
@@ -68,7 +75,7 @@ class Model:
     version: int
     """Version of the model folder; 0 for a file outside one."""
     spec: ModelSpec
-    """Specification as the file stores it, with the reliability from the file beside it."""
+    """Specification as the file stores it, with what the files beside it say."""
     camera: CanonicalCamera
     """The canonical camera, of which its input is an image."""
     slots: Sequence[Slot]
@@ -194,22 +201,22 @@ def load(path: Path, name: str = "", version: int = 0, runtime: Runtime = DEFAUL
     except OSError as exc:
         raise ModelError(f"model file {path} cannot be read: {exc.strerror}; expected an .onnx file") from exc
     model = from_bytes(data, str(path), name, version, runtime)
-    _add_reliability(model, path.with_name(RELIABILITY_FILE))
+    for file in BESIDE:
+        _add(model, path.with_name(file))
     return model
 
 
-def _add_reliability(model: Model, path: Path) -> None:
-    """Add the measured reliability to a model's specification, if the file is there."""
+def _add(model: Model, path: Path) -> None:
+    """Add what a file of :data:`BESIDE` says to a model's specification, if it is there."""
     try:
-        text = read_file(path, _MAX_RELIABILITY_BYTES)
+        text = read_file(path, _MAX_BESIDE_BYTES)
     except (FileNotFoundError, NotADirectoryError):
         return
     except OSError as exc:
-        raise ModelError(
-            f"{path} cannot be read: {exc.strerror}; expected what curio-export --intervals writes"
-        ) from exc
+        raise ModelError(f"{path} cannot be read: {exc.strerror}; expected what curio-export writes") from exc
+    field, parse = BESIDE[path.name]
     objects = [kind.name for kind in model.spec.objects]
-    model.spec.reliability.CopyFrom(parse_reliability(text, objects, str(path)))
+    getattr(model.spec, field).CopyFrom(parse(text, objects, str(path)))
 
 
 def from_bytes(data: bytes, where: str, name: str = "", version: int = 0, runtime: Runtime = DEFAULT_RUNTIME) -> Model:

@@ -18,8 +18,7 @@ from google.protobuf import text_format
 from curio_serve.errors import ModelError
 from curio_serve.files import read_file
 from curio_serve.models.golden import GOLDEN_FILE, check_golden
-from curio_serve.models.model import INPUT, Model, load
-from curio_serve.models.reliability import RELIABILITY_FILE
+from curio_serve.models.model import BESIDE, INPUT, Model, load
 from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime
 
 CONFIG_FILE = "config.pbtxt"
@@ -69,11 +68,12 @@ def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME)
     model = load(path, folder.name, version, runtime)
     try:
         _check_sum(folder, f"{version}/{MODEL_FILE}", model.sha256)
-        if model.spec.HasField("reliability"):
-            _check_file_sum(folder, f"{version}/{RELIABILITY_FILE}")
-        elif (folder / SUMS_FILE).exists() and f"{version}/{RELIABILITY_FILE}" in listed_sums(folder):
-            missing = folder / str(version) / RELIABILITY_FILE
-            raise ModelError(f"{missing} is missing, and {SUMS_FILE} lists it; copy the folder again")
+        for file, (field, _) in BESIDE.items():
+            if model.spec.HasField(field):
+                _check_file_sum(folder, f"{version}/{file}")
+            elif (folder / SUMS_FILE).exists() and f"{version}/{file}" in listed_sums(folder):
+                missing = folder / str(version) / file
+                raise ModelError(f"{missing} is missing, and {SUMS_FILE} lists it; copy the folder again")
         _check_config(folder, model)
         check_golden(folder / str(version) / GOLDEN_FILE, model)
     except OSError as exc:

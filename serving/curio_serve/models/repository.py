@@ -13,9 +13,8 @@ from pathlib import Path
 
 from curio_serve.errors import CheckNotDone, ModelError, ModelNotFound
 from curio_serve.models.golden import GOLDEN_FILE
-from curio_serve.models.model import Model
+from curio_serve.models.model import BESIDE, Model
 from curio_serve.models.model_folder import MODEL_FILE, is_model_name, load_version, versions
-from curio_serve.models.reliability import RELIABILITY_FILE
 from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime
 
 Key = tuple[str, int]
@@ -159,7 +158,7 @@ class Repository:
 
 def _signature(folder: Path, version: int) -> Signature:
     files = (
-        *(folder / str(version) / name for name in (MODEL_FILE, GOLDEN_FILE, RELIABILITY_FILE)),
+        *(folder / str(version) / name for name in (MODEL_FILE, GOLDEN_FILE, *BESIDE)),
         folder / "SHA256SUMS",
         folder / "config.pbtxt",
     )

@@ -38,6 +38,9 @@ class CalibrateCommand:
     rig_out: Path | None = None
     """Several cameras: the folder has one of each, which show --board at the same instants under the same names. File
     to write for curio-detect --rig: each camera and where it stands."""
+    plane_out: Path | None = None
+    """With --board: file for curio-detect --plane: where the camera stands over the board in the last photograph, by
+    name. Lay the board where objects will stand."""
     camera_out: Path | None = None
     """The camera file to write. None: camera.json; from a scene only where there is no such file yet."""
     views_out: Path | None = None

@@ -10,6 +10,7 @@ import numpy as np
 from curio_serve.files import write_whole
 
 from curio_train.camera import Intrinsics, load_intrinsics, save_intrinsics
+from curio_train.capture.board_plane import pose_over_board, save_plane
 from curio_train.capture.calibration import Board, calibrate
 from curio_train.capture.ground import scale_by_distance, to_world
 from curio_train.capture.options import CalibrateCommand
@@ -24,6 +25,7 @@ _NEEDED = {
     "--square-mm": "--board",
     "--marker-mm": "--board",
     "--dictionary": "--marker-mm",
+    "--plane-out": "--board",
     "--data": "--objects",
     "--camera": "--views-out",
 }
@@ -54,6 +56,7 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
     board = _board(command, command.board)
     found = calibrate(command.images, board)
     camera_out = command.camera_out or _CAMERA_FILE
+    over_board = None if command.plane_out is None else pose_over_board(found, Photographs(command.images).paths[-1])
     save_intrinsics(camera_out, found.camera)
     unused = f", not found in {', '.join(path.name for path in found.unused[:5])}" if found.unused else ""
     return (
@@ -61,6 +64,16 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
         f"corners off by {found.error_px:.2f} pixels in {found.num_views} photographs{unused}"
         + _reading(board, found.board)
         + found.doubt
+        + ("" if command.plane_out is None or over_board is None else _plane(command.plane_out, over_board))
+    )
+
+
+def _plane(path: Path, over_board: np.ndarray) -> str:
+    """Write where the camera stands over the board, and say it."""
+    save_plane(path, over_board)
+    height_m, steepness = -float(over_board[:3, 1] @ over_board[:3, 3]), -float(over_board[2, 1])
+    return f"\n{path}: in the last photograph the camera stands {height_m:.3f} m above the board and looks " + (
+        f"{math.degrees(math.asin(np.clip(steepness, -1, 1))):.0f} degrees down on it"
     )
 
 
@@ -179,7 +192,9 @@ def _check(command: CalibrateCommand) -> None:
     for flag in ("--rig-out", "--camera"):
         if command.camera_out is not None and getattr(command, _field(flag)) is not None:
             raise UsageError(f"--camera-out {command.camera_out} is not written with {flag}; leave out one of them")
-    for flag in ("--camera-out", "--views-out", "--rig-out"):
+    if command.rig_out is not None and command.plane_out is not None:
+        raise UsageError(f"--plane-out {command.plane_out} is of one camera; leave it out, or leave out --rig-out")
+    for flag in ("--camera-out", "--views-out", "--rig-out", "--plane-out"):
         _check_output(flag, getattr(command, _field(flag)))
 
 

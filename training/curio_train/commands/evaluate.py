@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from curio_serve.command_line import parsed
 from rich.console import Console
@@ -13,6 +13,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from curio_train.commands.command_line.running import CACHE, answer, report, warn
 from curio_train.commands.linemod_data import fetched_linemod
+
+if TYPE_CHECKING:
+    from curio_serve.planes.camera_poses import GivenPlane
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,8 @@ class EvaluateCommand:
     """Score the poses once more after rendering and comparing; needs the renderer, as serving never does."""
     reads: int = 1
     """Read each image that many times, as curio-detect --reads does."""
+    plane: Annotated[str | None, arg(metavar="FILE|objects")] = None
+    """With --data: move poses onto the plane on which objects stand, as curio-detect --plane does."""
     json: FlagCreatePairsOff[bool] = False
     """Print the result as one JSON object on the last line."""
     cache: Path = CACHE
@@ -57,9 +62,20 @@ def _evaluate(command: EvaluateCommand) -> int:
         command = replace(command, data=fetched_linemod(command.cache, report, ask=False, frames=True))
     names = ("split", "num_images", "data", "bop_results", "refine", "reads", "cache")
     given = {name: getattr(command, name) for name in names}
+    given["plane"] = _plane(command.plane)
     with Console(stderr=True).status("") as status:
         result = evaluate(command.path, **given, progress=status.update, warn=warn)
     print_evaluation(result, Console())
     if command.json:
         print(json.dumps(result))
     return 0
+
+
+def _plane(given: str | None) -> "GivenPlane":
+    from curio_serve.planes.plane import FIND_PLANE
+
+    from curio_train.capture.plane import CameraPoseFile
+
+    if given is None or given == FIND_PLANE:
+        return None if given is None else FIND_PLANE
+    return CameraPoseFile.read(Path(given))

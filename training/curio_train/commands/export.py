@@ -118,6 +118,9 @@ def _views(command: ExportCommand) -> "UnlabelledPhotographs | None":
 
 def _measure(command: ExportCommand, folder: Path, views: "UnlabelledPhotographs | None") -> None:
     """Measure the latest version of a model on renderings, and write what was found beside it."""
+    from curio_serve.models.reliability import RELIABILITY_FILE
+    from google.protobuf import json_format
+
     from curio_train.evaluation.reliability import NUM_IMAGES, fit_reliability, held_out_answers
     from curio_train.evaluation.subject import load_subject, model_reader
     from curio_train.evaluation.unlabelled.self_consistency import adjusted, adjustment, photographed_pairs
@@ -132,7 +135,8 @@ def _measure(command: ExportCommand, folder: Path, views: "UnlabelledPhotographs
         answers = held_out_answers(world, predict, "validation", NUM_IMAGES, cache, status.update)
     on_renderings, target = fit_reliability(answers), ModelFolder(folder)
     found = on_renderings if views is None else adjusted(on_renderings, answers, pairs or (), len(views.paths))
-    path = target.put_reliability(target.versions()[-1], found)
+    text = json_format.MessageToJson(found, preserving_proto_field_name=True) + "\n"
+    path = target.put_beside(target.versions()[-1], RELIABILITY_FILE, text)
     for one, of, before in zip(found.objects, answers, on_renderings.objects, strict=True):
         print(
             f"{path}: {one.object} is sure from a confidence of {one.min_confidence:.2g}, as in "

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 from curio_serve.bop import LINEMOD_IDS
-from curio_serve.imaging.rotation import are_several_axes
+from curio_serve.imaging.rotation import are_several_axes, is_rotation
 from PIL import Image
 
 from curio_train.camera import Intrinsics, check_matrix, load_intrinsics
 from curio_train.data.bop_json import Record, read_records
 from curio_train.errors import DataError, UsageError, nearest
-from curio_train.geometry import Pose, is_rotation
+from curio_train.geometry import Pose
 from curio_train.meshes.meshes import METRES, Mesh, load_mesh
 
 LINEMOD_CLASSES = tuple(name for name in LINEMOD_IDS if name not in ("bowl", "cup"))

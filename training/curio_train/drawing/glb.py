@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 import trimesh
 from curio_serve.files import read_file
+from curio_serve.imaging.rotation import is_rotation
 from PIL import Image
 
 from curio_train.drawing.axes import GL_FROM_CV, embed, linear, root_from_camera, towards_light
 from curio_train.drawing.pictures import SceneContext
 from curio_train.drawing.scenes import Placed, Scene, located
 from curio_train.errors import DataError
-from curio_train.geometry import Pose, is_rotation
+from curio_train.geometry import Pose
 from curio_train.meshes.meshes import MAX_BYTES, Mesh
 
 _LUX = math.pi  # of a directional light of strength 1: the irradiance of a surface that faces it

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 from curio_serve.files import read_file
+from curio_serve.imaging.rotation import is_rotation
 
 from curio_train.camera import check_matrix
 from curio_train.errors import DataError
-from curio_train.geometry import Pose, is_rotation
+from curio_train.geometry import Pose
 from curio_train.scene_code import COLOR, CONFIDENCE, LIGHT, TRANSLATION, SceneCode
 from curio_train.worlds import WORLDS, build
 from curio_train.worlds.base import World

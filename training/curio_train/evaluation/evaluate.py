@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from curio_serve.planes.camera_poses import GivenPlane
 from torch import Tensor
 
 from curio_train.errors import DataError, ReportError, UsageError
@@ -58,6 +59,7 @@ def evaluate(
     bop_results: Path | None = None,
     refine: bool = False,
     reads: int = 1,
+    plane: GivenPlane = None,
     cache: Path,
     progress: Callable[[str], None] = lambda text: None,
     warn: Callable[[str], None] = lambda text: None,
@@ -73,6 +75,7 @@ def evaluate(
         bop_results: Folder for a results file of those frames in BOP's format.
         refine: Score the poses once more after :class:`~curio_train.refinement.render_and_compare.RenderAndCompare`.
         reads: How often each image is read, see :mod:`curio_serve.models.repeated`.
+        plane: On which the objects of real frames stand, see :mod:`curio_serve.planes.standing`.
         cache: Where worlds keep their image sets.
         progress: Told what is being done.
         warn: Told why photographs could not be judged by, or a report not written: no evaluation is thrown away for
@@ -83,15 +86,14 @@ def evaluate(
         ``reliability`` of the confidence where one object has one, and
         ``real`` where real frames were scored, ``photographs`` where there are some to judge by, and
         ``refined`` with ``metrics`` and ``real`` of refined poses. A run folder gets it as well, and a report, unless
-        images were read more than once.
+        images were read more than once or poses moved onto a plane.
 
     Raises:
         CurioError: Any of this package's errors.
     """
     if num_images is not None and num_images < 1:
         raise UsageError(f"--num-images is {num_images}, expected at least 1")
-    if bop_results is not None and data is None:
-        raise UsageError("--bop-results needs the real frames: give --data DIR")
+    _refuse_without_frames(data, bop_results, plane, refine=refine)
     subject = load_subject(path, data)
     if data is not None:  # before minutes are spent on renderings
         _refuse_unscorable(subject, data, bop_results, ("", _REFINED) if refine else ("",))
@@ -101,6 +103,7 @@ def evaluate(
     progress(f"{num_images} images of the {split} split")
     held_out = draw(subject.world, split, num_images, cache)
     result = _origin(path, subject) | {"split": split, "num_images": len(held_out.images), "reads": reads}
+    result["on_plane"] = plane is not None
     progress("the network")
     scored = _scored(subject.world, subject.predict, held_out)
     result["metrics"] = scored.metrics
@@ -110,7 +113,7 @@ def evaluate(
     result["untrained"] = _scored(subject.world, subject.untrained(), held_out).metrics
     if data is not None:
         progress(f"real frames in {data}")
-        result["real"] = evaluate_real_frames(subject, data, bop_results)
+        result["real"] = evaluate_real_frames(subject, data, bop_results, plane=plane)
     if better is not None:
         progress("refined poses")
         result["refined"] = {"metrics": _scored(better.world, better.predict, held_out).metrics}
@@ -118,7 +121,8 @@ def evaluate(
             result["refined"]["real"] = evaluate_real_frames(better, data, bop_results, _REFINED)
     if (judgement := _judged(subject, warn)) is not None:
         result["photographs"] = judgement.summary
-    if reads == 1 and (path / CONFIG_FILE).exists():  # cards and reports are of the model as it answers by itself
+    is_plain = reads == 1 and plane is None  # cards and reports are of the model as it answers by itself
+    if is_plain and (path / CONFIG_FILE).exists():
         _keep_held_out(path, result)
         progress("the report")
         try:
@@ -126,6 +130,13 @@ def evaluate(
         except ReportError as exc:
             warn(str(exc))
     return result
+
+
+def _refuse_without_frames(data: Path | None, bop_results: Path | None, plane: GivenPlane, *, refine: bool) -> None:
+    if bop_results is not None and data is None:
+        raise UsageError("--bop-results needs the real frames: give --data DIR")
+    if plane is not None and (data is None or refine):
+        raise UsageError("--plane is for real frames (--data DIR), and not for --refine, which corrects distances, too")
 
 
 def _has_whole_frames(world: World) -> bool:

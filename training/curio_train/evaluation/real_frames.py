@@ -14,11 +14,13 @@ import torch
 from curio_serve.errors import CameraError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.view import CanonicalCamera, PinholeCrop, PinholeFrame
+from curio_serve.planes.camera_poses import GivenPlane, plane_of
 
 from curio_train.data.bop import Annotation, BopDataset, Frame
 from curio_train.data.bop_split import SPLIT, scored_frames
 from curio_train.data.photographs import read_photograph
 from curio_train.errors import DataError, UsageError
+from curio_train.evaluation.on_plane import Shape, shapes_of, standing_on
 from curio_train.evaluation.real_scores import Estimate, scored, together
 from curio_train.evaluation.subject import Subject
 from curio_train.geometry import Pose
@@ -28,7 +30,9 @@ from curio_train.worlds.base import Camera, World
 _BATCH = 16
 
 
-def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None, suffix: str = "") -> dict[str, Any]:
+def evaluate_real_frames(
+    subject: Subject, data: Path, bop_results: Path | None, suffix: str = "", plane: GivenPlane = None
+) -> dict[str, Any]:
     """Score on the targets of each object of the world in a data set.
 
     Args:
@@ -36,14 +40,19 @@ def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None,
         data: In BOP's layout.
         bop_results: Folder for a results file in BOP's format, or None.
         suffix: Of the method's name in that file's.
+        plane: On which objects stand.
 
     Raises:
-        UsageError: The world has no camera, the data set does not know the object, or the results file is there.
+        CameraError: The file of the plane has no pose of a frame's camera.
+        UsageError: The world has no camera or no objects that may stand in any way, the data set does not know the
+            object, or the results file is there.
         DataError: The data set is incomplete or has no frame of it.
     """
     dataset, kinds = BopDataset(data), subject.world.objects
     wanted = [scored_frames(dataset, kind.name) for kind in kinds]
     found = _read_frames(subject, dataset, {_key(target) for frames in wanted for target in frames.targets})
+    if plane is not None:
+        found = _on_plane(found, shapes_of(kinds), plane)
     chosen = [[found[_key(target)][slot] for target in frames.targets] for slot, frames in enumerate(wanted)]
     if bop_results is not None:
         by_object = {dataset.object_id(kind.name): one for kind, one in zip(kinds, chosen, strict=True)}
@@ -56,6 +65,17 @@ def evaluate_real_frames(subject: Subject, data: Path, bop_results: Path | None,
     if len(each) == 1:
         return about | next(iter(each.values()))
     return about | together(each, _absent(dataset, [kind.name for kind in kinds], found))
+
+
+def _on_plane(
+    found: Mapping[tuple[int, int], list[Estimate]], shapes: Sequence[Shape], given: GivenPlane
+) -> dict[tuple[int, int], list[Estimate]]:
+    """The same estimates, moved onto the plane in each frame."""
+    moved = {}
+    for key, estimates in found.items():
+        plane = plane_of(given, str(estimates[0].frame.path))
+        moved[key] = estimates if plane is None else standing_on(estimates, shapes, plane)
+    return moved
 
 
 def bop_file(folder: Path, subject: Subject, data: Path, suffix: str = "") -> Path:

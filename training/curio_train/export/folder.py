@@ -10,6 +10,7 @@
                  golden.npz           an image and its outputs, which a server asks again before it serves the version
                  weights.safetensors  the network as it was trained, to train it further; no server reads it
                  reliability.json     when its answers are sure, and how far off they are, where that was measured
+                 stable_poses.json    how its objects can stand on a plane
 """
 
 import hashlib
@@ -23,18 +24,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from curio_proto.v1.model_spec_pb2 import Reliability
 from curio_serve.files import write_whole
 from curio_serve.models.golden import GOLDEN_FILE
+from curio_serve.models.model import BESIDE
 from curio_serve.models.model_folder import CONFIG_FILE, MODEL_FILE, SUMS_FILE, is_model_name, versions
-from curio_serve.models.reliability import RELIABILITY_FILE
-from google.protobuf import json_format
 
 from curio_train.errors import ExportError, UsageError
 from curio_train.exported_model import WEIGHTS_FILE
 
 _CARD = "CARD.md"
-_LISTED = (MODEL_FILE, GOLDEN_FILE, WEIGHTS_FILE, RELIABILITY_FILE)
+_LISTED = (MODEL_FILE, GOLDEN_FILE, WEIGHTS_FILE, *BESIDE)
 _MAX_BATCH_SIZE = 64
 _NOT_IN_NAMES, _LONGEST_NAME = re.compile(r"[^A-Za-z0-9_.-]+"), 64
 
@@ -137,17 +136,21 @@ class ModelFolder:
             raise ExportError(f"cannot write {target}: {exc.strerror}; name another folder: --out") from exc
         return target
 
-    def put_reliability(self, version: int, found: Reliability) -> Path:
-        """Write what was measured of a version beside its model, in place of an earlier measurement.
+    def put_beside(self, version: int, file: str, text: str) -> Path:
+        """Write a file that says more of a version beside its model, in place of an earlier one.
+
+        Args:
+            version: That is there.
+            file: Its name, one of :data:`~curio_serve.models.model.BESIDE`.
+            text: Its content.
 
         Returns:
-            The file.
+            The file's path.
 
         Raises:
             ExportError: It could not be written.
         """
-        path, listed = self.path / str(version) / RELIABILITY_FILE, f"{version}/{RELIABILITY_FILE}"
-        text = json_format.MessageToJson(found, preserving_proto_field_name=True) + "\n"
+        path, listed = self.path / str(version) / file, f"{version}/{file}"
         lines = [line for line in _text(self.path / SUMS_FILE).splitlines() if not line.endswith(f"  {listed}")]
         lines.append(f"{hashlib.sha256(text.encode()).hexdigest()}  {listed}")
         try:

@@ -6,7 +6,9 @@ import numpy as np
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, ModelSpec, ObjectModel, Symmetry
 from curio_proto.v1.model_spec_pb2 import Field as FieldSpec
 from curio_serve.models.spec import SCHEMA_VERSION
+from curio_serve.planes.stable_poses import STABLE_POSES_FILE
 
+from curio_train.meshes.stable_poses import stable_poses, to_text
 from curio_train.scene_code import Field
 from curio_train.worlds.base import ObjectKind, World
 
@@ -26,6 +28,17 @@ def model_spec(world: World, name: str) -> ModelSpec:
             width=camera.width, height=camera.height, camera_matrix=matrix, is_default=camera.is_default
         ),
     )
+
+
+def stable_poses_file(world: World) -> dict[str, bytes]:
+    """The file beside a model that says how its objects can stand on a plane, by its name.
+
+    Empty where they always stand in the same way, or are flat.
+    """
+    hulls_m = [(kind.name, kind.hull_m) for kind in world.objects if kind.hull_m is not None]
+    if len(hulls_m) < len(world.objects):
+        return {}
+    return {STABLE_POSES_FILE: to_text(stable_poses(hulls_m)).encode()}
 
 
 def _field_spec(field: Field) -> FieldSpec:

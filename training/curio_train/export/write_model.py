@@ -24,7 +24,7 @@ from curio_train.export.graph import Graph, check_images, deployable, numericall
 from curio_train.export.int8 import rounded_otherwise
 from curio_train.export.onnx import put_spec, store_half
 from curio_train.export.parity import largest_difference, refuse_disparity
-from curio_train.export.spec import model_spec
+from curio_train.export.spec import model_spec, stable_poses_file
 from curio_train.export.stages import num_choosable, traced
 from curio_train.exported_model import WEIGHTS_FILE, ExportedModel
 from curio_train.learning.runs.checkpoint import RunFolder
@@ -148,7 +148,7 @@ def export(
     )
     report()
     text = card(version, spec, shapes, world.objects, made)
-    files = {
+    files = stable_poses_file(world) | {
         MODEL_FILE: model.SerializeToString(),
         GOLDEN_FILE: _golden(images, deployed, stable, found),
         WEIGHTS_FILE: weights_file(state, folder.config, half=half),

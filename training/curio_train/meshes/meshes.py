@@ -24,6 +24,7 @@ from curio_train.meshes.cad import CAD_SUFFIXES, read_cad
 from curio_train.meshes.color_range import refuse_bytes_as_fractions
 from curio_train.meshes.extent import box_corners, diameter
 from curio_train.meshes.gltf import GLTF_SUFFIXES, read_gltf, refuse_unread
+from curio_train.meshes.stable_poses import hull_points
 
 Unit = Literal["m", "cm", "mm", "inch"]
 METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
@@ -74,6 +75,11 @@ class Mesh:
     def box_corners_m(self) -> np.ndarray:
         """Corners [8, 3] of the axis-aligned box, in the order of :func:`~curio_train.meshes.extent.box_corners`."""
         return box_corners(self.vertices_m)
+
+    @cached_property
+    def hull_m(self) -> np.ndarray:
+        """Points of its convex hull, see :func:`~curio_train.meshes.stable_poses.hull_points`."""
+        return hull_points(self.vertices_m)
 
     def thinned_m(self, num: int) -> np.ndarray:
         """About ``num`` of the vertices, or all if there are fewer: every n-th, [k, 3]."""

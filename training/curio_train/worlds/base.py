@@ -44,6 +44,8 @@ class ObjectKind:
     """Continuous ones, each (unit axis [3], point on it in metres [3])."""
     center_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The object's middle, object frame. Scene codes have its position; outputs have the origin's."""
+    hull_m: np.ndarray | None = None
+    """Points of its convex hull, [n, 3], object frame; None for kinds that always stand the same way, or are flat."""
     attribution: str = ""
     """Source and licence of the mesh if it is not ours; the model's card quotes it."""
 

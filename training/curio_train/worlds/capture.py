@@ -185,6 +185,7 @@ def _object(options: CaptureOptions, camera: Intrinsics, file: Path, slot: int) 
         found.discrete,
         found.continuous,
         center_m=(float(center_m[0]), float(center_m[1]), float(center_m[2])),
+        hull_m=of_file.hull_m,
     )
     return Object(
         kind,

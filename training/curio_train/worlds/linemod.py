@@ -168,6 +168,7 @@ def _object(dataset: BopDataset, name: str, slot: int, backgrounds: Callable[[Pa
         mesh.sha256,
         info.symmetries,
         info.symmetry_axes,
+        hull_m=mesh.hull_m,
         attribution=dataset.attribution,
     )
     return Object(kind, mesh, dataset.camera, NEAR_M, FAR_M, backgrounds, scan_excess_m=SCAN_EXCESS_M)

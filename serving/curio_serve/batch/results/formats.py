@@ -70,6 +70,12 @@ class ImageResult:
         """[3] towards the light, camera frame; empty where the world has none."""
         return next((list(result.light) for result in self.results if result.light), [])
 
+    @property
+    def plane(self) -> dict[str, list[float]]:
+        """The plane on which objects stand, camera frame; empty where none was given or found."""
+        found = next((result.plane for result in self.results if result.HasField("plane")), None)
+        return {} if found is None else {"point_m": list(found.point_m), "normal": list(found.normal)}
+
 
 @dataclass(frozen=True)
 class ImageLines:
@@ -143,7 +149,7 @@ class JsonLines(ResultFormat):
     """One JSON object an image, always with the same keys; ``error`` stands in place of ``detections``.
 
     What does not apply (the rotation of a flat object, the size of what is no image) is null. ``views``,
-    ``cam_from_rig``, ``distortion`` and ``exif_rotation`` are there only where they apply.
+    ``cam_from_rig``, ``distortion``, ``exif_rotation`` and ``plane`` are there only where they apply.
     """
 
     opening = b'{"image": '
@@ -162,6 +168,7 @@ class JsonLines(ResultFormat):
             **({"exif_rotation": True} if result.exif_rotation else {}),
             **({"error": result.error} if result.error else answer),
             "light": result.light or None,
+            **({"plane": result.plane} if result.plane else {}),
             "model": {"name": result.model, "version": result.version},
             "milliseconds": {"decode": _rounded(result.decode_ms), "inference": _rounded(result.inference_ms)},
         }

@@ -1,0 +1,127 @@
+"""Finds the plane on which a frame's objects stand, and how far away an object is that stands on a plane.
+
+The distance is what a network reads worst: it is off by a hundredth or two, several times as far as the place across
+the view. A known plane says how far away an object is that stands on it. Where the plane is not known, the objects tell
+it: a body stands on few of its sides only, so each pose proposes a few planes, and the answer is the one on which most
+objects stand.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from curio_serve.planes.plane import Plane
+
+Array = np.ndarray
+_DEPTH_STD = 0.015
+"""Standard deviation of a distance that a network reads, fraction of the distance."""
+_HEIGHT_STD_M = 0.004
+"""Of the height of an object's lowest point over the plane: meshes end where scanners stopped, and tables bend."""
+_TILT_STD = 0.08
+"""Of the angle between the plane and a side that an object stands on, radians."""
+_MOST_TILT = 0.3
+"""Objects that lean farther from every side that they can stand on are left where they are, radians."""
+_MOST_DEVIATIONS = 4.0
+"""So are those whose distance would change by more than that many standard deviations."""
+_LEAST_EVIDENCE, _LEAST_OBJECTS = 0.2, 2
+"""That many objects have to stand on a plane, each with a likelihood of that part of the largest."""
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """An object's pose, and how it can stand."""
+
+    weight: float
+    """Its confidence."""
+    middle_m: Array
+    """[3], camera frame."""
+    hull_m: Array
+    """Points of its convex hull, [n, 3], camera frame."""
+    up: Array
+    """For each of its stable poses the unit vector that points away from the plane, [k, 3], camera frame."""
+
+
+def find_plane(objects: Sequence[Standing]) -> Plane | None:
+    """The plane on which most of the objects stand; None where no two of them agree on one."""
+    objects = [one for one in objects if one.weight > 0 and len(one.up)]
+    candidates = [one.up[one.up @ one.middle_m < 0] for one in objects]  # seen from above
+    if len(objects) < _LEAST_OBJECTS or not any(map(len, candidates)):
+        return None
+    normals = np.concatenate(candidates)
+    heights_m = _heights_m(normals, objects)
+    best, found = 0.0, None
+    for offsets_m in heights_m.T:
+        scores = _likelihoods(normals, offsets_m, objects, heights_m) @ [one.weight for one in objects]
+        row = int(scores.argmax())
+        if scores[row] > best:
+            best, found = float(scores[row]), (normals[row], float(offsets_m[row]))
+    return None if found is None else _fitted(*found, objects)
+
+
+def distance_factor(one: Standing, plane: Plane) -> float | None:
+    """By which factor an object's distance changes where it stands on a plane; None where it does not stand there.
+
+    The factor is the likeliest, given how far a network's distances and an object's height over a plane are off.
+    """
+    if not len(one.up) or np.linalg.norm(one.up - plane.normal, axis=1).min() > _MOST_TILT:
+        return None
+    towards_m = float(plane.normal @ one.middle_m)  # negative: from the camera down to the plane
+    below_m = float((one.hull_m @ plane.normal).min()) - towards_m
+    if towards_m >= -_HEIGHT_STD_M:
+        return None
+    change = (plane.offset_m - below_m) / towards_m - 1
+    std = _HEIGHT_STD_M / -towards_m
+    if abs(change) > _MOST_DEVIATIONS * np.hypot(_DEPTH_STD, std):
+        return None
+    return 1 + change * _DEPTH_STD**2 / (_DEPTH_STD**2 + std**2)
+
+
+def _fitted(normal: Array, offset_m: float, objects: Sequence[Standing]) -> Plane | None:
+    """The plane that fits a candidate's supporters best, by least squares, reweighted a few times."""
+    weights = np.array([one.weight for one in objects])
+    sides = np.stack([one.up[np.linalg.norm(one.up - normal, axis=1).argmin()] for one in objects])
+    for _ in range(_ROUNDS):
+        fits = _likelihoods(normal[None], np.array([offset_m]), objects)[0]
+        contacts_m = np.stack([one.hull_m[(one.hull_m @ normal).argmin()] for one in objects])
+        height = np.sqrt(weights * fits) / _height_stds_m(normal[None], objects)[0]
+        tilt = np.sqrt(weights * fits) / _TILT_STD
+        rows = np.concatenate([np.c_[contacts_m, -np.ones(len(objects))] * height[:, None], *_turned_by(tilt)])
+        values = np.concatenate([np.zeros(len(objects)), (sides * tilt[:, None]).T.ravel()])
+        found = np.linalg.lstsq(rows, values, rcond=None)[0]
+        length = float(np.linalg.norm(found[:3]))
+        if length < 0.5:  # sides that point everywhere
+            return None
+        normal, offset_m = found[:3] / length, float(found[3]) / length
+    fits = _likelihoods(normal[None], np.array([offset_m]), objects)[0]
+    return (
+        Plane(normal * offset_m, normal) if (fits > _LEAST_EVIDENCE).sum() >= _LEAST_OBJECTS and offset_m < 0 else None
+    )
+
+
+def _turned_by(tilt: Array) -> list[Array]:
+    """Rows of the least squares that hold the normal's three entries to each side's, [n, 4] each."""
+    return [np.eye(4)[axis] * tilt[:, None] for axis in range(3)]
+
+
+def _likelihoods(
+    normals: Array, offsets_m: Array, objects: Sequence[Standing], heights_m: Array | None = None
+) -> Array:
+    """How well each object stands on each plane, 0 to 1, [planes, objects]."""
+    heights_m = _heights_m(normals, objects) if heights_m is None else heights_m
+    tilts = [np.linalg.norm(normals[:, None] - one.up, axis=-1).min(axis=1) for one in objects]
+    off = (heights_m - offsets_m[:, None]) / _height_stds_m(normals, objects)
+    result: Array = np.exp(-0.5 * (np.stack(tilts, axis=1) / _TILT_STD) ** 2 - 0.5 * off**2)
+    return result
+
+
+def _heights_m(normals: Array, objects: Sequence[Standing]) -> Array:
+    """The lowest point of each object along each normal, [planes, objects]."""
+    return np.stack([(normals @ one.hull_m.T).min(axis=1) for one in objects], axis=1)
+
+
+def _height_stds_m(normals: Array, objects: Sequence[Standing]) -> Array:
+    """Standard deviation of those, as the distances that a network reads make it, [planes, objects]."""
+    along_m = np.stack([normals @ one.middle_m for one in objects], axis=1)
+    return np.hypot(_DEPTH_STD * along_m, _HEIGHT_STD_M)

@@ -1,0 +1,222 @@
+"""Poses that are moved onto a plane: in process, on the command line and over gRPC."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from curio_proto.v1 import detector_pb2 as messages
+from curio_proto.v1.model_spec_pb2 import ModelSpec
+from curio_serve.batch.arguments import DetectArguments
+from curio_serve.batch.detect_cli import run
+from curio_serve.client import Plane, PoseClient
+from curio_serve.client.request import detect_request, views_request
+from curio_serve.errors import ArgumentError, ModelError, UsageError
+from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.models.detector import Detector
+from curio_serve.models.model_folder import open_model
+from onnx import helper, numpy_helper
+
+K = np.array([[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]])
+CORNERS_M = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float) * 0.05
+SIDES = np.concatenate([np.eye(3), -np.eye(3)])
+STABLE_POSES = {"objects": [{"object": "spot", "hull_m": CORNERS_M.ravel().tolist(), "up": SIDES.ravel().tolist()}]}
+_BESIDE = 0.2 * np.array([0.36, -0.8, 0.48])
+Spot = Callable[..., np.ndarray]
+
+
+@pytest.fixture
+def standing(tmp_path: Path, spot_onnx: Callable[..., onnx.ModelProto], write_folder: Callable[..., Path]) -> Path:
+    """The folder of ``pinhole``, whose object can stand as a cube does."""
+    return _with_stable_poses(write_folder(tmp_path / "models" / "pinhole", spot_onnx(True)))
+
+
+@pytest.fixture
+def pair(
+    tmp_path: Path,
+    spot_onnx: Callable[..., onnx.ModelProto],
+    spot_spec: Callable[[bool], ModelSpec],
+    write_folder: Callable[..., Path],
+) -> Path:
+    """The folder of ``pair``: ``pinhole`` with a second cube 0.2 m beside the first, along the first's own x axis."""
+    spec = spot_spec(True)
+    spec.name, spec.num_slots, spec.objects[0].slots[:] = "pair", 2, [0, 1]
+    model = spot_onnx(True, spec)
+    graph = model.graph
+    for output in graph.output:
+        if output.name == "light":
+            continue
+        (last,) = [node for node in graph.node if output.name in node.output]
+        last.output[:] = [f"{output.name}_one"]
+        shift = _BESIDE if output.name == "translation_m" else np.float32(0)
+        graph.initializer.append(numpy_helper.from_array(np.asarray(shift, np.float32), f"{output.name}_shift"))
+        names = [f"{output.name}_{part}" for part in ("one", "shift", "two")]
+        graph.node.append(helper.make_node("Add", names[:2], names[2:]))
+        graph.node.append(helper.make_node("Concat", [names[0], names[2]], [output.name], axis=1))
+        output.type.tensor_type.shape.dim[1].dim_value = 2
+    onnx.checker.check_model(model)
+    return _with_stable_poses(write_folder(tmp_path / "models" / "pair", model))
+
+
+def _with_stable_poses(folder: Path) -> Path:
+    file = folder / "1" / "stable_poses.json"
+    file.write_text(json.dumps(STABLE_POSES))
+    with (folder / "SHA256SUMS").open("a") as sums:
+        sums.write(f"{hashlib.sha256(file.read_bytes()).hexdigest()}  1/stable_poses.json\n")
+    return folder
+
+
+@pytest.fixture
+def pixels(spot_image: Spot) -> np.ndarray:
+    return spot_image(320, 240, 150, 120, 12, 12, (255, 128, 0))
+
+
+def _below(found: messages.Detection, farther_m: float) -> Plane:
+    """The plane on which a detection's cube would stand, if it were farther away by so much."""
+    rotation, origin_m = np.reshape(found.rotation, (3, 3)), np.array(found.translation_m)
+    normal = max(SIDES @ rotation.T, key=lambda side: -side @ origin_m)
+    ray = origin_m / np.linalg.norm(origin_m)
+    return Plane(origin_m + farther_m * ray - 0.05 * normal, normal)
+
+
+def _detect(folder: Path, pixels: np.ndarray, **options: Any) -> messages.RegionResult:
+    (result,) = Detector(open_model(folder)).detect(pixels, PinholeCamera(K), **options)
+    return result
+
+
+def test_a_pose_moves_along_its_line_of_sight(standing: Path, pixels: np.ndarray) -> None:
+    before = _detect(standing, pixels).detections[0]
+    assert not before.on_plane
+    plane = _below(before, 0.01)
+    result = _detect(standing, pixels, plane=plane)
+    (found,) = result.detections
+    assert found.on_plane
+    assert np.allclose(result.plane.normal, plane.normal)
+    was_m, now_m = np.array(before.translation_m), np.array(found.translation_m)
+    assert np.linalg.norm(np.cross(was_m, now_m)) < 1e-9
+    farther_m = np.linalg.norm(now_m) - np.linalg.norm(was_m)
+    assert 0.006 < farther_m < 0.01  # most of the way: a plane is not known exactly either
+    assert list(found.rotation) == list(before.rotation)
+    spread = [np.ptp(np.reshape(one.box_px, (8, 2)), axis=0) for one in (before, found)]
+    assert (spread[1] < spread[0]).all()  # what is farther away is smaller
+
+
+def test_a_pose_that_does_not_stand_there_stays(standing: Path, pixels: np.ndarray) -> None:
+    before = _detect(standing, pixels).detections[0]
+    result = _detect(standing, pixels, plane=_below(before, 0.4))
+    assert result.detections[0].translation_m == before.translation_m
+    assert not result.detections[0].on_plane
+    assert result.HasField("plane")
+
+
+def test_the_plane_is_found_where_two_objects_stand_on_it(standing: Path, pair: Path, pixels: np.ndarray) -> None:
+    assert not _detect(standing, pixels, plane="objects").HasField("plane")  # one object stands on any
+    result = _detect(pair, pixels, plane="objects")
+    assert [one.on_plane for one in result.detections] == [True, True]
+    heights_m = [np.array(one.translation_m) @ result.plane.normal for one in result.detections]
+    assert np.ptp(heights_m) < 0.002
+
+
+def test_a_model_that_does_not_say_how_objects_stand_refuses(models_dir: Path, pixels: np.ndarray) -> None:
+    with pytest.raises(ArgumentError, match="model pinhole/1 does not say how its objects stand"):
+        _detect(models_dir / "pinhole", pixels, plane="objects")
+
+
+def test_a_file_that_was_changed_or_lost_is_refused(standing: Path) -> None:
+    file = standing / "1" / "stable_poses.json"
+    file.write_text(json.dumps(STABLE_POSES, indent=1))
+    with pytest.raises(ModelError, match=r"stable_poses\.json has SHA-256"):
+        open_model(standing)
+    file.unlink()
+    with pytest.raises(ModelError, match=r"stable_poses\.json is missing"):
+        open_model(standing)
+
+
+def test_over_grpc(standing: Path, pair: Path, start_server: Callable[..., Any], pixels: np.ndarray) -> None:
+    before = _detect(standing, pixels).detections[0]
+    plane = _below(before, 0.01)
+    expected = _detect(standing, pixels, plane=plane).detections[0]
+    with PoseClient(start_server(standing.parent).address) as client:
+        (result,) = client.detect("pinhole", pixels, K, plane=plane).results
+        found = client.detect(["pinhole", "pair"], pixels, K, plane="objects").results
+        assert client.get_model("pinhole").spec.stable_poses.objects[0].object == "spot"
+        with pytest.raises(ArgumentError, match="expected a Plane, 'objects' or None"):
+            client.detect("pinhole", pixels, K, plane="table")  # type: ignore[arg-type]
+        impossible = detect_request("pinhole", pixels, K, plane=plane)
+        del impossible.plane.normal[:]
+        following = detect_request("pinhole", pixels, K, plane="objects", track=messages.Tracking())
+        answers = list(client.detect_stream([impossible, following], timeout_s=60))
+        views = views_request("pinhole", [(pixels, K, np.eye(4)), (pixels, K, np.eye(4))])
+        views.plane.CopyFrom(messages.Plane())
+        answers += client.detect_stream([views], timeout_s=60)
+    assert result.detections[0].translation_m == pytest.approx(expected.translation_m)
+    assert result.detections[0].on_plane
+    assert [[one.on_plane for one in of_model.detections] for of_model in found] == [[False], [True, True]]
+    told = [answer.error.message for answer in answers]
+    assert "3 values of a point and 0 of a normal" in told[0]
+    assert "plane are not for following" in told[1]
+    assert "the request has views and plane" in told[2]
+
+
+def test_the_command_line(standing: Path, frames: Path, camera: Path, tmp_path: Path) -> None:
+    """A camera that stands still, and cameras whose poses are named."""
+    out, poses = tmp_path / "out.jsonl", tmp_path / "views.json"
+    call = DetectArguments(str(standing), (str(frames),), camera=camera, out=str(out), overwrite=True, jobs=1)
+    assert run(call) == 0
+    before = [json.loads(line)["detections"][0] for line in out.read_text().splitlines()]
+    plane = _below(
+        messages.Detection(translation_m=before[0]["translation_m"], rotation=np.ravel(before[0]["rotation"])), 0.01
+    )
+    pose = {"cam_from_world": _pose_over(plane).tolist()}
+    for content, num_moved in ((pose, 6), ({"000000.png": pose}, 1)):
+        poses.write_text(json.dumps(content))
+        assert run(replace(call, plane=str(poses))) == int(num_moved < 6)
+        lines = [json.loads(line) for line in out.read_text().splitlines()]
+        assert len([line for line in lines if "plane" in line]) == num_moved
+        assert lines[0]["detections"][0]["on_plane"]
+        assert np.allclose(lines[0]["plane"]["normal"], plane.normal)
+    assert "has no pose of 000005.png" in lines[-1]["error"]
+    assert run(replace(call, plane="objects")) == 0
+    assert "plane" not in json.loads(out.read_text().splitlines()[0])  # of one object none is found
+
+
+def _pose_over(plane: Plane) -> np.ndarray:
+    """The cam_from_world of a plane at y = 0."""
+    across = np.cross(plane.normal, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([across, plane.normal, np.cross(across, plane.normal)], axis=1)
+    pose[:3, 3] = plane.point_m
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"plane": "nowhere.json"}, r"--plane nowhere\.json: cannot be read"),
+        ({"plane": "objects", "track": True}, "--reads and --plane"),
+        ({"plane": "objects", "refine": True}, "--refine and --plane both correct distances"),
+        ({"plane": "views.json", "exif_rotation": True}, "leave out --exif-rotation"),
+        ({"plane": "views.json", "video": "0", "images": (), "out": None, "overwrite": False}, "named photographs"),
+        ({"plane": "objects", "model": "FLAT"}, "model flat does not say how its objects stand"),
+    ],
+)
+def test_wrong_calls(
+    standing: Path, models_dir: Path, frames: Path, camera: Path, tmp_path: Path, changes: dict[str, Any], told: str
+) -> None:
+    views = tmp_path / "views.json"
+    views.write_text(json.dumps({"a.png": {"cam_from_world": np.eye(4).tolist()}}))
+    call = DetectArguments(str(standing), (str(frames),), camera=camera, out=str(tmp_path / "out.jsonl"))
+    named = {"views.json": str(views), "FLAT": str(models_dir / "flat")}
+    with pytest.raises(UsageError, match=told):
+        run(
+            replace(
+                call,
+                **{key: named.get(value, value) if isinstance(value, str) else value for key, value in changes.items()},
+            )
+        )
