@@ -63,17 +63,27 @@ def test_no_plane_is_found_where_no_two_objects_agree() -> None:
 @pytest.mark.parametrize("factor", [0.98, 1.0, 1.02])
 def test_an_object_moves_until_it_stands_on_a_plane(factor: float) -> None:
     standing = _on_table(1, factor)
-    found = distance_factor(standing, TABLE)
+    found = distance_factor(standing, TABLE, is_known=False)
     assert found is not None
     assert found * factor == pytest.approx(1, abs=0.004)  # the plane is trusted to millimetres, not entirely
 
 
-def test_an_object_that_cannot_stand_there_stays() -> None:
-    leaning = _on_table(0)
-    turned = Rotation.from_rotvec([0, 0, 0.5]).as_matrix() @ Rotation.from_rotvec([0.5, 0, 0]).as_matrix()
-    assert distance_factor(_brick(turned, leaning.middle_m), TABLE) is None
-    assert distance_factor(_on_table(0, 1.2), TABLE) is None  # too far off to be an error of reading
-    assert distance_factor(_on_table(0), Plane(TABLE.normal * 0.5, -TABLE.normal)) is None  # it hangs under it
+def test_an_object_that_leans_touches_a_known_plane_and_does_not_stand_on_one_that_was_found() -> None:
+    turned = Rotation.from_rotvec([0.5, 0, 0.5]).as_matrix()
+    lowest_m = (CORNERS_M @ turned.T @ TABLE.normal).min()
+    leaning = _brick(turned, 1.01 * (TABLE.point_m - lowest_m * TABLE.normal))
+    assert distance_factor(leaning, TABLE, is_known=False) is None
+    found = distance_factor(leaning, TABLE, is_known=True)
+    assert found is not None
+    assert found * 1.01 == pytest.approx(1, abs=0.003)
+
+
+@pytest.mark.parametrize("is_known", [False, True])
+def test_an_object_that_cannot_stand_there_stays(is_known: bool) -> None:
+    too_far = _on_table(0, 1.2)  # to be an error of reading
+    assert distance_factor(too_far, TABLE, is_known=is_known) is None
+    under = Plane(TABLE.normal * 0.5, -TABLE.normal)
+    assert distance_factor(_on_table(0), under, is_known=is_known) is None
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,7 @@ def move_onto_plane(
     plane = given if isinstance(given, Plane) else find_plane([standing for _, standing in pairs])
     if plane is None:
         return
-    factors = iter([distance_factor(standing, plane) for _, standing in pairs])
+    factors = iter([distance_factor(standing, plane, is_known=plane is given) for _, standing in pairs])
     for result, crop in zip(results, crops, strict=True):
         result.plane.point_m.extend(plane.point_m.tolist())
         result.plane.normal.extend(plane.normal.tolist())

@@ -21,9 +21,9 @@ _HEIGHT_STD_M = 0.004
 _TILT_STD = 0.08
 """Of the angle between the plane and a side that an object stands on, radians."""
 _MOST_TILT = 0.3
-"""Objects that lean farther from every side that they can stand on are left where they are, radians."""
+"""Objects that lean farther from every side that they can stand on tell no plane, and do not move to one, radians."""
 _MOST_DEVIATIONS = 4.0
-"""So are those whose distance would change by more than that many standard deviations."""
+"""Objects whose distance would change by more than that many standard deviations are not on the plane."""
 _LEAST_EVIDENCE, _LEAST_OBJECTS = 0.2, 2
 """That many objects have to stand on a plane, each with a likelihood of that part of the largest."""
 _ROUNDS = 4
@@ -60,12 +60,18 @@ def find_plane(objects: Sequence[Standing]) -> Plane | None:
     return None if found is None else _fitted(*found, objects)
 
 
-def distance_factor(one: Standing, plane: Plane) -> float | None:
+def distance_factor(one: Standing, plane: Plane, *, is_known: bool) -> float | None:
     """By which factor an object's distance changes where it stands on a plane; None where it does not stand there.
 
     The factor is the likeliest, given how far a network's distances and an object's height over a plane are off.
+
+    Args:
+        one: The object.
+        plane: On which it may stand.
+        is_known: The plane was given: objects that lean on it touch it, too. Otherwise it was found, and objects stand
+            on one of their sides.
     """
-    if not len(one.up) or np.linalg.norm(one.up - plane.normal, axis=1).min() > _MOST_TILT:
+    if not is_known and (not len(one.up) or np.linalg.norm(one.up - plane.normal, axis=1).min() > _MOST_TILT):
         return None
     towards_m = float(plane.normal @ one.middle_m)  # negative: from the camera down to the plane
     below_m = float((one.hull_m @ plane.normal).min()) - towards_m

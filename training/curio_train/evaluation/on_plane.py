@@ -52,7 +52,7 @@ def standing_on(estimates: Sequence[Estimate], shapes: Sequence[Shape], plane: A
     found = plane if isinstance(plane, Plane) else find_plane(standing)
     if found is None:
         return list(estimates)
-    factors = [distance_factor(one, found) for one in standing]
+    factors = [distance_factor(one, found, is_known=found is plane) for one in standing]
     return [_moved(*pair, one) for pair, one in zip(pairs, factors, strict=True)]
 
 

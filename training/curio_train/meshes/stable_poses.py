@@ -10,7 +10,7 @@ from curio_proto.v1.model_spec_pb2 import StablePoses
 from google.protobuf import json_format
 from jaxtyping import Float
 
-_DIRECTIONS = 256  # the hull's points are those farthest in these: seven degrees apart, 0.2 % of the radius at most
+_DIRECTIONS = 256  # the hull's points are those farthest in these; a ball loses a hundredth of its radius between them
 _LEAST_PROBABILITY = 0.01  # of coming to rest on a side; the side of a cylinder is many sides
 _FLAT = 1e-4  # of the longest extent: no body that stands on its rim
 _DECIMALS_M = 6
