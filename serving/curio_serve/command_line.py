@@ -2,6 +2,7 @@
 
 import argparse
 import inspect
+import os
 import sys
 import types
 from collections.abc import Iterable, Sequence
@@ -61,8 +62,20 @@ def parsed(
     if _HELP & set(given):
         join_help_lines([command])
         given = ["--help" if word == HELP_ALL else word for word in given]
-    with _REGISTRY:
-        return tyro.cli(command, args=with_lists_joined(given, lists), prog=prog, **options)
+    try:
+        with _REGISTRY:
+            return tyro.cli(command, args=with_lists_joined(given, lists), prog=prog, **options)
+    except BrokenPipeError:
+        stop_printing()
+        sys.exit(1)
+
+
+def stop_printing() -> None:
+    """Let nothing more be written to standard output: its reader (``head``, ``less``) has seen enough.
+
+    Python's own flush at exit must not fail on it again.
+    """
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def with_lists_joined(given: Sequence[str], lists: Sequence[str]) -> list[str]:

@@ -1,5 +1,8 @@
 """What all command lines share: plain metavars, help with whole lines, --help-all and --version."""
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -60,6 +63,15 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
         parsed(Command, ["--version"], "curio-x")
     assert done.value.code == 0
     assert capsys.readouterr().out.startswith("curio-x")
+
+
+def test_help_ends_quietly_when_its_reader_has_seen_enough() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-c", "from curio_serve.batch.detect_cli import main; main()", "--help"]
+    with os.fdopen(write, "w") as output:
+        done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "")
 
 
 def test_a_flag_of_several_values_may_be_there_twice() -> None:

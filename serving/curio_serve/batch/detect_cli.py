@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from curio_serve.batch.arguments import DetectArguments
-from curio_serve.command_line import parsed
+from curio_serve.command_line import parsed, stop_printing
 from curio_serve.errors import ArgumentError, CameraError, CurioError, UsageError
 
 if TYPE_CHECKING:
@@ -37,8 +37,7 @@ def main() -> NoReturn:
     try:
         status = run(arguments)
     except BrokenPipeError:
-        # whoever read our standard output has what it wanted; Python's own flush at exit must not fail on it again
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        stop_printing()
         status = 1
     except CurioError as exc:
         print(f"curio-detect: error: {exc}", file=sys.stderr)

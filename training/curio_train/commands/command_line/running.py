@@ -1,10 +1,10 @@
 """Runs a command: errors become one message on stderr and an exit status, signals stop it."""
 
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from curio_serve.command_line import stop_printing
 from curio_serve.memory import keep_freed
 from rich.console import Console
 
@@ -36,8 +36,8 @@ def answer(work: Callable[[Interruption], int]) -> int:
             return UsageError.exit_status
         except Interrupted as exc:
             return _stopped(console, exc)
-        except BrokenPipeError:  # the reader of our output (head, less) has seen enough
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        except BrokenPipeError:
+            stop_printing()
             return 1
         except (RuntimeError, TypeError):
             # Libraries written in C++ make errors of their own of what is raised within them.
