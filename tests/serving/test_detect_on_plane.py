@@ -163,7 +163,7 @@ def test_over_grpc(standing: Path, pair: Path, start_server: Callable[..., Any],
     assert "the request has views and plane" in told[2]
 
 
-def test_the_command_line(standing: Path, frames: Path, camera: Path, tmp_path: Path) -> None:
+def test_the_command_line(standing: Path, pair: Path, frames: Path, camera: Path, tmp_path: Path) -> None:
     """A camera that stands still, and cameras whose poses are named."""
     out, poses = tmp_path / "out.jsonl", tmp_path / "views.json"
     call = DetectArguments(str(standing), (str(frames),), camera=camera, out=str(out), overwrite=True, jobs=1)
@@ -181,8 +181,8 @@ def test_the_command_line(standing: Path, frames: Path, camera: Path, tmp_path: 
         assert lines[0]["detections"][0]["on_plane"]
         assert np.allclose(lines[0]["plane"]["normal"], plane.normal)
     assert "has no pose of 000005.png" in lines[-1]["error"]
-    assert run(replace(call, plane="objects")) == 0
-    assert "plane" not in json.loads(out.read_text().splitlines()[0])  # of one object none is found
+    assert run(replace(call, model=str(pair), plane="objects")) == 0
+    assert all("plane" in json.loads(line) for line in out.read_text().splitlines())
 
 
 def _pose_over(plane: Plane) -> np.ndarray:
@@ -200,6 +200,7 @@ def _pose_over(plane: Plane) -> np.ndarray:
     [
         ({"plane": "nowhere.json"}, r"--plane nowhere\.json: cannot be read"),
         ({"plane": "objects", "track": True}, "--reads and --plane"),
+        ({"plane": "objects"}, "finds one object in an image, which stands on any plane"),
         ({"plane": "objects", "refine": True}, "--refine and --plane both correct distances"),
         ({"plane": "views.json", "exif_rotation": True}, "leave out --exif-rotation"),
         ({"plane": "views.json", "video": "0", "images": (), "out": None, "overwrite": False}, "named photographs"),

@@ -22,6 +22,7 @@ from curio_serve.batch.images.sources import (
 from curio_serve.errors import UsageError
 from curio_serve.models.repeated import MAX_READS
 from curio_serve.planes.camera_poses import CameraPoseFile
+from curio_serve.planes.plane import FIND_PLANE
 
 
 def check_numbers(arguments: DetectArguments) -> None:
@@ -127,6 +128,11 @@ def check_plane(arguments: DetectArguments, estimator: Estimator) -> None:
             "run again (of worlds that are flat, or whose parts all stand, none says it)"
         )
     poses = estimator.settings.plane
+    if poses == FIND_PLANE and estimator.spec.num_slots == 1 and arguments.max_instances in (None, 1):
+        raise UsageError(
+            f"--plane objects: {estimator.name} finds one object in an image, which stands on any plane; give a file of "
+            "the plane, or look for several objects"
+        )
     if isinstance(poses, CameraPoseFile) and arguments.exif_rotation:
         raise UsageError(f"--plane {arguments.plane} is of the stored pixels' camera; leave out --exif-rotation")
     if isinstance(poses, CameraPoseFile) and poses.of_all is None and arguments.video is not None:
