@@ -130,8 +130,8 @@ def check_plane(arguments: DetectArguments, estimator: Estimator) -> None:
     poses = estimator.settings.plane
     if poses == FIND_PLANE and estimator.spec.num_slots == 1 and arguments.max_instances in (None, 1):
         raise UsageError(
-            f"--plane objects: {estimator.name} finds one object in an image, which stands on any plane; give a file of "
-            "the plane, or look for several objects"
+            f"--plane objects: {estimator.name} finds one object in an image, which stands on any plane; give a file "
+            "of the plane, or look for several objects"
         )
     if isinstance(poses, CameraPoseFile) and arguments.exif_rotation:
         raise UsageError(f"--plane {arguments.plane} is of the stored pixels' camera; leave out --exif-rotation")
