@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,8 @@ def test_no_plane_is_found_where_no_two_objects_agree() -> None:
     assert find_plane([]) is None
     assert find_plane([_on_table(0)]) is None
     assert find_plane([_on_table(0), _on_table(1, plane=Plane.of([0, 0, 1.4], [0.9, 0, -0.3]))]) is None
+    twice = _on_table(0)  # in two regions of a frame
+    assert find_plane([twice, replace(twice, weight=0.5), _lost(20)]) is None
     ball = Standing(0.9, np.array([0, 0, 1.0]), CORNERS_M + np.array([0, 0, 1.0]), np.zeros((0, 3)))
     assert find_plane([ball, ball, _on_table(0)]) is None
 

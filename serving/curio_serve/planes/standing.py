@@ -26,6 +26,7 @@ _MOST_DEVIATIONS = 4.0
 """Objects whose distance would change by more than that many standard deviations are not on the plane."""
 _LEAST_EVIDENCE, _LEAST_OBJECTS = 0.2, 2
 """That many objects have to stand on a plane, each with a likelihood of that part of the largest."""
+_MOST_OBJECTS = 32  # that tell a plane: more make it no better, and time grows with their cube
 _ROUNDS = 4
 
 
@@ -44,20 +45,36 @@ class Standing:
 
 
 def find_plane(objects: Sequence[Standing]) -> Plane | None:
-    """The plane on which most of the objects stand; None where no two of them agree on one."""
-    objects = [one for one in objects if one.weight > 0 and len(one.up)]
+    """The plane on which most of the objects stand; None where no two of them agree on one.
+
+    An object that was found twice, in two regions of a frame, counts once.
+    """
+    objects = _at_different_places(objects)
     candidates = [one.up[one.up @ one.middle_m < 0] for one in objects]  # seen from above
     if len(objects) < _LEAST_OBJECTS or not any(map(len, candidates)):
         return None
     normals = np.concatenate(candidates)
-    heights_m = _heights_m(normals, objects)
+    heights_m, tilts = _heights_m(normals, objects), _tilts(normals, objects)
+    stds_m, weights = _height_stds_m(normals, objects), [one.weight for one in objects]
     best, found = 0.0, None
     for offsets_m in heights_m.T:
-        scores = _likelihoods(normals, offsets_m, objects, heights_m) @ [one.weight for one in objects]
+        scores = _likelihoods(tilts, (heights_m - offsets_m[:, None]) / stds_m) @ weights
         row = int(scores.argmax())
         if scores[row] > best:
             best, found = float(scores[row]), (normals[row], float(offsets_m[row]))
     return None if found is None else _fitted(*found, objects)
+
+
+def _at_different_places(objects: Sequence[Standing]) -> list[Standing]:
+    """The objects that can tell a plane, the surest of those at one place, and of very many the surest."""
+    kept: list[Standing] = []
+    for one in sorted(objects, key=lambda one: -one.weight):
+        if one.weight <= 0 or not len(one.up) or len(kept) == _MOST_OBJECTS:
+            continue
+        radius_m = np.linalg.norm(one.hull_m - one.middle_m, axis=1).max()
+        if all(np.linalg.norm(one.middle_m - other.middle_m) > radius_m / 2 for other in kept):
+            kept.append(one)
+    return kept
 
 
 def distance_factor(one: Standing, plane: Plane, *, is_known: bool) -> float | None:
@@ -89,7 +106,7 @@ def _fitted(normal: Array, offset_m: float, objects: Sequence[Standing]) -> Plan
     weights = np.array([one.weight for one in objects])
     sides = np.stack([one.up[np.linalg.norm(one.up - normal, axis=1).argmin()] for one in objects])
     for _ in range(_ROUNDS):
-        fits = _likelihoods(normal[None], np.array([offset_m]), objects)[0]
+        fits = _fits(normal, offset_m, objects)
         contacts_m = np.stack([one.hull_m[(one.hull_m @ normal).argmin()] for one in objects])
         height = np.sqrt(weights * fits) / _height_stds_m(normal[None], objects)[0]
         tilt = np.sqrt(weights * fits) / _TILT_STD
@@ -100,10 +117,9 @@ def _fitted(normal: Array, offset_m: float, objects: Sequence[Standing]) -> Plan
         if length < 0.5:  # sides that point everywhere
             return None
         normal, offset_m = found[:3] / length, float(found[3]) / length
-    fits = _likelihoods(normal[None], np.array([offset_m]), objects)[0]
-    return (
-        Plane(normal * offset_m, normal) if (fits > _LEAST_EVIDENCE).sum() >= _LEAST_OBJECTS and offset_m < 0 else None
-    )
+    if (_fits(normal, offset_m, objects) > _LEAST_EVIDENCE).sum() < _LEAST_OBJECTS or offset_m >= 0:
+        return None
+    return Plane(normal * offset_m, normal)
 
 
 def _turned_by(tilt: Array) -> list[Array]:
@@ -111,15 +127,22 @@ def _turned_by(tilt: Array) -> list[Array]:
     return [np.eye(4)[axis] * tilt[:, None] for axis in range(3)]
 
 
-def _likelihoods(
-    normals: Array, offsets_m: Array, objects: Sequence[Standing], heights_m: Array | None = None
-) -> Array:
-    """How well each object stands on each plane, 0 to 1, [planes, objects]."""
-    heights_m = _heights_m(normals, objects) if heights_m is None else heights_m
-    tilts = [np.linalg.norm(normals[:, None] - one.up, axis=-1).min(axis=1) for one in objects]
-    off = (heights_m - offsets_m[:, None]) / _height_stds_m(normals, objects)
-    result: Array = np.exp(-0.5 * (np.stack(tilts, axis=1) / _TILT_STD) ** 2 - 0.5 * off**2)
+def _fits(normal: Array, offset_m: float, objects: Sequence[Standing]) -> Array:
+    """How well each object stands on a plane, 0 to 1, [objects]."""
+    normals = normal[None]
+    off = (_heights_m(normals, objects) - offset_m) / _height_stds_m(normals, objects)
+    return _likelihoods(_tilts(normals, objects), off)[0]
+
+
+def _likelihoods(tilts: Array, off: Array) -> Array:
+    """The same of angles, and of heights in standard deviations."""
+    result: Array = np.exp(-0.5 * (tilts / _TILT_STD) ** 2 - 0.5 * off**2)
     return result
+
+
+def _tilts(normals: Array, objects: Sequence[Standing]) -> Array:
+    """The angle between each plane and the nearest side of each object, radians, [planes, objects]."""
+    return np.stack([np.linalg.norm(normals[:, None] - one.up, axis=-1).min(axis=1) for one in objects], axis=1)
 
 
 def _heights_m(normals: Array, objects: Sequence[Standing]) -> Array:

@@ -11,7 +11,8 @@ from google.protobuf import json_format
 from jaxtyping import Float
 
 _DIRECTIONS = 256  # the hull's points are those farthest in these; a ball loses a hundredth of its radius between them
-_LEAST_PROBABILITY = 0.01  # of coming to rest on a side; the side of a cylinder is many sides
+_LEAST_PROBABILITY = 0.01  # of coming to rest on a side
+_NEAR = math.cos(math.radians(8))  # of two sides that count as one: less than what networks read rotations by
 _FLAT = 1e-4  # of the longest extent: no body that stands on its rim
 _DECIMALS_M = 6
 
@@ -40,9 +41,21 @@ def stable_up(hull_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
     if spread[2] <= _FLAT * spread[0]:
         return np.stack([axes[2], -axes[2]])
     solid = trimesh.convex.convex_hull(hull_m)
-    plane_from_object, _ = trimesh.poses.compute_stable_poses(solid, n_samples=1, sigma=0, threshold=_LEAST_PROBABILITY)
-    up: np.ndarray = np.reshape(plane_from_object, (-1, 4, 4))[:, 2, :3]
-    return up
+    plane_from_object, probabilities = trimesh.poses.compute_stable_poses(solid, n_samples=1, sigma=0, threshold=0.0)
+    return _apart(np.reshape(plane_from_object, (-1, 4, 4))[:, 2, :3], np.asarray(probabilities))
+
+
+def _apart(up: Float[np.ndarray, "n 3"], probabilities: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k 3"]:
+    """The likeliest directions, those near one of them left out: the round side of a cylinder is very many sides."""
+    found: list[np.ndarray] = []
+    left = probabilities.copy()
+    while left.max(initial=0) > 0:
+        best = int(left.argmax())
+        near = (up @ up[best] > _NEAR) & (left > 0)
+        if left[near].sum() >= _LEAST_PROBABILITY:
+            found.append(up[best])
+        left[near] = 0
+    return np.reshape(found, (-1, 3))
 
 
 def stable_poses(hulls_m: Sequence[tuple[str, Float[np.ndarray, "n 3"]]]) -> StablePoses:
