@@ -145,6 +145,8 @@ def test_over_grpc(standing: Path, pair: Path, start_server: Callable[..., Any],
         (result,) = client.detect("pinhole", pixels, K, plane=plane).results
         found = client.detect(["pinhole", "pair"], pixels, K, plane="objects").results
         assert client.get_model("pinhole").spec.stable_poses.objects[0].object == "spot"
+        with pytest.raises(ArgumentError, match=r"values of a point|expected three numbers each"):
+            client.detect("pinhole", pixels, K, plane=Plane(None, None))  # type: ignore[arg-type]
         with pytest.raises(ArgumentError, match="expected a Plane, 'objects' or None"):
             client.detect("pinhole", pixels, K, plane="table")  # type: ignore[arg-type]
         impossible = detect_request("pinhole", pixels, K, plane=plane)
@@ -202,6 +204,7 @@ def _pose_over(plane: Plane) -> np.ndarray:
         ({"plane": "objects", "track": True}, "--reads and --plane"),
         ({"plane": "objects"}, "finds one object in an image, which stands on any plane"),
         ({"plane": "objects", "refine": True}, "--refine and --plane both correct distances"),
+        ({"plane": "up.json"}, r"b\.png: cam_from_world has shape"),
         ({"plane": "views.json", "exif_rotation": True}, "leave out --exif-rotation"),
         ({"plane": "views.json", "video": "0", "images": (), "out": None, "overwrite": False}, "named photographs"),
         ({"plane": "objects", "model": "FLAT"}, "model flat does not say how its objects stand"),
@@ -210,10 +213,12 @@ def _pose_over(plane: Plane) -> np.ndarray:
 def test_wrong_calls(
     standing: Path, models_dir: Path, frames: Path, camera: Path, tmp_path: Path, changes: dict[str, Any], told: str
 ) -> None:
-    views = tmp_path / "views.json"
-    views.write_text(json.dumps({"a.png": {"cam_from_world": np.eye(4).tolist()}}))
+    views, up = tmp_path / "views.json", tmp_path / "up.json"
+    over = _pose_over(Plane.of([0.0, 0.1, 1.0], [0.0, -0.8, -0.6]))
+    views.write_text(json.dumps({"a.png": {"cam_from_world": over.tolist()}}))
+    up.write_text(json.dumps({"a.png": {"cam_from_world": over.tolist()}, "b.png": {"cam_from_world": [[]]}}))
     call = DetectArguments(str(standing), (str(frames),), camera=camera, out=str(tmp_path / "out.jsonl"))
-    named = {"views.json": str(views), "FLAT": str(models_dir / "flat")}
+    named = {"views.json": str(views), "up.json": str(up), "FLAT": str(models_dir / "flat")}
     with pytest.raises(UsageError, match=told):
         run(
             replace(

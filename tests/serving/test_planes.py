@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,12 +54,28 @@ def test_objects_tell_the_plane_on_which_they_stand(factors: Sequence[float]) ->
         assert found.normal @ TABLE.point_m == pytest.approx(found.offset_m, abs=0.01)
 
 
+def test_surer_objects_tell_more_of_the_plane() -> None:
+    other = Plane.of(TABLE.point_m + 0.2 * TABLE.normal, TABLE.normal)
+    unsure = [replace(_on_table(seed, plane=other), weight=0.2) for seed in (0, 2)]
+    found = find_plane([*unsure, _on_table(1), _on_table(3)])
+    assert found is not None
+    assert found.normal @ TABLE.point_m == pytest.approx(found.offset_m, abs=0.005)
+    heights_m = []
+    for weights in ((0.9, 0.1), (0.1, 0.9)):  # two that do not agree exactly
+        pair = [replace(_on_table(0, 1.01), weight=weights[0]), replace(_on_table(3, 0.99), weight=weights[1])]
+        found = find_plane(pair)
+        assert found is not None
+        heights_m.append(found.normal @ TABLE.point_m - found.offset_m)
+    assert heights_m[0] > heights_m[1] + 0.002
+
+
 def test_no_plane_is_found_where_no_two_objects_agree() -> None:
     assert find_plane([]) is None
     assert find_plane([_on_table(0)]) is None
     assert find_plane([_on_table(0), _on_table(1, plane=Plane.of([0, 0, 1.4], [0.9, 0, -0.3]))]) is None
     twice = _on_table(0)  # in two regions of a frame
     assert find_plane([twice, replace(twice, weight=0.5), _lost(20)]) is None
+    assert find_plane([_on_table(0), replace(_on_table(1), weight=0.04)]) is None  # what may not be there
     ball = Standing(0.9, np.array([0, 0, 1.0]), CORNERS_M + np.array([0, 0, 1.0]), np.zeros((0, 3)))
     assert find_plane([ball, ball, _on_table(0)]) is None
 
@@ -93,6 +110,7 @@ def test_an_object_that_cannot_stand_there_stays(is_known: bool) -> None:
     ("point_m", "normal", "told"),
     [
         ([0, 0], [0, 0, -1], "2 values of a point and 3 of a normal"),
+        (["far"], [0, 0, -1], "expected three numbers each"),
         ([0, 0, 1], [], "3 values of a point and 0 of a normal"),
         ([0, 0, 1], [0, 0, 0], "expected metres and a direction"),
         ([0, 0, np.nan], [0, 0, -1], "expected metres and a direction"),
@@ -100,7 +118,7 @@ def test_an_object_that_cannot_stand_there_stays(is_known: bool) -> None:
         ([0, 0, 1], [0, 0, 1], "seen from below"),
     ],
 )
-def test_an_impossible_plane_is_refused(point_m: list[float], normal: list[float], told: str) -> None:
+def test_an_impossible_plane_is_refused(point_m: list[Any], normal: list[float], told: str) -> None:
     with pytest.raises(ArgumentError, match=told):
         Plane.of(point_m, normal)
 
@@ -129,7 +147,7 @@ def test_a_file_of_camera_poses_says_the_plane_in_each_camera(tmp_path: Path) ->
     [
         (None, "cannot be read"),
         ("{", "not JSON"),
-        ('{"b.png": {"cam_from_world": []}}', r"has no pose of a\.png"),
+        ('{"b.png": {"cam_from_world": []}}', r"has no pose of a\.png, only of b\.png"),
         ('{"cam_from_world": 3}', "expected 4x4"),
         ('{"cam_from_world": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "looks up"),
         ('{"unit": "mm", "cam_from_world": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "the unit is 'mm'"),
@@ -140,6 +158,14 @@ def test_a_file_without_the_plane_is_refused(tmp_path: Path, content: str | None
         (tmp_path / "views.json").write_text(content)
     with pytest.raises(CameraError, match=told):
         CameraPoseFile.read(tmp_path / "views.json").plane(tmp_path / "a.png")
+
+
+def test_a_photograph_of_the_same_name_in_another_folder_is_not_taken_for_it(tmp_path: Path) -> None:
+    for folder in ("left", "right"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "views.json").write_text(json.dumps({"a.png": {"cam_from_world": [], "folder": "left"}}))
+    with pytest.raises(CameraError, match=r"has no pose of a\.png, but of one of that name in left"):
+        CameraPoseFile.read(tmp_path / "views.json").plane(tmp_path / "right" / "a.png")
 
 
 OF_BRICK = {"object": "brick", "hull_m": CORNERS_M.ravel().tolist(), "up": SIDES.ravel().tolist()}

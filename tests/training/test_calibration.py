@@ -157,6 +157,10 @@ def test_the_last_photograph_says_where_the_camera_stands_over_the_board(tmp_pat
     assert found.normal @ normal > np.cos(np.radians(0.5))
     assert found.offset_m == pytest.approx(normal @ middle_m, abs=0.003)
     assert f"stands {-found.offset_m:.3f} m above the board and looks" in told
+    assert "right if squares are 30 mm (--square-mm)" in told
+    same = CalibrateCommand(images=folder, board=(9, 6), plane_out=Path("camera.json"))
+    with pytest.raises(UsageError, match="is the camera file, too"):
+        run(same, lambda *_: pytest.fail("no structure"))
     cv2.imwrite(str(folder / "zebra.png"), np.full((HEIGHT, WIDTH), 90, np.uint8))
     with pytest.raises(CameraError, match=r"zebra\.png, the last photograph, does not show the whole board"):
         run(CalibrateCommand(images=folder, board=(9, 6), **outputs), lambda *_: pytest.fail("no structure"))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from curio_serve.planes.camera_poses import CameraPoseFile
 from curio_serve.planes.plane import FIND_PLANE, Plane
 from curio_serve.planes.stable_poses import STABLE_POSES_FILE, parse_stable_poses
 from curio_train.data.bop import Frame
@@ -93,10 +94,10 @@ def _read(brick: Object, place_m: list[float], factor: float) -> Estimate:
 
 
 def test_estimates_move_until_they_stand_on_the_plane(brick: Object) -> None:
-    shapes = shapes_of(_world(brick, hull_m=brick.mesh.hull_m).objects) * 3
+    given = Plane.of([0, 0.2, 1.0], [0, -1, 0])
+    shapes = shapes_of(_world(brick, hull_m=brick.mesh.hull_m).objects, CameraPoseFile(Path("views.json"), {})) * 3
     read = [_read(brick, [-0.2, 0.5], 1.0), _read(brick, [0.0, 0.6], 1.01), _read(brick, [0.2, 0.5], 0.99)]
     true_m = [_read(brick, [x, z], 1.0).pose.translation_m for x, z in ((-0.2, 0.5), (0.0, 0.6), (0.2, 0.5))]
-    given = Plane.of([0, 0.2, 1.0], [0, -1, 0])
     for plane, largest_m in ((given, 0.005), (FIND_PLANE, 0.006)):
         moved = standing_on(read, shapes, plane)
         errors_m = [np.linalg.norm(one.pose.translation_m - true) for one, true in zip(moved, true_m, strict=True)]
@@ -107,7 +108,9 @@ def test_estimates_move_until_they_stand_on_the_plane(brick: Object) -> None:
 
 def test_a_plane_is_for_real_frames_of_objects_that_may_stand_in_any_way(brick: Object, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="objects that may stand in any way"):
-        shapes_of(_world(brick).objects)
+        shapes_of(_world(brick).objects, CameraPoseFile(Path("views.json"), {}))
+    with pytest.raises(UsageError, match="one object, brick, stands on any plane"):
+        shapes_of(_world(brick, hull_m=brick.mesh.hull_m).objects, FIND_PLANE)
     with pytest.raises(UsageError, match="--plane is for real frames"):
         evaluate(tmp_path, plane=FIND_PLANE, cache=tmp_path)
     with pytest.raises(UsageError, match="not for --refine"):

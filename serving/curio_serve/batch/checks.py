@@ -19,7 +19,7 @@ from curio_serve.batch.images.sources import (
     matching_paths,
     names_recordings,
 )
-from curio_serve.errors import UsageError
+from curio_serve.errors import CameraError, UsageError
 from curio_serve.models.repeated import MAX_READS
 from curio_serve.planes.camera_poses import CameraPoseFile
 from curio_serve.planes.plane import FIND_PLANE
@@ -133,6 +133,11 @@ def check_plane(arguments: DetectArguments, estimator: Estimator) -> None:
             f"--plane objects: {estimator.name} finds one object in an image, which stands on any plane; give a file "
             "of the plane, or look for several objects"
         )
+    if isinstance(poses, CameraPoseFile):
+        try:
+            poses.refuse_impossible_planes()
+        except CameraError as exc:
+            raise UsageError(str(exc)) from exc
     if isinstance(poses, CameraPoseFile) and arguments.exif_rotation:
         raise UsageError(f"--plane {arguments.plane} is of the stored pixels' camera; leave out --exif-rotation")
     if isinstance(poses, CameraPoseFile) and poses.of_all is None and arguments.video is not None:

@@ -154,7 +154,8 @@ def selector(model: str) -> messages.ModelSelector:
 
 def _plane(plane: AnyPlane | None) -> messages.Plane | None:
     if isinstance(plane, Plane):
-        return messages.Plane(point_m=plane.point_m, normal=plane.normal)
+        checked = Plane.of(plane.point_m, plane.normal)  # type: ignore[arg-type]
+        return messages.Plane(point_m=checked.point_m, normal=checked.normal)
     if plane not in (None, FIND_PLANE):
         raise ArgumentError(f"plane {plane!r}: expected a Plane, {FIND_PLANE!r} or None")
     return None if plane is None else messages.Plane()

@@ -69,9 +69,8 @@ class CameraPoseFile:
             CameraError: The file has none, or it is not rigid.
         """
         if not self.is_known(photograph):
-            others = f"only of {', '.join([*self.entries][:5])}" if self.entries else "nor of any other photograph"
             raise self.error(
-                f"{self.flag} {self.file}: has no pose of {photograph.name}, {others}. "
+                f"{self.flag} {self.file}: has no pose of {photograph.name}, {self._others(photograph)}. "
                 "Photographs are named by their path from that file's folder, or by their file name"
             )
         return self._rigid(self._entry(photograph)[_POSE], self._where(photograph))
@@ -107,9 +106,26 @@ class CameraPoseFile:
         matrix = self.pose_above_plane(photograph)
         return Plane(matrix[:3, 3], matrix[:3, 1])
 
+    def refuse_impossible_planes(self) -> None:
+        """Look at every pose, before any photograph is read.
+
+        Raises:
+            CameraError: As :meth:`pose_above_plane`, of a pose that is there.
+        """
+        for name in ["every image"] if self.of_all is not None else self.entries:
+            if self.is_known(self.file.parent / name):
+                self.pose_above_plane(self.file.parent / name)
+
     def is_known(self, photograph: Path) -> bool:
         """Whether the file has a pose of this photograph."""
         return _POSE in self._entry(photograph)
+
+    def _others(self, photograph: Path) -> str:
+        """What the file has poses of instead."""
+        folder = self.entries.get(photograph.name, {}).get("folder")
+        if folder is not None:
+            return f"but of one of that name in {folder}"
+        return f"only of {', '.join([*self.entries][:5])}" if self.entries else "nor of any other photograph"
 
     def _where(self, photograph: Path) -> str:
         return f"{self.flag} {self.file}, {photograph.name}"

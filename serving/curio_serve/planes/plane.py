@@ -36,7 +36,10 @@ class Plane:
             ArgumentError: Not three values each, values that are not finite or impossibly far, no direction, or the
                 camera does not see the side where the objects are.
         """
-        point, direction = np.array(point_m, float), np.array(normal, float)
+        try:
+            point, direction = np.array(point_m, float), np.array(normal, float)
+        except (TypeError, ValueError) as exc:
+            raise ArgumentError(f"plane: point {point_m!r}, normal {normal!r}; expected three numbers each") from exc
         if point.shape != (3,) or direction.shape != (3,):
             raise ArgumentError(
                 f"plane has {point.size} values of a point and {direction.size} of a normal; expected 3"

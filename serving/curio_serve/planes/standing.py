@@ -16,8 +16,9 @@ from curio_serve.planes.plane import Plane
 Array = np.ndarray
 _DEPTH_STD = 0.015
 """Standard deviation of a distance that a network reads, fraction of the distance."""
-_HEIGHT_STD_M = 0.004
-"""Of the height of an object's lowest point over the plane: meshes end where scanners stopped, and tables bend."""
+_HEIGHT_STD = 0.004
+"""Of the height of an object's lowest point over the plane, fraction of the same distance: meshes end where scanners
+stopped, tables bend, and planes are measured."""
 _TILT_STD = 0.08
 """Of the angle between the plane and a side that an object stands on, radians."""
 _MOST_TILT = 0.3
@@ -26,6 +27,7 @@ _MOST_DEVIATIONS = 4.0
 """Objects whose distance would change by more than that many standard deviations are not on the plane."""
 _LEAST_EVIDENCE, _LEAST_OBJECTS = 0.2, 2
 """That many objects have to stand on a plane, each with a likelihood of that part of the largest."""
+_LEAST_WEIGHT = 0.05  # below, objects are rarely there: what is seen in an empty scene may agree by chance
 _MOST_OBJECTS = 32  # that tell a plane: more make it no better, and time grows with their cube
 _ROUNDS = 4
 
@@ -69,7 +71,7 @@ def _at_different_places(objects: Sequence[Standing]) -> list[Standing]:
     """The objects that can tell a plane, the surest of those at one place, and of very many the surest."""
     kept: list[Standing] = []
     for one in sorted(objects, key=lambda one: -one.weight):
-        if one.weight <= 0 or not len(one.up) or len(kept) == _MOST_OBJECTS:
+        if one.weight < _LEAST_WEIGHT or not len(one.up) or len(kept) == _MOST_OBJECTS:
             continue
         radius_m = np.linalg.norm(one.hull_m - one.middle_m, axis=1).max()
         if all(np.linalg.norm(one.middle_m - other.middle_m) > radius_m / 2 for other in kept):
@@ -80,7 +82,8 @@ def _at_different_places(objects: Sequence[Standing]) -> list[Standing]:
 def distance_factor(one: Standing, plane: Plane, *, is_known: bool) -> float | None:
     """By which factor an object's distance changes where it stands on a plane; None where it does not stand there.
 
-    The factor is the likeliest, given how far a network's distances and an object's height over a plane are off.
+    The factor is the likeliest, given how far a network's distances and an object's height over a plane are off. It
+    goes nine tenths of the way to a plane that the camera looks down on, and less to one that it looks along.
 
     Args:
         one: The object.
@@ -92,10 +95,11 @@ def distance_factor(one: Standing, plane: Plane, *, is_known: bool) -> float | N
         return None
     towards_m = float(plane.normal @ one.middle_m)  # negative: from the camera down to the plane
     below_m = float((one.hull_m @ plane.normal).min()) - towards_m
-    if towards_m >= -_HEIGHT_STD_M:
+    distance_m = float(np.linalg.norm(one.middle_m))
+    if towards_m >= -_HEIGHT_STD * distance_m:
         return None
     change = (plane.offset_m - below_m) / towards_m - 1
-    std = _HEIGHT_STD_M / -towards_m
+    std = _HEIGHT_STD * distance_m / -towards_m
     if abs(change) > _MOST_DEVIATIONS * np.hypot(_DEPTH_STD, std):
         return None
     return 1 + change * _DEPTH_STD**2 / (_DEPTH_STD**2 + std**2)
@@ -153,4 +157,4 @@ def _heights_m(normals: Array, objects: Sequence[Standing]) -> Array:
 def _height_stds_m(normals: Array, objects: Sequence[Standing]) -> Array:
     """Standard deviation of those, as the distances that a network reads make it, [planes, objects]."""
     along_m = np.stack([normals @ one.middle_m for one in objects], axis=1)
-    return np.hypot(_DEPTH_STD * along_m, _HEIGHT_STD_M)
+    return np.hypot(_DEPTH_STD * along_m, _HEIGHT_STD * np.linalg.norm([one.middle_m for one in objects], axis=1))

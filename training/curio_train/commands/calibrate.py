@@ -64,16 +64,21 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
         f"corners off by {found.error_px:.2f} pixels in {found.num_views} photographs{unused}"
         + _reading(board, found.board)
         + found.doubt
-        + ("" if command.plane_out is None or over_board is None else _plane(command.plane_out, over_board))
+        + (
+            ""
+            if command.plane_out is None or over_board is None
+            else _plane(command.plane_out, over_board, command.square_mm)
+        )
     )
 
 
-def _plane(path: Path, over_board: np.ndarray) -> str:
+def _plane(path: Path, over_board: np.ndarray, square_mm: float) -> str:
     """Write where the camera stands over the board, and say it."""
     save_plane(path, over_board)
     height_m, steepness = -float(over_board[:3, 1] @ over_board[:3, 3]), -float(over_board[2, 1])
     return f"\n{path}: in the last photograph the camera stands {height_m:.3f} m above the board and looks " + (
-        f"{math.degrees(math.asin(np.clip(steepness, -1, 1))):.0f} degrees down on it"
+        f"{math.degrees(math.asin(np.clip(steepness, -1, 1))):.0f} degrees down on it; that is right if squares are "
+        f"{square_mm:g} mm (--square-mm)"
     )
 
 
@@ -194,6 +199,8 @@ def _check(command: CalibrateCommand) -> None:
             raise UsageError(f"--camera-out {command.camera_out} is not written with {flag}; leave out one of them")
     if command.rig_out is not None and command.plane_out is not None:
         raise UsageError(f"--plane-out {command.plane_out} is of one camera; leave it out, or leave out --rig-out")
+    if command.plane_out is not None and command.plane_out == (command.camera_out or _CAMERA_FILE):
+        raise UsageError(f"--plane-out {command.plane_out} is the camera file, too (--camera-out); name another one")
     for flag in ("--camera-out", "--views-out", "--rig-out", "--plane-out"):
         _check_output(flag, getattr(command, _field(flag)))
 

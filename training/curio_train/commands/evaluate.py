@@ -78,4 +78,6 @@ def _plane(given: str | None) -> "GivenPlane":
 
     if given is None or given == FIND_PLANE:
         return None if given is None else FIND_PLANE
-    return CameraPoseFile.read(Path(given))
+    poses = CameraPoseFile.read(Path(given))
+    poses.refuse_impossible_planes()
+    return poses

@@ -10,6 +10,7 @@ from curio_serve.planes.camera_poses import GivenPlane
 from torch import Tensor
 
 from curio_train.errors import DataError, ReportError, UsageError
+from curio_train.evaluation.on_plane import shapes_of
 from curio_train.evaluation.real_frames import bop_file, evaluate_real_frames, refuse_unscorable
 from curio_train.evaluation.repeated import reading_repeatedly
 from curio_train.evaluation.reporting.report import keep, write_report
@@ -96,7 +97,7 @@ def evaluate(
     _refuse_without_frames(data, bop_results, plane, refine=refine)
     subject = load_subject(path, data)
     if data is not None:  # before minutes are spent on renderings
-        _refuse_unscorable(subject, data, bop_results, ("", _REFINED) if refine else ("",))
+        _refuse_unscorable(subject, data, bop_results, ("", _REFINED) if refine else ("",), plane)
     subject = subject if reads == 1 else reading_repeatedly(subject, reads)
     num_images = num_images or (QUICK if _has_whole_frames(subject.world) else ALL)
     better = _refining(subject) if refine else None
@@ -143,10 +144,14 @@ def _has_whole_frames(world: World) -> bool:
     return isinstance(world, SingleObjectWorld | SeveralObjectsWorld)
 
 
-def _refuse_unscorable(subject: Subject, data: Path, bop_results: Path | None, suffixes: Sequence[str]) -> None:
+def _refuse_unscorable(
+    subject: Subject, data: Path, bop_results: Path | None, suffixes: Sequence[str], plane: GivenPlane
+) -> None:
     if not _has_whole_frames(subject.world):
         raise UsageError(f"--data {data}: world {subject.world.name} has no real frames; leave it out")
     refuse_unscorable(subject.world, data)
+    if plane is not None:
+        shapes_of(subject.world.objects, plane)
     if bop_results is not None:
         for suffix in suffixes:
             bop_file(bop_results, subject, data, suffix)

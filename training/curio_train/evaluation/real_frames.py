@@ -52,7 +52,7 @@ def evaluate_real_frames(
     wanted = [scored_frames(dataset, kind.name) for kind in kinds]
     found = _read_frames(subject, dataset, {_key(target) for frames in wanted for target in frames.targets})
     if plane is not None:
-        found = _on_plane(found, shapes_of(kinds), plane)
+        found = _on_plane(found, shapes_of(kinds, plane), plane)
     chosen = [[found[_key(target)][slot] for target in frames.targets] for slot, frames in enumerate(wanted)]
     if bop_results is not None:
         by_object = {dataset.object_id(kind.name): one for kind, one in zip(kinds, chosen, strict=True)}

@@ -11,6 +11,7 @@ from google.protobuf import json_format
 from jaxtyping import Float
 
 _DIRECTIONS = 256  # the hull's points are those farthest in these; a ball loses a hundredth of its radius between them
+_PARTS = 32  # of these, one after the other: a mesh may have millions of vertices
 _LEAST_PROBABILITY = 0.01  # of coming to rest on a side
 _NEAR = math.cos(math.radians(8))  # of two sides that count as one: less than what networks read rotations by
 _FLAT = 1e-4  # of the longest extent: no body that stands on its rim
@@ -22,8 +23,9 @@ def hull_points(vertices_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"
     number = np.arange(_DIRECTIONS) + 0.5
     height, turn = 1 - 2 * number / _DIRECTIONS, math.pi * (1 + math.sqrt(5)) * number  # a Fibonacci sphere
     around = np.sqrt(1 - height**2)
-    directions = np.stack([around * np.cos(turn), around * np.sin(turn), height])
-    points: np.ndarray = vertices_m[np.unique((vertices_m @ directions).argmax(axis=0))]
+    directions = np.stack([around * np.cos(turn), around * np.sin(turn), height], axis=1)
+    farthest = [(vertices_m @ part.T).argmax(axis=0) for part in np.array_split(directions, _PARTS)]
+    points: np.ndarray = vertices_m[np.unique(np.concatenate(farthest))]
     return points
 
 
