@@ -58,27 +58,24 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
     camera_out = command.camera_out or _CAMERA_FILE
     over_board = None if command.plane_out is None else pose_over_board(found, Photographs(command.images).paths[-1])
     save_intrinsics(camera_out, found.camera)
+    plane = "" if command.plane_out is None or over_board is None else _plane(command, command.plane_out, over_board)
     unused = f", not found in {', '.join(path.name for path in found.unused[:5])}" if found.unused else ""
     return (
         f"{camera_out}: focal length {found.camera.matrix[0, 0]:.1f} pixels ± {found.focal_uncertainty:.2%}, "
         f"corners off by {found.error_px:.2f} pixels in {found.num_views} photographs{unused}"
         + _reading(board, found.board)
         + found.doubt
-        + (
-            ""
-            if command.plane_out is None or over_board is None
-            else _plane(command.plane_out, over_board, command.square_mm)
-        )
+        + plane
     )
 
 
-def _plane(path: Path, over_board: np.ndarray, square_mm: float) -> str:
+def _plane(command: CalibrateCommand, path: Path, over_board: np.ndarray) -> str:
     """Write where the camera stands over the board, and say it."""
     save_plane(path, over_board)
     height_m, steepness = -float(over_board[:3, 1] @ over_board[:3, 3]), -float(over_board[2, 1])
     return f"\n{path}: in the last photograph the camera stands {height_m:.3f} m above the board and looks " + (
         f"{math.degrees(math.asin(np.clip(steepness, -1, 1))):.0f} degrees down on it; that is right if squares are "
-        f"{square_mm:g} mm (--square-mm)"
+        f"{command.square_mm:g} mm (--square-mm)"
     )
 
 
