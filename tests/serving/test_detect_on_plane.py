@@ -106,6 +106,26 @@ def test_a_pose_moves_along_its_line_of_sight(standing: Path, pixels: np.ndarray
     assert (spread[1] < spread[0]).all()  # what is farther away is smaller
 
 
+def test_what_keeps_its_direction_is_the_middle(
+    tmp_path: Path,
+    spot_onnx: Callable[..., onnx.ModelProto],
+    spot_spec: Callable[[bool], ModelSpec],
+    write_folder: Callable[..., Path],
+    pixels: np.ndarray,
+) -> None:
+    spec = spot_spec(True)
+    spec.objects[0].center_m[:] = [0.03, 0.02, -0.04]
+    folder = _with_stable_poses(write_folder(tmp_path / "models" / "pinhole", spot_onnx(True, spec)))
+    before = _detect(folder, pixels).detections[0]
+    found = _detect(folder, pixels, plane=_below(before, 0.01)).detections[0]
+    assert found.on_plane
+    origins_m = [np.array(one.translation_m) for one in (before, found)]
+    from_origin_m = np.reshape(before.rotation, (3, 3)) @ spec.objects[0].center_m
+    middles_m = [origin_m + from_origin_m for origin_m in origins_m]
+    assert np.linalg.norm(np.cross(*middles_m)) < 1e-9
+    assert np.linalg.norm(np.cross(*origins_m)) > 1e-5
+
+
 def test_a_pose_that_does_not_stand_there_stays(standing: Path, pixels: np.ndarray) -> None:
     before = _detect(standing, pixels).detections[0]
     result = _detect(standing, pixels, plane=_below(before, 0.4))

@@ -54,6 +54,21 @@ def test_objects_tell_the_plane_on_which_they_stand(factors: Sequence[float]) ->
         assert found.normal @ TABLE.point_m == pytest.approx(found.offset_m, abs=0.01)
 
 
+def test_the_plane_is_the_mean_of_what_objects_tell() -> None:
+    """Each leans by three degrees, to another side."""
+    axes = np.array([[1, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1]])
+    tilts = [Rotation.from_rotvec(np.radians(3) * axis) for axis in axes]
+    bricks = [_on_table(seed) for seed in range(4)]
+    leaning = []
+    for brick, tilt in zip(bricks, tilts, strict=True):
+        matrix = tilt.as_matrix()
+        hull_m = (brick.hull_m - brick.middle_m) @ matrix.T + brick.middle_m
+        leaning.append(replace(brick, hull_m=hull_m, up=brick.up @ matrix.T))
+    found = find_plane(leaning)
+    assert found is not None
+    assert found.normal @ TABLE.normal > np.cos(np.radians(1.2))
+
+
 def test_surer_objects_tell_more_of_the_plane() -> None:
     other = Plane.of(TABLE.point_m + 0.2 * TABLE.normal, TABLE.normal)
     unsure = [replace(_on_table(seed, plane=other), weight=0.2) for seed in (0, 2)]
@@ -114,6 +129,7 @@ def test_an_object_that_cannot_stand_there_stays(is_known: bool) -> None:
         ([0, 0, 1], [], "3 values of a point and 0 of a normal"),
         ([0, 0, 1], [0, 0, 0], "expected metres and a direction"),
         ([0, 0, np.nan], [0, 0, -1], "expected metres and a direction"),
+        ([0, 0, 1], [0, 0, -1e300], "expected metres and a direction"),
         ([0, 0, 1e5], [0, 0, -1], "expected metres and a direction"),
         ([0, 0, 1], [0, 0, 1], "seen from below"),
     ],

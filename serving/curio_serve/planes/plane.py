@@ -44,7 +44,8 @@ class Plane:
             raise ArgumentError(
                 f"plane has {point.size} values of a point and {direction.size} of a normal; expected 3"
             )
-        length = float(np.linalg.norm(direction))
+        with np.errstate(over="ignore"):  # which is refused below
+            length = float(np.linalg.norm(direction))
         if not np.isfinite([*point, length]).all() or np.abs(point).max() > _FARTHEST_M or length < 1e-9:
             raise ArgumentError(f"plane: point {list(point_m)}, normal {list(normal)}; expected metres and a direction")
         found = cls(point, direction / length)
