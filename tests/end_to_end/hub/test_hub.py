@@ -79,7 +79,7 @@ def test_a_folder_and_a_card_are_pushed_as_one_commit(hub: Any, push: Push, fold
     assert len(repository.commits) == 2
     sent = dict(repository.commits[-1])
     local = [path for path in folder.rglob("*") if path.is_file()]
-    assert len(local) == 7
+    assert len(local) == 8
     for path in local:
         assert sent.pop(path.relative_to(folder.parent).as_posix()) == path.read_bytes()
     assert sent.keys() == {".gitattributes", "README.md"}
@@ -99,7 +99,7 @@ def test_a_model_is_fetched_once_and_then_serves_offline(
 ) -> None:
     found, expected = (json.loads(detect(model)) for model in (ADDRESS, ROOT / "models" / "ape"))
     assert {**found, "milliseconds": None} == {**expected, "milliseconds": None}
-    of_version = [f"{VERSION}/{name}" for name in ("golden.npz", "model.onnx", "reliability.json")]
+    of_version = [f"{VERSION}/{name}" for name in ("golden.npz", "model.onnx", "reliability.json", "stable_poses.json")]
     assert sorted(hub.downloads) == [f"ape/{name}" for name in (*of_version, "CARD.md", "SHA256SUMS", "config.pbtxt")]
     hub.downloads.clear()
     offline = environment(hub, tmp_path) | {"HF_HUB_OFFLINE": "1"}
