@@ -176,12 +176,9 @@ def _settings(arguments: DetectArguments) -> "Settings":
 
 def _plane(arguments: DetectArguments) -> "GivenPlane":
     from curio_serve.planes.camera_poses import CameraPoseFile
-    from curio_serve.planes.plane import FIND_PLANE
 
-    if arguments.plane in (None, FIND_PLANE):
-        return None if arguments.plane is None else FIND_PLANE
     try:
-        return CameraPoseFile.read(Path(arguments.plane))
+        return CameraPoseFile.named(arguments.plane)
     except CameraError as exc:
         raise UsageError(str(exc)) from exc
 

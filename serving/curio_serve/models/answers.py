@@ -1,5 +1,6 @@
 """Writes what a network read in a crop into an answer, in the frame's camera, and moves it onto a plane on request."""
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop
 from curio_serve.models.instances import Rows, Values
 from curio_serve.models.model import Model, Slot
-from curio_serve.models.object_frames import middle_from_origin, origin_from_middle, transformed
+from curio_serve.models.object_frames import middle_from_origin, transformed
 from curio_serve.planes.plane import AnyPlane, Plane
 from curio_serve.planes.standing import Standing, distance_factor, find_plane
 
@@ -129,14 +130,14 @@ def move_onto_plane(
     plane = given if isinstance(given, Plane) else find_plane([standing for _, standing in pairs])
     if plane is None:
         return
-    factors = iter([distance_factor(standing, plane, is_known=plane is given) for _, standing in pairs])
+    remaining, slots = iter(pairs), {slot.object: slot for slot in model.slots}
     for result, crop in zip(results, crops, strict=True):
         result.plane.point_m.extend(plane.point_m.tolist())
         result.plane.normal.extend(plane.normal.tolist())
-        for detection in result.detections:
-            factor = next(factors)
+        for detection, standing in itertools.islice(remaining, len(result.detections)):
+            factor = distance_factor(standing, plane, is_known=plane is given)
             if factor is not None and crop is not None:
-                _move(detection, factor, crop, model)
+                _move(detection, (factor - 1) * standing.middle_m, crop, slots[detection.object])
 
 
 def _standing(detection: Detection, hull_m: np.ndarray, up: np.ndarray, center_m: np.ndarray) -> Standing:
@@ -145,11 +146,7 @@ def _standing(detection: Detection, hull_m: np.ndarray, up: np.ndarray, center_m
     return Standing(detection.confidence, middle_m, hull_m @ rotation.T + origin_m, up @ rotation.T)
 
 
-def _move(detection: Detection, factor: float, crop: Crop, model: Model) -> None:
-    """Move a detection along the line of sight of its middle."""
-    slot = next(slot for slot in model.slots if slot.object == detection.object)
-    rotation, center_m = np.reshape(detection.rotation, (3, 3)), np.array(slot.center)
-    middle_m = middle_from_origin(np.array(detection.translation_m), rotation, center_m)
-    detection.translation_m[:] = origin_from_middle(factor * middle_m, rotation, center_m).tolist()
+def _move(detection: Detection, by_m: np.ndarray, crop: Crop, slot: Slot) -> None:
+    detection.translation_m[:] = (np.array(detection.translation_m) + by_m).tolist()
     detection.box_px[:] = crop.project(transformed(slot.box_corners, detection.rotation, detection.translation_m))
     detection.on_plane = True

@@ -21,11 +21,12 @@ from curio_proto.v1.detector_pb2 import (
     RegionStatus,
 )
 from curio_proto.v1.model_spec_pb2 import ObjectReliability, PoseBounds, Reliability
-from google.protobuf import json_format
 
+from curio_serve.beside import parsed_message, refuse_other_objects
 from curio_serve.errors import ModelError
 
 RELIABILITY_FILE = "reliability.json"
+_WRITER = "curio-export --intervals"
 _LEAST, _MOST_LOGIT = 1e-9, 60.0  # nearer to 0 and 1 logits say nothing
 
 
@@ -40,17 +41,10 @@ def parse_reliability(text: bytes, objects: Sequence[str], where: str) -> Reliab
     Raises:
         ModelError: It is no Reliability, has impossible values, or is about other objects.
     """
-    try:
-        found = json_format.Parse(text, Reliability(), ignore_unknown_fields=True, max_recursion_depth=20)
-    except (json_format.ParseError, UnicodeDecodeError) as exc:
-        raise ModelError(f"{where} is not what curio-export --intervals writes: {exc}") from exc
-    if sorted(one.object for one in found.objects) != sorted(objects):
-        raise ModelError(
-            f"{where} is about {sorted(one.object for one in found.objects)}, the model finds {sorted(objects)}; "
-            "write it again with curio-export --intervals"
-        )
+    found = parsed_message(text, Reliability(), where, _WRITER)
+    refuse_other_objects(found.objects, objects, where, f"write it again with {_WRITER}")
     if not 0 < found.level < 1 or not _is_calibration(found.calibration) or not all(map(_is_possible, found.objects)):
-        raise ModelError(f"{where} has impossible values; write it again with curio-export --intervals")
+        raise ModelError(f"{where} has impossible values; write it again with {_WRITER}")
     return found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from curio_serve.errors import CameraError
 from curio_serve.files import read_json
 from curio_serve.imaging.rotation import is_rotation
-from curio_serve.planes.plane import AnyPlane, Plane
+from curio_serve.planes.plane import FIND_PLANE, AnyPlane, Plane
 
 _MAX_BYTES = 1 << 26
 _MAX_SHEAR = 1e-3
@@ -61,6 +61,20 @@ class CameraPoseFile:
         if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
             raise cls.error(f"{flag} {file}: expected an object of photographs, each with its cam_from_world")
         return cls(file, entries, flag)
+
+    @classmethod
+    def named(cls, given: str | None) -> "GivenPlane":
+        """What ``--plane`` names.
+
+        Args:
+            given: A file, ``objects``, or None.
+
+        Raises:
+            CameraError: The file is missing, or no such file.
+        """
+        if given is None or given == FIND_PLANE:
+            return None if given is None else FIND_PLANE
+        return cls.read(Path(given))
 
     def cam_from_world(self, photograph: Path) -> np.ndarray:
         """The camera pose of a photograph: rigid [4, 4].

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from curio_proto.v1.model_spec_pb2 import ObjectStablePoses, StablePoses
-from google.protobuf import json_format
 
+from curio_serve.beside import parsed_message, refuse_other_objects
 from curio_serve.errors import ModelError
 
 STABLE_POSES_FILE = "stable_poses.json"
+_REMEDY = "export the run again"
 _FARTHEST_M = 100.0
 _UNIT = 1e-3  # how far a direction's length may be from 1
 
@@ -28,17 +29,10 @@ def parse_stable_poses(text: bytes, objects: Sequence[str], where: str) -> Stabl
     Raises:
         ModelError: It is no StablePoses, has impossible values, or is about other objects.
     """
-    try:
-        found = json_format.Parse(text, StablePoses(), ignore_unknown_fields=True, max_recursion_depth=20)
-    except (json_format.ParseError, UnicodeDecodeError) as exc:
-        raise ModelError(f"{where} is not what curio-export writes: {exc}") from exc
-    if sorted(one.object for one in found.objects) != sorted(objects):
-        raise ModelError(
-            f"{where} is about {sorted(one.object for one in found.objects)}, the model finds {sorted(objects)}; "
-            "export the run again"
-        )
+    found = parsed_message(text, StablePoses(), where, "curio-export")
+    refuse_other_objects(found.objects, objects, where, _REMEDY)
     if not all(map(_is_possible, found.objects)):
-        raise ModelError(f"{where} has impossible values; export the run again")
+        raise ModelError(f"{where} has impossible values; {_REMEDY}")
     return found
 
 

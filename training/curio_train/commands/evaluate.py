@@ -72,12 +72,9 @@ def _evaluate(command: EvaluateCommand) -> int:
 
 
 def _plane(given: str | None) -> "GivenPlane":
-    from curio_serve.planes.plane import FIND_PLANE
-
     from curio_train.capture.plane import CameraPoseFile
 
-    if given is None or given == FIND_PLANE:
-        return None if given is None else FIND_PLANE
-    poses = CameraPoseFile.read(Path(given))
-    poses.refuse_impossible_planes()
-    return poses
+    plane = CameraPoseFile.named(given)
+    if isinstance(plane, CameraPoseFile):
+        plane.refuse_impossible_planes()
+    return plane
