@@ -147,6 +147,17 @@ def test_a_model_that_does_not_say_how_objects_stand_refuses(models_dir: Path, p
         _detect(models_dir / "pinhole", pixels, plane="objects")
 
 
+def test_a_flat_world_refuses_whatever_lies_beside_it(
+    tmp_path: Path,
+    spot_onnx: Callable[..., onnx.ModelProto],
+    write_folder: Callable[..., Path],
+    pixels: np.ndarray,
+) -> None:
+    folder = _with_stable_poses(write_folder(tmp_path / "models" / "flat", spot_onnx(False)))
+    with pytest.raises(ArgumentError, match="model flat/1 does not say how its objects stand"):
+        Detector(open_model(folder)).detect(pixels, None, plane="objects")
+
+
 def test_a_file_that_was_changed_or_lost_is_refused(standing: Path) -> None:
     file = standing / "1" / "stable_poses.json"
     file.write_text(json.dumps(STABLE_POSES, indent=1))

@@ -99,7 +99,7 @@ def check_can_stand(model: Model) -> None:
     Raises:
         ArgumentError: It does not.
     """
-    if not model.spec.HasField("stable_poses"):
+    if not model.spec.HasField("stable_poses") or "rotation" not in model.output_names:
         raise ArgumentError(
             f"plane is given, and model {model.label} does not say how its objects stand on one: leave it out, or "
             "export its run again with curio-export (of worlds that are flat, or whose parts all stand, none says it)"
