@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import onnx
 import pytest
@@ -18,10 +19,14 @@ from curio_serve.client import Plane, PoseClient
 from curio_serve.client.request import detect_request, views_request
 from curio_serve.errors import ArgumentError, ModelError, UsageError
 from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.models.answers import standing_shapes
 from curio_serve.models.detector import Detector
 from curio_serve.models.model_folder import open_model
+from curio_serve.models.object_frames import center_of, middle_from_origin
+from curio_serve.tracking.stream import FollowingStream
 from onnx import helper, numpy_helper
 
+ROOT = Path(__file__).parents[2]
 K = np.array([[300.0, 0, 160.0], [0, 301.0, 119.0], [0, 0, 1]])
 CORNERS_M = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float) * 0.05
 SIDES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -182,8 +187,8 @@ def test_over_grpc(standing: Path, pair: Path, start_server: Callable[..., Any],
             client.detect("pinhole", pixels, K, plane="table")  # type: ignore[arg-type]
         impossible = detect_request("pinhole", pixels, K, plane=plane)
         del impossible.plane.normal[:]
-        following = detect_request("pinhole", pixels, K, plane="objects", track=messages.Tracking())
-        answers = list(client.detect_stream([impossible, following], timeout_s=60))
+        followed = detect_request("pinhole", pixels, K, plane=plane, track=messages.Tracking())
+        answers = list(client.detect_stream([impossible, followed], timeout_s=60))
         views = views_request("pinhole", [(pixels, K, np.eye(4)), (pixels, K, np.eye(4))])
         views.plane.CopyFrom(messages.Plane())
         answers += client.detect_stream([views], timeout_s=60)
@@ -192,8 +197,76 @@ def test_over_grpc(standing: Path, pair: Path, start_server: Callable[..., Any],
     assert [[one.on_plane for one in of_model.detections] for of_model in found] == [[False], [True, True]]
     told = [answer.error.message for answer in answers]
     assert "3 values of a point and 0 of a normal" in told[0]
-    assert "plane are not for following" in told[1]
+    assert answers[1].results[0].detections[0].translation_m == pytest.approx(expected.translation_m)
     assert "the request has views and plane" in told[2]
+
+
+def _follow(
+    detector: Detector,
+    pixels: np.ndarray,
+    num_frames: int,
+    num_objects: int = 1,
+    camera: PinholeCamera | None = None,
+    plane: Any = None,
+) -> Any:
+    """The results of equal frames."""
+    stream, results, camera = FollowingStream(), messages.DetectResponse().results, camera or PinholeCamera(K)
+    track = messages.Tracking(num_objects=num_objects)
+    for _ in range(num_frames):
+        stream.follow(track, [detector], pixels, camera, min_confidence=0.0, plane=plane, reduction=1, results=results)
+    return results
+
+
+def test_a_track_stands_on_a_plane_that_is_known_and_its_height_is_known_better(
+    standing: Path, pixels: np.ndarray
+) -> None:
+    detector = Detector(open_model(standing))
+    before = _detect(standing, pixels).detections[0]
+    plane = _below(before, 0.01)
+    expected = _detect(standing, pixels, plane=plane).detections[0]
+    free, result = (_follow(detector, pixels, 3, **options)[-1] for options in ({}, {"plane": plane}))
+    (found,) = result.detections
+    assert np.allclose(result.plane.normal, plane.normal)
+    assert not free.HasField("plane")
+    assert (found.on_plane, free.detections[0].on_plane) == (True, False)
+    assert found.translation_m == pytest.approx(expected.translation_m)
+    assert found.track.translation_m == pytest.approx(expected.translation_m)
+    assert max(found.track.position_std_m) < 0.7 * max(free.detections[0].track.position_std_m)
+
+
+def test_followed_objects_tell_their_plane(pair: Path, standing: Path, pixels: np.ndarray) -> None:
+    detector = Detector(open_model(pair))
+    result = _follow(detector, pixels, 2, 2, plane="objects")[-1]
+    expected = _detect(pair, pixels, plane="objects")
+    assert [one.on_plane for one in result.detections] == [True, True]
+    assert np.allclose(result.plane.normal, expected.plane.normal)
+    tracked, detected = (sorted(list(one.translation_m) for one in of.detections) for of in (result, expected))
+    assert np.allclose(tracked, detected)
+    (alone,) = _follow(Detector(open_model(standing)), pixels, 1, plane="objects")
+    assert not alone.HasField("plane")
+
+
+def test_what_crops_show_moves_as_well() -> None:
+    """The shipped model of an ape is cut at its crops: after the first frame the whole frame is not read."""
+    matrix = json.loads((ROOT / "samples" / "camera.json").read_text())["camera_matrix"]
+    photograph = np.ascontiguousarray(cv2.imread(str(ROOT / "samples" / "03.jpg"))[..., ::-1])
+    detector = Detector(open_model(ROOT / "models" / "ape"))
+    (kind,), shape = detector.model.spec.objects, standing_shapes(detector.model)["ape"]
+
+    def lowest_m(found: messages.Detection, normal: np.ndarray | None = None) -> Plane:
+        rotation = np.reshape(found.rotation, (3, 3))
+        middle_m = middle_from_origin(np.array(found.translation_m), rotation, center_of(kind))
+        where = shape.at(middle_m, rotation, 1.0)
+        normal = min(where.up, key=lambda up: up @ middle_m) if normal is None else normal
+        return Plane((where.hull_m @ normal).min() * normal, normal)
+
+    before = _follow(detector, photograph, 2, camera=PinholeCamera(np.array(matrix)))[-1].detections[0]
+    read = lowest_m(before)
+    plane = Plane(read.point_m - 0.004 * read.normal, read.normal)
+    found = _follow(detector, photograph, 2, camera=PinholeCamera(np.array(matrix)), plane=plane)[-1].detections[0]
+    assert found.on_plane
+    below_m = lowest_m(found, plane.normal).offset_m - read.offset_m
+    assert -0.005 < below_m < -0.002
 
 
 def test_the_command_line(standing: Path, pair: Path, frames: Path, camera: Path, tmp_path: Path) -> None:
@@ -214,6 +287,12 @@ def test_the_command_line(standing: Path, pair: Path, frames: Path, camera: Path
         assert lines[0]["detections"][0]["on_plane"]
         assert np.allclose(lines[0]["plane"]["normal"], plane.normal)
     assert "has no pose of 000005.png" in lines[-1]["error"]
+    poses.write_text(json.dumps(pose))
+    assert run(replace(call, plane=str(poses), track=True)) == 0
+    followed = [json.loads(line)["detections"][0] for line in out.read_text().splitlines()]
+    assert all("track" in one for one in followed)
+    assert followed[0]["translation_m"] == pytest.approx(lines[0]["detections"][0]["translation_m"])
+    assert run(replace(call, model=str(pair), plane="objects", track=True, track_objects=2)) == 0
     assert run(replace(call, model=str(pair), plane="objects")) == 0
     assert all("plane" in json.loads(line) for line in out.read_text().splitlines())
 
@@ -232,7 +311,7 @@ def _pose_over(plane: Plane) -> np.ndarray:
     ("changes", "told"),
     [
         ({"plane": "nowhere.json"}, r"--plane nowhere\.json: cannot be read"),
-        ({"plane": "objects", "track": True}, "--reads and --plane"),
+        ({"plane": "objects", "track": True}, "finds one object in an image"),
         ({"plane": "objects"}, "finds one object in an image, which stands on any plane"),
         ({"plane": "objects", "refine": True}, "--refine and --plane both correct distances"),
         ({"plane": "up.json"}, r"b\.png: cam_from_world has shape"),

@@ -265,7 +265,7 @@ def test_the_command_writes_all_of_them(seeking: Path, tmp_path: Path) -> None:
     ("flags", "told"),
     [
         ({"max_instances": 0}, "expected 1 to 16"),
-        ({"max_instances": 2, "track": True}, "leave out --max-detections, --max-instances, --reads and --plane"),
+        ({"max_instances": 2, "track": True}, "leave out --max-detections, --max-instances and --reads"),
     ],
 )
 def test_the_command_refuses(seeking: Path, tmp_path: Path, flags: dict[str, Any], told: str) -> None:

@@ -161,7 +161,7 @@ def test_the_command_reads_an_image_as_often_as_it_is_told(spot: Path, models_di
     [
         ("pinhole", {"reads": 0}, "--reads 0: expected 1 to 9"),
         ("pinhole", {"reads": 10}, "--reads 10"),
-        ("pinhole", {"reads": 3, "track": True}, "--reads and --plane"),
+        ("pinhole", {"reads": 3, "track": True}, "--max-instances and --reads"),
         ("flat", {"reads": 3}, "--reads: reads is 3, but model flat can read an image only once"),
     ],
 )
@@ -206,5 +206,5 @@ def test_following_and_rigs_read_once(client: PoseClient) -> None:
     views = views_request("pinhole", [(IMAGE[0], K, np.eye(4)), (IMAGE[0], K, np.eye(4))])
     views.reads = 2
     told = [str(error_from_answer(answer)) for answer in client.detect_stream([following, views], timeout_s=30)]
-    assert "reads and plane are not for following" in told[0]
+    assert "reads are not for following" in told[0]
     assert "the request has views and reads" in told[1]

@@ -29,7 +29,7 @@ from curio_serve.tracking.stream import FollowingStream
 
 Context = grpc.ServicerContext
 _MAX_ID_LENGTH = 128
-_NOT_WITH_TRACK = ("max_detections", "max_instances", "reads", "plane")
+_NOT_WITH_TRACK = ("max_detections", "max_instances", "reads")
 _ID_PREFIX, _ID_NUMBERS = secrets.token_hex(8), itertools.count()
 
 
@@ -142,6 +142,7 @@ class PoseService(PoseDetectorServicer):
                 frame.pixels,
                 camera,
                 min_confidence=min_confidence,
+                plane=plane,
                 reduction=frame.reduction,
                 results=answer.results,
                 before_run=before_run,
@@ -260,8 +261,7 @@ def _check_following(request: messages.DetectRequest, following: FollowingStream
         raise ArgumentError("track is set in a single call; objects are followed in DetectStream")
     if request.regions or any(map(request.HasField, _NOT_WITH_TRACK)):
         raise ArgumentError(
-            "regions, max_detections, max_instances, reads and plane are not for following; leave them out, or leave "
-            "out track"
+            "regions, max_detections, max_instances and reads are not for following; leave them out, or leave out track"
         )
     return following
 

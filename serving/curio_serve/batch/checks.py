@@ -128,7 +128,8 @@ def check_plane(arguments: DetectArguments, estimator: Estimator) -> None:
             "run again (of worlds that are flat, or whose parts all stand, none says it)"
         )
     poses = estimator.settings.plane
-    if poses == FIND_PLANE and estimator.spec.num_slots == 1 and arguments.max_instances in (None, 1):
+    most = arguments.track_objects if arguments.track else arguments.max_instances or 1
+    if poses == FIND_PLANE and estimator.spec.num_slots == 1 and most == 1:
         raise UsageError(
             f"--plane objects: {estimator.name} finds one object in an image, which stands on any plane; give a file "
             "of the plane, or look for several objects"

@@ -178,9 +178,11 @@ def _plane(arguments: DetectArguments) -> "GivenPlane":
     from curio_serve.planes.camera_poses import CameraPoseFile
 
     try:
-        return CameraPoseFile.named(arguments.plane)
+        found = CameraPoseFile.named(arguments.plane)
     except CameraError as exc:
         raise UsageError(str(exc)) from exc
+    # Absolute, because other nodes of a cluster have another working folder.
+    return replace(found, file=found.file.absolute()) if isinstance(found, CameraPoseFile) else found
 
 
 def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "Settings") -> "list[Estimator]":

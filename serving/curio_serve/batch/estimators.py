@@ -290,6 +290,7 @@ class LocalEstimator(Estimator):
             frame.pixels,
             camera,
             min_confidence=self.settings.min_confidence,
+            plane=plane_of(self.settings.plane, image.name),
             reduction=frame.reduction,
             results=results,
         )

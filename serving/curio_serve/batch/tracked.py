@@ -42,11 +42,11 @@ def check_tracking(arguments: DetectArguments, models: Sequence[str]) -> DetectA
             "--track follows on one machine and writes JSON Lines; leave out --ray, --refine and --format, and name "
             "--out so"
         )
-    whole = arguments.max_detections, arguments.max_instances, arguments.plane
+    whole = arguments.max_detections, arguments.max_instances
     if any(given is not None for given in whole) or arguments.reads != 1:
         raise UsageError(
-            "--track: say by --track-objects how many are followed, and leave out --max-detections, --max-instances, "
-            "--reads and --plane"
+            "--track: say by --track-objects how many are followed, and leave out --max-detections, --max-instances "
+            "and --reads"
         )
     if not 1 <= arguments.track_objects <= MAX_OBJECTS:
         raise UsageError(f"--track-objects {arguments.track_objects}: expected 1 to {MAX_OBJECTS}")

@@ -14,8 +14,9 @@ from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop
 from curio_serve.models.instances import Rows, Values
 from curio_serve.models.model import Model, Slot
-from curio_serve.models.object_frames import middle_from_origin, transformed
+from curio_serve.models.object_frames import center_of, middle_from_origin, transformed
 from curio_serve.planes.plane import AnyPlane, Plane
+from curio_serve.planes.stable_poses import StandingShape
 from curio_serve.planes.standing import Standing, distance_factor, find_plane
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -117,33 +118,39 @@ def move_onto_plane(
         model: That answered.
         given: The plane, or that it is to be found.
     """
-    shapes = {
-        one.object: (np.reshape(one.hull_m, (-1, 3)), np.reshape(one.up, (-1, 3)))
-        for one in model.spec.stable_poses.objects
-    }
-    centers_m = {slot.object: np.array(slot.center) for slot in model.slots}
+    shapes, slots = standing_shapes(model), {slot.object: slot for slot in model.slots}
     pairs = [
-        (detection, _standing(detection, *shapes[detection.object], centers_m[detection.object]))
+        (detection, _standing(detection, shapes[detection.object], slots[detection.object]))
         for result in results
         for detection in result.detections
     ]
     plane = given if isinstance(given, Plane) else find_plane([standing for _, standing in pairs])
     if plane is None:
         return
-    remaining, slots = iter(pairs), {slot.object: slot for slot in model.slots}
+    remaining = iter(pairs)
     for result, crop in zip(results, crops, strict=True):
-        result.plane.point_m.extend(plane.point_m.tolist())
-        result.plane.normal.extend(plane.normal.tolist())
+        write_plane(result, plane)
         for detection, standing in itertools.islice(remaining, len(result.detections)):
             factor = distance_factor(standing, plane, is_known=plane is given)
             if factor is not None and crop is not None:
                 _move(detection, (factor - 1) * standing.middle_m, crop, slots[detection.object])
 
 
-def _standing(detection: Detection, hull_m: np.ndarray, up: np.ndarray, center_m: np.ndarray) -> Standing:
+def standing_shapes(model: Model) -> dict[str, StandingShape]:
+    """How each kind of a model's objects can stand, by name."""
+    centers_m = {kind.name: center_of(kind) for kind in model.spec.objects}
+    return {one.object: StandingShape.of(one, centers_m[one.object]) for one in model.spec.stable_poses.objects}
+
+
+def write_plane(result: RegionResult, plane: Plane) -> None:
+    """Write into a result on which plane its objects stand."""
+    result.plane.point_m.extend(plane.point_m.tolist())
+    result.plane.normal.extend(plane.normal.tolist())
+
+
+def _standing(detection: Detection, shape: StandingShape, slot: Slot) -> Standing:
     rotation, origin_m = np.reshape(detection.rotation, (3, 3)), np.array(detection.translation_m)
-    middle_m = middle_from_origin(origin_m, rotation, center_m)
-    return Standing(detection.confidence, middle_m, hull_m @ rotation.T + origin_m, up @ rotation.T)
+    return shape.at(middle_from_origin(origin_m, rotation, np.array(slot.center)), rotation, detection.confidence)
 
 
 def _move(detection: Detection, by_m: np.ndarray, crop: Crop, slot: Slot) -> None:

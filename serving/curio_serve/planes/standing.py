@@ -16,7 +16,7 @@ from curio_serve.planes.plane import Plane
 Array = np.ndarray
 _DEPTH_STD = 0.015
 """Standard deviation of a distance that a network reads, fraction of the distance."""
-_HEIGHT_STD = 0.004
+HEIGHT_STD = 0.004
 """Of the height of an object's lowest point over the plane, fraction of the same distance: meshes end where scanners
 stopped, tables bend, and planes are measured."""
 _TILT_STD = 0.08
@@ -96,10 +96,10 @@ def distance_factor(one: Standing, plane: Plane, *, is_known: bool) -> float | N
     towards_m = float(plane.normal @ one.middle_m)  # negative: from the camera down to the plane
     below_m = float((one.hull_m @ plane.normal).min()) - towards_m
     distance_m = float(np.linalg.norm(one.middle_m))
-    if towards_m >= -_HEIGHT_STD * distance_m:
+    if towards_m >= -HEIGHT_STD * distance_m:
         return None
     change = (plane.offset_m - below_m) / towards_m - 1
-    std = _HEIGHT_STD * distance_m / -towards_m
+    std = HEIGHT_STD * distance_m / -towards_m
     if abs(change) > _MOST_DEVIATIONS * np.hypot(_DEPTH_STD, std):
         return None
     return 1 + change * _DEPTH_STD**2 / (_DEPTH_STD**2 + std**2)
@@ -157,4 +157,4 @@ def _heights_m(normals: Array, objects: Sequence[Standing]) -> Array:
 def _height_stds_m(normals: Array, objects: Sequence[Standing]) -> Array:
     """Standard deviation of those, as the distances that a network reads make it, [planes, objects]."""
     along_m = np.stack([normals @ one.middle_m for one in objects], axis=1)
-    return np.hypot(_DEPTH_STD * along_m, _HEIGHT_STD * np.linalg.norm([one.middle_m for one in objects], axis=1))
+    return np.hypot(_DEPTH_STD * along_m, HEIGHT_STD * np.linalg.norm([one.middle_m for one in objects], axis=1))

@@ -15,9 +15,12 @@ from curio_proto.v1.detector_pb2 import DETECTION_STATUS_SURE, DETECTION_STATUS_
 
 from curio_serve.errors import ArgumentError
 from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.models.answers import write_plane
 from curio_serve.models.detector import Detector
 from curio_serve.models.reliability import region_status
+from curio_serve.planes.plane import AnyPlane
 from curio_serve.tracking.frame import StreamFrame
+from curio_serve.tracking.frame_plane import FramePlane
 from curio_serve.tracking.tracks import Measurement, Track, assign, without_doubles
 
 if TYPE_CHECKING:
@@ -81,6 +84,7 @@ class Follower:
         following: Following,
         *,
         min_confidence: float = 0.0,
+        plane: AnyPlane | None = None,
         reduction: int = 1,
         results: "Results",
         before_run: Callable[[], None] = lambda: None,
@@ -94,6 +98,7 @@ class Follower:
             time_s: When it was taken, after the frame before.
             following: How.
             min_confidence: Objects last seen with less are not answered; how far a prediction faded is no matter.
+            plane: On which objects stand in this frame, camera frame, or the one on which most of them do.
             reduction: How much smaller than the frame the pixels were decoded.
             results: The field of a response.
             before_run: Called before each run of a network.
@@ -101,7 +106,7 @@ class Follower:
         Raises:
             As :meth:`~curio_serve.models.detector.Detector.detect`.
         """
-        frame = StreamFrame(detector, pixels, camera, reduction, time_s, before_run)
+        frame = StreamFrame(detector, pixels, camera, reduction, time_s, FramePlane(detector.model, plane), before_run)
         wanted = [slot.object for slot in detector.model.slots]
         self._tracks = [track for track in self._tracks if track.kind.name in wanted]
         step_s, last_s = time_s - self._time_s, self._step_s
@@ -124,13 +129,12 @@ class Follower:
 
     def _read_crops(self, frame: StreamFrame) -> Sequence[float]:
         """Read each object from crops at its expected position; return the light."""
-        light: Sequence[float] = ()
-        for track in self._tracks:
-            pose = frame.read(track.filter.translation_m)
-            if pose is not None and pose.confidence >= _FOLLOWED:
-                track.update(Measurement.of_crops(track.kind, pose), frame.time_s)
-                light = pose.light.tolist()
-        return light
+        read = [(track, frame.read(track.filter.translation_m)) for track in self._tracks]
+        seen = [(track, pose) for track, pose in read if pose is not None and pose.confidence >= _FOLLOWED]
+        found = frame.plane.stood([Measurement.of_crops(track.kind, pose) for track, pose in seen])
+        for (track, _), measured in zip(seen, found, strict=True):
+            track.update(measured, frame.time_s)
+        return seen[-1][1].light.tolist() if seen else ()
 
     def _search_around(self, frame: StreamFrame) -> Sequence[float]:
         """Search each object that is not seen around its last position; return the light."""
@@ -144,7 +148,8 @@ class Follower:
             found = [pose for pose in found if not self._is_taken(track, pose.translation_m)]
             if found:
                 surest = max(found, key=lambda pose: pose.confidence)
-                track.update(Measurement.of_crops(track.kind, surest), frame.time_s)
+                (measured,) = frame.plane.stood([Measurement.of_crops(track.kind, surest)])
+                track.update(measured, frame.time_s)
                 light = surest.light.tolist()
         return light
 
@@ -181,7 +186,7 @@ class Follower:
         hidden = [track for track in self._tracks if track.is_seen] if has_crops and following.num_objects > 1 else []
         found, light = frame.look(hidden)
         alone = following.num_objects == 1
-        found = [measured for measured in found if measured.confidence >= _FOLLOWED]
+        found = frame.plane.stood([measured for measured in found if measured.confidence >= _FOLLOWED])
         if has_crops and alone:
             found = self._verified(found)
         unseen = [track for track in self._tracks if not track.is_seen]
@@ -229,6 +234,8 @@ class Follower:
         model = frame.detector.model
         result = results.add(model=model.name, model_version=model.version)
         result.light.extend(light)
+        if frame.plane.plane is not None:
+            write_plane(result, frame.plane.plane)
         now_s, keep_s = frame.time_s, following.keep_s
         for track in sorted(self._tracks, key=lambda t: (-t.confidence(now_s, keep_s), t.number)):
             if track.measured.confidence < min_confidence:
@@ -242,6 +249,7 @@ class Follower:
                 pose.rotation if raw is None else raw.rotation,
                 track.confidence(now_s, keep_s),
             )
+            detection.on_plane = raw is not None and raw.on_plane
             frame.describe(detection.track, track)
             if raw is None and detection.status == DETECTION_STATUS_SURE:  # this frame does not show it
                 detection.status = DETECTION_STATUS_UNSURE

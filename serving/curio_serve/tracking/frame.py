@@ -15,6 +15,7 @@ from curio_serve.models.instances import cover, enlarged
 from curio_serve.models.object_frames import center_of, middle_from_origin, origin_from_middle, transformed
 from curio_serve.models.reliability import status_of
 from curio_serve.models.stages.crop_stage import CropPose
+from curio_serve.tracking.frame_plane import FramePlane
 from curio_serve.tracking.tracks import Measurement, Track
 
 Array = np.ndarray
@@ -34,6 +35,8 @@ class StreamFrame:
     """Factor by which the pixels are smaller than the frame."""
     time_s: float
     """Time at which it was taken, seconds."""
+    plane: FramePlane
+    """On which its objects stand."""
     before_run: Callable[[], None]
     """Called before each run of a network."""
 

@@ -10,7 +10,9 @@ from curio_proto.v1.detector_pb2 import Tracking
 
 from curio_serve.errors import ArgumentError, CameraError
 from curio_serve.imaging.camera import PinholeCamera
+from curio_serve.models.answers import check_can_stand
 from curio_serve.models.detector import Detector
+from curio_serve.planes.plane import AnyPlane
 from curio_serve.tracking.follower import Follower, Following
 
 if TYPE_CHECKING:
@@ -61,6 +63,7 @@ class FollowingStream:
         camera: PinholeCamera | None,
         *,
         min_confidence: float,
+        plane: AnyPlane | None = None,
         reduction: int,
         results: "Results",
         before_run: Callable[[], None] = lambda: None,
@@ -73,12 +76,15 @@ class FollowingStream:
             pixels: uint8 RGB [height / reduction, width / reduction, 3].
             camera: Intrinsics of the full-size frame.
             min_confidence: Detections below it are not answered.
+            plane: On which objects stand in this frame, see
+                :meth:`~curio_serve.models.detector.Detector.detect`.
             reduction: How much smaller than the frame the pixels were decoded.
             results: The field of a response.
             before_run: Called before each run of a network.
 
         Raises:
-            ArgumentError: See :meth:`check`; or a model is of a 2D world.
+            ArgumentError: See :meth:`check`; or a model is of a 2D world, or does not say how its objects stand and a
+                plane is given.
             CameraError: Frame or K are of another camera than before, or K cannot be this frame's.
             CameraMissing: A model needs K.
             InternalError: A network failed.
@@ -87,6 +93,8 @@ class FollowingStream:
         for detector in detectors:
             if detector.model.camera.matrix is None:
                 raise ArgumentError(f"model {detector.model.label} is of a 2D world; poses in space can be followed")
+            if plane is not None:
+                check_can_stand(detector.model)
         size = pixels.shape[1] * reduction, pixels.shape[0] * reduction
         for detector in detectors:
             detector.camera_of(camera, *size)
@@ -104,6 +112,7 @@ class FollowingStream:
                 time_s,
                 following,
                 min_confidence=min_confidence,
+                plane=plane,
                 reduction=reduction,
                 results=results,
                 before_run=before_run,

@@ -37,6 +37,8 @@ class Measurement:
     """[3, 3]."""
     rotation_variance: float
     """About each axis, rad²."""
+    on_plane: bool = False
+    """Whether the object was moved to stand on a plane."""
 
     @staticmethod
     def of_whole_frame(kind: ObjectModel, translation_m: Array, rotation: Array, confidence: float) -> "Measurement":
