@@ -153,6 +153,9 @@ def test_a_file_of_camera_poses_says_the_plane_in_each_camera(tmp_path: Path) ->
         plane = poses.plane(tmp_path / "a.png")
         assert plane.offset_m == pytest.approx(-1)
         assert plane.normal.tolist() == [0, -0.6, -0.8]
+    level = {"cam_from_world": [[1, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 0], [0, 0, 0, 1]]}
+    (tmp_path / "level.json").write_text(json.dumps(level))
+    assert CameraPoseFile.read(tmp_path / "level.json").plane(tmp_path / "a.png").normal.tolist() == [0, -1, 0]
     assert poses.plane(tmp_path / "any.png").offset_m == pytest.approx(-1)  # of a camera that stands still
     assert plane_of(FIND_PLANE, "a.png") == FIND_PLANE
     assert plane_of(None, "a.png") is None
@@ -165,7 +168,8 @@ def test_a_file_of_camera_poses_says_the_plane_in_each_camera(tmp_path: Path) ->
         ("{", "not JSON"),
         ('{"b.png": {"cam_from_world": []}}', r"has no pose of a\.png, only of b\.png"),
         ('{"cam_from_world": 3}', "expected 4x4"),
-        ('{"cam_from_world": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "looks up"),
+        ('{"cam_from_world": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "looks straight ahead"),
+        ('{"cam_from_world": [[1,0,0,0],[0,-0.6,-0.8,1],[0,0.8,-0.6,0],[0,0,0,1]]}', "height of 0.6 m and looks up"),
         ('{"unit": "mm", "cam_from_world": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "the unit is 'mm'"),
     ],
 )

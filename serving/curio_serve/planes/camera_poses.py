@@ -19,6 +19,7 @@ from curio_serve.planes.plane import FIND_PLANE, AnyPlane, Plane
 _MAX_BYTES = 1 << 26
 _MAX_SHEAR = 1e-3
 _POSE = "cam_from_world"
+_MOST_UPWARD = 0.7  # sine of the angle: a camera that looks up farther hardly shows a plane below it
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +90,12 @@ class CameraPoseFile:
             )
         return self._rigid(self._entry(photograph)[_POSE], self._where(photograph))
 
-    def pose_above_plane(self, photograph: Path) -> np.ndarray:
+    def pose_above_plane(self, photograph: Path, most_upward: float = 0.0) -> np.ndarray:
         """The camera pose of a photograph, in metres, whose camera has to look down on the plane from above: [4, 4].
+
+        Args:
+            photograph: Its file.
+            most_upward: Sine of the angle by which the camera may look up.
 
         Raises:
             CameraError: The file has no pose, another one, or says that it is not in metres.
@@ -103,10 +108,10 @@ class CameraPoseFile:
                 "or --objects beside --calibrate --views-out, which bring the scene to metres"
             )
         height, forward = (-matrix[:3, :3].T @ matrix[:3, 3])[1], matrix[2, 1]
-        if height <= 0 or forward >= 0:
+        if height <= 0 or forward >= most_upward:
             raise self.error(
                 f"{self._where(photograph)}: the camera stands at a height of {height:.3g} m and looks "
-                f"{'up' if forward >= 0 else 'down'}; expected one above the plane y = 0 that looks down on it. "
+                f"{'down' if forward < 0 else 'up' if forward > 0 else 'straight ahead'}; expected one above the plane y = 0 that looks down on it. "
                 "Is y up, and is it cam_from_world?"
             )
         return matrix
@@ -117,7 +122,7 @@ class CameraPoseFile:
         Raises:
             CameraError: As :meth:`pose_above_plane`.
         """
-        matrix = self.pose_above_plane(photograph)
+        matrix = self.pose_above_plane(photograph, _MOST_UPWARD)
         return Plane(matrix[:3, 3], matrix[:3, 1])
 
     def refuse_impossible_planes(self) -> None:
@@ -128,7 +133,7 @@ class CameraPoseFile:
         """
         for name in ["every image"] if self.of_all is not None else self.entries:
             if self.is_known(self.file.parent / name):
-                self.pose_above_plane(self.file.parent / name)
+                self.pose_above_plane(self.file.parent / name, _MOST_UPWARD)
 
     def is_known(self, photograph: Path) -> bool:
         """Whether the file has a pose of this photograph."""
