@@ -108,10 +108,11 @@ class CameraPoseFile:
                 "or --objects beside --calibrate --views-out, which bring the scene to metres"
             )
         height, forward = (-matrix[:3, :3].T @ matrix[:3, 3])[1], matrix[2, 1]
+        looks = "down" if forward < 0 else "up" if forward > 0 else "straight ahead"
         if height <= 0 or forward >= most_upward:
             raise self.error(
-                f"{self._where(photograph)}: the camera stands at a height of {height:.3g} m and looks "
-                f"{'down' if forward < 0 else 'up' if forward > 0 else 'straight ahead'}; expected one above the plane y = 0 that looks down on it. "
+                f"{self._where(photograph)}: the camera stands at a height of {height:.3g} m and looks {looks}; "
+                "expected one above the plane y = 0 that looks down on it. "
                 "Is y up, and is it cam_from_world?"
             )
         return matrix
