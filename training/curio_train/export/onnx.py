@@ -1,5 +1,6 @@
 """Writes a torch module as an ONNX file."""
 
+import gc
 import logging
 import warnings
 from collections.abc import Collection, Iterator, Sequence
@@ -79,7 +80,7 @@ def traced_program(
     free: tuple[dict[int, Any], ...] = ({} if tracing.one_image else {0: torch.export.Dim("batch")},)
     if tracing.num_slots is not None:
         examples, free = (*examples, torch.arange(tracing.num_slots)), (*free, {0: torch.export.Dim("wanted")})
-    with quiet(*_TALKATIVE):
+    with quiet(*_TALKATIVE), _uncollected():
         program = torch.onnx.export(
             network,
             examples,
@@ -135,6 +136,18 @@ def _simplify(model: ir.Model) -> None:
         passes.NameFixPass(),
     ):
         simplify(model)
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Leave garbage for later: tracing makes millions of objects that live on, and to look through them takes long."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 @contextmanager
