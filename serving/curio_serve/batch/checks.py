@@ -132,7 +132,7 @@ def check_plane(arguments: DetectArguments, estimator: Estimator) -> None:
     if poses == FIND_PLANE and estimator.spec.num_slots == 1 and most == 1:
         raise UsageError(
             f"--plane objects: {estimator.name} finds one object in an image, which stands on any plane; give a file "
-            "of the plane, or look for several objects"
+            f"of the plane, or look for several objects (--{'track-objects' if arguments.track else 'max-instances'})"
         )
     if isinstance(poses, CameraPoseFile):
         try:

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from curio_serve.imaging.rotation import quaternion_xyzw
 from curio_serve.imaging.view import Crop
 from curio_serve.models.instances import Rows, Values
 from curio_serve.models.model import Model, Slot
-from curio_serve.models.object_frames import center_of, middle_from_origin, transformed
+from curio_serve.models.object_frames import center_of, middle_from_origin, transformed, turns_any_way
 from curio_serve.planes.plane import AnyPlane, Plane
 from curio_serve.planes.stable_poses import StandingShape
 from curio_serve.planes.standing import Standing, distance_factor, find_plane
@@ -138,8 +139,13 @@ def move_onto_plane(
 
 def standing_shapes(model: Model) -> dict[str, StandingShape]:
     """How each kind of a model's objects can stand, by name."""
-    centers_m = {kind.name: center_of(kind) for kind in model.spec.objects}
-    return {one.object: StandingShape.of(one, centers_m[one.object]) for one in model.spec.stable_poses.objects}
+    kinds = {kind.name: kind for kind in model.spec.objects}
+    shapes = {}
+    for one in model.spec.stable_poses.objects:
+        shape = StandingShape.of(one, center_of(kinds[one.object]))
+        # The sides of a ball's mesh tell nothing: its rotation is not read.
+        shapes[one.object] = replace(shape, up=shape.up[:0]) if turns_any_way(kinds[one.object]) else shape
+    return shapes
 
 
 def write_plane(result: RegionResult, plane: Plane) -> None:

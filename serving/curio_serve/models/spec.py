@@ -97,6 +97,10 @@ def part_of(spec: ModelSpec, wanted: Sequence[int]) -> ModelSpec:
         if rows := [row for row, slot in enumerate(wanted) if slot in kind.slots]:
             part.objects.add().CopyFrom(kind)
             part.objects[-1].slots[:] = rows
+    if spec.HasField("stable_poses"):
+        names = {kind.name for kind in part.objects}
+        del part.stable_poses.objects[:]
+        part.stable_poses.objects.extend(one for one in spec.stable_poses.objects if one.object in names)
     return part
 
 

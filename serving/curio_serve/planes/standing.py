@@ -14,7 +14,7 @@ import numpy as np
 from curio_serve.planes.plane import Plane
 
 Array = np.ndarray
-_DEPTH_STD = 0.015
+DEPTH_STD = 0.015
 """Standard deviation of a distance that a network reads, fraction of the distance."""
 HEIGHT_STD = 0.004
 """Of the height of an object's lowest point over the plane, fraction of the same distance: meshes end where scanners
@@ -88,21 +88,34 @@ def distance_factor(one: Standing, plane: Plane, *, is_known: bool) -> float | N
     Args:
         one: The object.
         plane: On which it may stand.
+        is_known: As of :func:`height_over`.
+    """
+    height_m = height_over(one, plane, is_known=is_known)
+    if height_m is None:
+        return None
+    down_m = -float(plane.normal @ one.middle_m)
+    std = HEIGHT_STD * float(np.linalg.norm(one.middle_m)) / down_m
+    return 1 + height_m / down_m * DEPTH_STD**2 / (DEPTH_STD**2 + std**2)
+
+
+def height_over(one: Standing, plane: Plane, *, is_known: bool) -> float | None:
+    """How far an object that stands on a plane was read above it, metres; None where it does not stand there.
+
+    Args:
+        one: The object.
+        plane: On which it may stand.
         is_known: The plane was given: objects that lean on it touch it, too. Otherwise it was found, and objects stand
             on one of their sides.
     """
     if not is_known and (not len(one.up) or np.linalg.norm(one.up - plane.normal, axis=1).min() > _MOST_TILT):
         return None
-    towards_m = float(plane.normal @ one.middle_m)  # negative: from the camera down to the plane
-    below_m = float((one.hull_m @ plane.normal).min()) - towards_m
-    distance_m = float(np.linalg.norm(one.middle_m))
-    if towards_m >= -HEIGHT_STD * distance_m:
+    down_m, distance_m = -float(plane.normal @ one.middle_m), float(np.linalg.norm(one.middle_m))
+    if down_m <= HEIGHT_STD * distance_m:
         return None
-    change = (plane.offset_m - below_m) / towards_m - 1
-    std = HEIGHT_STD * distance_m / -towards_m
-    if abs(change) > _MOST_DEVIATIONS * np.hypot(_DEPTH_STD, std):
+    height_m = float((one.hull_m @ plane.normal).min()) - plane.offset_m
+    if abs(height_m) > _MOST_DEVIATIONS * np.hypot(DEPTH_STD * down_m, HEIGHT_STD * distance_m):
         return None
-    return 1 + change * _DEPTH_STD**2 / (_DEPTH_STD**2 + std**2)
+    return height_m
 
 
 def _fitted(normal: Array, offset_m: float, objects: Sequence[Standing]) -> Plane | None:
@@ -157,4 +170,4 @@ def _heights_m(normals: Array, objects: Sequence[Standing]) -> Array:
 def _height_stds_m(normals: Array, objects: Sequence[Standing]) -> Array:
     """Standard deviation of those, as the distances that a network reads make it, [planes, objects]."""
     along_m = np.stack([normals @ one.middle_m for one in objects], axis=1)
-    return np.hypot(_DEPTH_STD * along_m, HEIGHT_STD * np.linalg.norm([one.middle_m for one in objects], axis=1))
+    return np.hypot(DEPTH_STD * along_m, HEIGHT_STD * np.linalg.norm([one.middle_m for one in objects], axis=1))

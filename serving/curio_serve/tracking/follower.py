@@ -15,7 +15,7 @@ from curio_proto.v1.detector_pb2 import DETECTION_STATUS_SURE, DETECTION_STATUS_
 
 from curio_serve.errors import ArgumentError
 from curio_serve.imaging.camera import PinholeCamera
-from curio_serve.models.answers import write_plane
+from curio_serve.models.answers import standing_shapes, write_plane
 from curio_serve.models.detector import Detector
 from curio_serve.models.reliability import region_status
 from curio_serve.planes.plane import AnyPlane
@@ -106,7 +106,8 @@ class Follower:
         Raises:
             As :meth:`~curio_serve.models.detector.Detector.detect`.
         """
-        frame = StreamFrame(detector, pixels, camera, reduction, time_s, FramePlane(detector.model, plane), before_run)
+        shapes = {} if plane is None else standing_shapes(detector.model)
+        frame = StreamFrame(detector, pixels, camera, reduction, time_s, FramePlane(shapes, plane), before_run)
         wanted = [slot.object for slot in detector.model.slots]
         self._tracks = [track for track in self._tracks if track.kind.name in wanted]
         step_s, last_s = time_s - self._time_s, self._step_s
@@ -144,13 +145,17 @@ class Follower:
                 continue
             offsets_m = _AROUND * track.kind.diameter_m
             read = [frame.read(track.measured.translation_m + offsets_m * offset) for offset in _OFFSETS]
-            found = [pose for pose in read if pose is not None and pose.confidence >= _FOLLOWED]
-            found = [pose for pose in found if not self._is_taken(track, pose.translation_m)]
-            if found:
-                surest = max(found, key=lambda pose: pose.confidence)
-                (measured,) = frame.plane.stood([Measurement.of_crops(track.kind, surest)])
-                track.update(measured, frame.time_s)
-                light = surest.light.tolist()
+            seen = [pose for pose in read if pose is not None and pose.confidence >= _FOLLOWED]
+            found = frame.plane.stood([Measurement.of_crops(track.kind, pose) for pose in seen])
+            free = [
+                (measured.confidence, number)
+                for number, measured in enumerate(found)
+                if not self._is_taken(track, measured.translation_m)
+            ]
+            if free:
+                _, surest = max(free)
+                track.update(found[surest], frame.time_s)
+                light = seen[surest].light.tolist()
         return light
 
     def _is_taken(self, track: Track, position_m: Array) -> bool:

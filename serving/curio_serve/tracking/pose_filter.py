@@ -82,6 +82,11 @@ class PoseFilter:
         self.rotation = from_rotation_vector(correction[:3]) @ self.rotation
         self.turn_rad_s += correction[3:]
 
+    def replace_position(self, translation_m: Array, covariance_m2: Array) -> None:
+        """Restart with another position; the rotation stays."""
+        self.translation_m, self.velocity_m_s = np.array(translation_m, float), np.zeros(3)
+        self._linear = _first(_floored(covariance_m2), _FIRST_SPEED_M_S)
+
     def replace_rotation(self, rotation: Array, variance: float) -> None:
         """Restart with another rotation; position and velocity stay."""
         self.rotation, self.turn_rad_s = np.array(rotation, float), np.zeros(3)

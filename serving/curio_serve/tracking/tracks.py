@@ -98,14 +98,17 @@ class Track:
 
     def update(self, measured: Measurement, time_s: float) -> None:
         """Update with a measurement in the current frame."""
-        unseen_s = time_s - self.seen_s
+        unseen_s, was_on_plane = time_s - self.seen_s, self.measured.on_plane
         self.is_seen, self.seen_s, self.measured = True, time_s, measured
         if self._is_elsewhere(measured) and unseen_s > 0:
             self.filter = PoseFilter(
                 measured.translation_m, measured.rotation, measured.covariance_m2, measured.rotation_variance
             )
             return
-        self.filter.update(measured.translation_m, measured.covariance_m2)
+        if measured.on_plane == was_on_plane:
+            self.filter.update(measured.translation_m, measured.covariance_m2)
+        else:  # it jumped, and did not move as fast
+            self.filter.replace_position(measured.translation_m, measured.covariance_m2)
         rotation = self._nearest_symmetric(measured.rotation)
         if _angle(rotation, self.filter.rotation) < _FLIP_RAD:
             self._num_flips = 0

@@ -15,12 +15,13 @@ from curio_serve.errors import CameraError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.view import CanonicalCamera, PinholeCrop, PinholeFrame
 from curio_serve.planes.camera_poses import GivenPlane, plane_of
+from curio_serve.planes.stable_poses import StandingShape
 
 from curio_train.data.bop import Annotation, BopDataset, Frame
 from curio_train.data.bop_split import SPLIT, scored_frames
 from curio_train.data.photographs import read_photograph
 from curio_train.errors import DataError, UsageError
-from curio_train.evaluation.on_plane import Shape, shapes_of, standing_on
+from curio_train.evaluation.on_plane import shapes_of, standing_on
 from curio_train.evaluation.real_scores import Estimate, scored, together
 from curio_train.evaluation.subject import Subject
 from curio_train.geometry import Pose
@@ -68,7 +69,7 @@ def evaluate_real_frames(
 
 
 def _on_plane(
-    found: Mapping[tuple[int, int], list[Estimate]], shapes: Sequence[Shape], given: GivenPlane
+    found: Mapping[tuple[int, int], list[Estimate]], shapes: Sequence[StandingShape], given: GivenPlane
 ) -> dict[tuple[int, int], list[Estimate]]:
     """The same estimates, moved onto the plane in each frame."""
     moved = {}
