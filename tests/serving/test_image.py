@@ -201,6 +201,45 @@ def test_reduced_decoding_shows_the_same_scene(max_reduction: int) -> None:
     assert np.abs(frame.pixels.astype(int) - expected).mean() < 4
 
 
+@pytest.mark.parametrize(
+    "options", [(), (cv2.IMWRITE_JPEG_PROGRESSIVE, 1), (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)]
+)
+@pytest.mark.parametrize("is_grey", [False, True])
+def test_jpegs_are_decoded_as_opencv_does(options: tuple[int, ...], is_grey: bool) -> None:
+    """Models were trained on its pixels."""
+    scene = _scene(320, 240)
+    data = _encode(scene[..., 0] if is_grey else scene, ".jpg", *options)
+    for reduction, flag in ((1, cv2.IMREAD_COLOR), (2, cv2.IMREAD_REDUCED_COLOR_2), (8, cv2.IMREAD_REDUCED_COLOR_8)):
+        expected = cv2.imdecode(np.frombuffer(data, np.uint8), flag)[..., ::-1]
+        assert np.array_equal(decode(data, max_reduction=reduction).pixels, expected)
+
+
+@pytest.mark.parametrize("damage", ["removed", "zeros", "end in the middle", "cut"])
+def test_a_jpeg_that_is_damaged_inside_is_refused_and_nothing_is_printed(
+    damage: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    data = _encode(np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8), ".jpg")
+    middle = len(data) // 2
+    damaged = {
+        "removed": data[:middle] + data[middle + 500 :],
+        "zeros": data[:middle] + bytes(400) + data[middle + 400 :],
+        "end in the middle": data[:middle] + b"\xff\xd9" + data[middle:],
+        "cut": data[:middle] + b"\xff\xd9",
+    }[damage]
+    with pytest.raises(ImageError, match=r"the JPEG is damaged \(Corrupt JPEG data: "):
+        decode(damaged)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_cameras_leave_in_jpegs_is_passed_over() -> None:
+    """A few bytes before the end, and what follows it."""
+    data = _encode(_scene(320, 240), ".jpg")
+    for odd in (data[:-2] + bytes(6) + data[-2:], data + b"some more"):
+        assert np.array_equal(decode(odd).pixels, decode(data).pixels)
+    with pytest.raises(ImageError, match="extraneous bytes before marker 0xd9"):
+        decode(data[:-2] + bytes(40) + data[-2:])
+
+
 def test_reduction_is_used_only_where_it_is_exact() -> None:
     assert decode(_encode(_scene(644, 484), ".jpg"), max_reduction=8).reduction == 4
     assert decode(_encode(_scene(641, 480), ".jpg"), max_reduction=8).reduction == 1

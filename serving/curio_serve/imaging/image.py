@@ -13,6 +13,7 @@ import numpy as np
 
 from curio_serve.errors import ImageError
 from curio_serve.imaging.image_header import Header, read_header
+from curio_serve.imaging.jpeg import decoded_jpeg
 from curio_serve.imaging.png import pixels_only
 
 MIN_SIDE_PX = 16
@@ -20,12 +21,6 @@ MAX_PIXELS = 1 << 25  # 33.5 million: 8K video fits
 MAX_FILE_BYTES = 1 << 28  # more than so many pixels of 8 bytes take without compression
 RawFormat = Literal["RGB8", "BGR8", "GRAY8"]
 
-_REDUCED = {
-    1: cv2.IMREAD_COLOR_RGB,
-    2: cv2.IMREAD_REDUCED_COLOR_2,
-    4: cv2.IMREAD_REDUCED_COLOR_4,
-    8: cv2.IMREAD_REDUCED_COLOR_8,
-}
 _QUARTER_TURNS = {1: 0, 3: 2, 6: 1, 8: 3}  # EXIF orientation to clockwise quarter turns
 
 
@@ -126,17 +121,25 @@ def _reduction(header: Header, max_reduction: int) -> int:
 
 
 def _decode_pixels(data: bytes, header: Header, reduction: int) -> np.ndarray:
+    if header.format == "jpeg":
+        pixels = decoded_jpeg(data, header.width, header.height, reduction)
+    else:
+        pixels = _decode_others(data, header)
+    expected = (header.height // reduction, header.width // reduction, 3)
+    if pixels.shape != expected or pixels.dtype != np.uint8:
+        raise ImageError(f"the {header.format.upper()} declares {expected} and holds {pixels.shape}; it is damaged")
+    return pixels
+
+
+def _decode_others(data: bytes, header: Header) -> np.ndarray:
     buffer = np.frombuffer(pixels_only(data) if header.format == "png" else data, np.uint8)
     try:
-        pixels = cv2.imdecode(buffer, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
+        pixels = cv2.imdecode(buffer, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as exc:
         raise ImageError(f"the {header.format.upper()} cannot be decoded: {exc.err}; send the file again") from exc
     if pixels is None:
         raise ImageError(f"the {header.format.upper()} is damaged and cannot be decoded; send the file again")
-    expected = (header.height // reduction, header.width // reduction, 3)
-    if pixels.shape != expected or pixels.dtype != np.uint8:
-        raise ImageError(f"the {header.format.upper()} declares {expected} and holds {pixels.shape}; it is damaged")
-    return pixels if reduction == 1 else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+    return pixels
 
 
 def from_raw(

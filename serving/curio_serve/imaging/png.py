@@ -33,11 +33,14 @@ def pixels_only(data: bytes) -> bytes:
         data: A whole PNG file, which :func:`~curio_serve.imaging.image_header.read_header` accepts.
 
     Raises:
-        ImageError: The image data unfolds to more than twice what the declared pixels take.
+        ImageError: A checksum does not fit, or the image data unfolds to more than twice what the declared pixels take.
     """
     found = list(chunks(data))
     view = memoryview(data)
     kept = [view[start - 8 : start + length + 4] for kind, start, length in found if kind in _KEPT]
+    # The decoder would find that out, too, and print it to the process's standard error.
+    if any(zlib.crc32(chunk[4:-4]) != int.from_bytes(chunk[-4:], "big") for chunk in kept):
+        raise ImageError("the PNG is damaged: a checksum does not fit its content; send the file again")
     packed = [view[start : start + length] for kind, start, length in found if kind == b"IDAT"]
     if sum(map(len, packed)) > _HARMLESS_BYTES:
         _check_unfolded(packed, _unfolded_bytes(data))
