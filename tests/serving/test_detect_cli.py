@@ -140,6 +140,13 @@ def test_nothing_is_written_over_the_images(models_dir: Path, frames: Path, tmp_
     assert {path: path.read_bytes() for path in before} == before
 
 
+def test_nothing_is_written_over_what_a_call_reads(models_dir: Path, frames: Path, camera: Path) -> None:
+    before = camera.read_bytes()
+    with pytest.raises(UsageError, match=r"--out .* is the file of --camera"):
+        detect(models_dir / "pinhole", frames, camera=camera, out=camera, overwrite=True)
+    assert camera.read_bytes() == before
+
+
 def test_models_whose_results_look_the_same_are_refused(models_dir: Path, frames: Path, tmp_path: Path) -> None:
     shutil.copytree(models_dir / "flat", tmp_path / "again" / "flat")
     with pytest.raises(UsageError, match=r"two models are flat/\d"):

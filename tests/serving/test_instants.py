@@ -46,6 +46,18 @@ def test_frames_of_recordings_go_together_by_their_stamps() -> None:
     assert len(told) == 1
 
 
+def test_frames_that_were_not_taken_together_do_not_go_together() -> None:
+    """Clocks that were set otherwise, one that nobody set, and one that jumps."""
+    pairs, told = paired(recorded("left", [0, 100, 200]), recorded("right", [1000, 1100]))
+    assert pairs == []
+    assert told[0].startswith("--rig: 3 images were taken at no other camera's time")
+    unset = [SourceImage("right@0", "right", recorded=RecordedAt("right", 0, 0, ""))]
+    assert paired(recorded("left", [0, 100]), unset)[0] == []
+    pairs, told = paired(recorded("left", [0, 100, 9000]), recorded("right", [0, 100, 200, 9020]))
+    assert pairs == [("0", "0"), ("100", "100"), ("9000", "9020")]
+    assert len(told) == 1
+
+
 def test_frames_of_videos_with_other_rates_go_together_by_their_times() -> None:
     pairs, told = paired(frames("left", [0, 0.04, 0.08, 0.12, 0.16]), frames("right", [0, 0.08, 0.16, 0.24]))
     assert pairs == [("0", "0"), ("2", "1"), ("4", "2")]
@@ -70,6 +82,9 @@ def test_files_that_are_numbered_alike_stay_so() -> None:
     missing = Instants([iter(files("a/1.png", "a/2.png")), iter(files("b/1.png", "b/3.png"))], LABELS)
     with pytest.raises(UsageError, match=r"a/2\.png and b/3\.png come together"):
         list(missing)
+    late = Instants([iter(files("a/0.png", "a/1.png")), iter(files("b/1.png", "b/2.png"))], LABELS)
+    with pytest.raises(UsageError, match=r"a/1\.png and b/2\.png come together"):
+        list(late)
     by_clock = Instants([iter(files("a/1001.png", "a/1012.png")), iter(files("b/1002.png", "b/1011.png"))], LABELS)
     assert len(list(by_clock)) == 2
 

@@ -81,6 +81,15 @@ def test_overwrite_starts_again(tmp_path: Path) -> None:
     assert path.read_bytes() == whole, "without any image there is nothing to overwrite it with"
 
 
+def test_images_without_a_name_in_the_format_cost_no_earlier_result(tmp_path: Path) -> None:
+    form = Bop({"ape": 1})
+    run(tmp_path / "out", form)
+    before = (tmp_path / "out").read_bytes()
+    with pytest.raises(UsageError, match="does not say its scene and image"):
+        run(tmp_path / "out", form, [Image("folder/frame.png")], overwrite=True)
+    assert (tmp_path / "out").read_bytes() == before
+
+
 @pytest.mark.parametrize("form", FORMATS)
 def test_other_images_are_refused_and_nothing_is_lost(form: ResultFormat, tmp_path: Path) -> None:
     path = tmp_path / "out"
@@ -102,6 +111,18 @@ def test_another_model_is_refused(form: ResultFormat, model: tuple[str, int], tm
         pytest.raises(UsageError, match="ape version 1; this is"),
     ):
         output.unanswered(iter(IMAGES))
+
+
+def test_other_options_are_refused_and_named(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    run(path, JsonLines({"reads": 3}), stop_after=2)
+    before = path.read_bytes()
+    assert b'"options": {"reads": 3}' in before
+    for options in ({}, {"reads": 3, "plane": "objects"}):
+        with pytest.raises(UsageError, match=r'other options: \{"reads": 3\} instead of \{'):
+            run(path, JsonLines(options))
+    assert path.read_bytes() == before
+    assert run(path, JsonLines({"reads": 3})).num_images == 6
 
 
 PAIR = [("ape", 1), ("can", 2)]

@@ -1,5 +1,6 @@
 """The server's life: starting, refusing to start, load, replacement, leaving; and who may call."""
 
+import itertools
 import shutil
 import signal
 import subprocess
@@ -7,7 +8,7 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ import onnx
 import pytest
 from curio_proto.v1 import detector_pb2 as pb
 from curio_proto.v1.detector_pb2_grpc import PoseDetectorStub
+from curio_serve.client import PoseClient
+from curio_serve.errors import Unavailable
 from curio_serve.server.server import _warn_of_little_memory
 from google.rpc import error_details_pb2
 from grpc_health.v1 import health_pb2, health_pb2_grpc
@@ -108,6 +111,35 @@ def test_accepted_requests_are_finished_before_it_leaves(
         with pytest.raises(grpc.RpcError) as caught:
             stub.Detect(SMALL_REQUEST, timeout=10)
         assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
+
+
+def test_a_stream_that_waits_for_a_frame_does_not_hold_up_a_server_that_stops(
+    start_server: StartServer, models_dir: Path
+) -> None:
+    server, over = start_server(models_dir, "--grace-s", "600"), threading.Event()
+
+    def one_frame() -> Iterator[pb.DetectRequest]:
+        yield SMALL_REQUEST
+        over.wait(60)
+
+    with grpc.insecure_channel(server.address) as channel:
+        answers = PoseDetectorStub(channel).DetectStream(one_frame(), timeout=60)
+        assert next(answers).width
+        assert server.stop() == 0
+        with pytest.raises(grpc.RpcError):
+            next(answers)
+        over.set()
+
+
+def test_a_stream_without_end_is_ended_after_a_frame_and_told_why(start_server: StartServer, models_dir: Path) -> None:
+    server = start_server(models_dir, "--grace-s", "4")
+    with PoseClient(server.address) as client:
+        answers = client.detect_stream(itertools.repeat(SMALL_REQUEST), timeout_s=60)
+        assert next(answers).width
+        server.process.send_signal(signal.SIGTERM)
+        with pytest.raises(Unavailable, match="the server stops; open the stream again"):
+            list(answers)
+    assert server.process.wait(30) == 0
 
 
 def test_a_server_that_loses_all_models_is_not_ready(

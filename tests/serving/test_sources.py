@@ -112,6 +112,18 @@ def test_pipes_devices_and_endless_files_are_errors_of_these_images(tmp_path: Pa
             image.read()
 
 
+def test_links_to_folders_are_named(tmp_path: Path) -> None:
+    touch(tmp_path, "scenes/a.png", "elsewhere/b.png")
+    (tmp_path / "scenes" / "more").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "scenes" / "round").symlink_to(tmp_path)
+    passed_over = PassedOver()
+    assert len(list(images([str(tmp_path / "scenes")], passed_over))) == 1
+    (told,) = passed_over.lines()
+    assert told.startswith("links to folders are not followed: ")
+    assert "more" in told
+    assert "round" in told
+
+
 def test_a_link_in_a_circle_is_an_error_of_its_own(tmp_path: Path) -> None:
     touch(tmp_path, "a.png", "z.png")
     (tmp_path / "link.png").symlink_to("link.png")

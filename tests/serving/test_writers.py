@@ -6,7 +6,8 @@ import json
 
 import pytest
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
-from curio_serve.batch.results.formats import Bop, Csv, ImageResult, JsonLines, bop_object_ids
+from curio_serve.batch.results.formats import Bop, Csv, ImageResult, JsonLines
+from curio_serve.bop import bop_object_ids
 from curio_serve.errors import UsageError
 
 QUARTER_TURN = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,11 @@ def test_a_model_of_another_mesh(subjects: Subjects, size: float, fault: str, st
     export(subjects.model, "0" * 64, load_mesh(subjects.mesh, "mm").diameter_m * size)
     (finding,) = alarms(subjects)
     assert (finding.fault, finding.state) == (fault, state)
+
+
+def test_the_models_own_mesh_in_another_unit(subjects: Subjects) -> None:
+    (finding,) = alarms(replace(subjects, mesh_unit="cm"))
+    assert (finding.fault, finding.state) == ("mesh unit", "bad")
 
 
 @pytest.mark.parametrize(

@@ -212,6 +212,17 @@ def test_a_network_is_finished_once_for_each_budget(tmp_path: Path, interruption
     assert stopped.state.progress.finished_step is None
 
 
+def test_a_signal_while_a_network_is_finished_ends_the_run(tmp_path: Path, interruption: Interruption) -> None:
+    learner = trainer(configuration(images=16))
+
+    def finish() -> None:
+        interruption.signum = 2
+
+    outcome = train(learner, RunFolder(tmp_path, learner.config), interruption, None, 60.0, finish=finish)
+    assert outcome is Outcome.INTERRUPTED
+    assert learner.state.progress.finished_step == learner.state.progress.step
+
+
 def test_a_signal_ends_a_run_after_a_whole_step(tmp_path: Path, cache: Path, interruption: Interruption) -> None:
     interruption.signum = 15
     outcome, _ = learn(configuration(images=800), tmp_path / "run", interruption, resume=False, cache=cache)

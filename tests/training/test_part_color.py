@@ -84,6 +84,11 @@ def test_where_photographs_do_not_tell_a_colour_none_is_found(folder: Path) -> N
     assert found_in(take(folder, [SRGB["red"]] * 8, confidence=0.0)) is None, "nothing but the background image"
     several = [SRGB["red"], SRGB["teal"], (0.2, 0.2, 0.9), (0.8, 0.8, 0.1)]
     assert found_in(take(folder, several * 3)) is None, "parts of several colours"
+    options = take(folder, [SRGB["red"]] * 6 + [SRGB["teal"]] * 2)
+    assert options.background is not None
+    mostly = find_color(options.photos, options.background, load_intrinsics(options.camera))
+    assert mostly is not None
+    assert (mostly.num_used, mostly.num_compared) == (6, 8)
     options = take(folder, [SRGB["red"]] * 4)
     random = np.random.default_rng(4)
     save(folder / "other.png", cv2.resize(random.random((6, 8, 3)), (WIDTH, HEIGHT)))

@@ -20,7 +20,7 @@ from curio_train.learning.runs.checkpoint import RunFolder
 from curio_train.learning.runs.interruption import Interruption
 from curio_train.learning.session import learn
 from curio_train.learning.state import TrainState
-from curio_train.scene_code import COLOR, CONFIDENCE
+from curio_train.scene_code import COLOR, CONFIDENCE, ROTATION_6D, TRANSLATION
 from curio_train.templates.build import template_network
 from curio_train.worlds import build
 from curio_train.worlds.options import CaptureOptions, LinemodOptions
@@ -179,3 +179,26 @@ def test_photographs_judge_parts_that_are_likely_there(
     assert found is not None
     assert found.summary["num_photographs"] == 4
     assert found.metrics["own_view_overlap"] == 0, "the photographs show the background alone"
+
+
+def test_parts_that_explain_a_photograph_are_drawn_however_unsure(
+    folder: Path, world: SeveralObjectsWorld, tmp_path: Path
+) -> None:
+    """Both are there; in the second and fourth photograph the unsure one is read elsewhere, and is left out."""
+    plate = torch.tensor([0.1, 0.8, 0.3])[:, None, None].expand(3, HEIGHT, WIDTH)
+    made = dict(world.sample(4, (5,))) | {CONFIDENCE: torch.ones(4, 2, 1)}
+    (tmp_path / "photos").mkdir()
+    for number, image in enumerate([plate, *world.render(made, plate.expand(4, -1, -1, -1))]):
+        pixels = (255 * image.flip(0).permute(1, 2, 0)).round().byte().numpy()
+        cv2.imwrite(str(tmp_path / ("plate.png" if number == 0 else f"photos/{number}.png")), pixels)
+    seen = build(options(folder, photos=tmp_path / "photos", background=tmp_path / "plate.png"))
+    read = made | {CONFIDENCE: torch.tensor([[0.3], [0.1]]).expand(4, 2, 1)}
+    elsewhere = {name: values.clone() for name, values in read.items()}
+    for name in (TRANSLATION, ROTATION_6D):
+        elsewhere[name][1::2, 1] = elsewhere[name][[0, 2], 1]
+    found, less = (judge(seen, lambda _, code=code: dict(code)) for code in (read, elsewhere))
+    assert found is not None
+    assert less is not None
+    assert found.metrics["own_view_overlap"] > 0.85
+    assert found.metrics["own_view_agreeing"] == 1
+    assert less.metrics["own_view_overlap"] < found.metrics["own_view_overlap"] - 0.1

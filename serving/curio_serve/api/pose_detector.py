@@ -17,7 +17,7 @@ from curio_serve.api.registration import only_message
 from curio_serve.api.rig_request import check_views, refuse_many_pixels, rig_view
 from curio_serve.api.status import CallLog, frame_error
 from curio_serve.api.streams import Streams
-from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, ModelNotFound
+from curio_serve.errors import ArgumentError, CallEnded, CurioError, ImageError, ModelNotFound, Unavailable
 from curio_serve.imaging import image
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector, check_min_confidence
@@ -73,6 +73,13 @@ class PoseService(PoseDetectorServicer):
                 stream.works()
                 yield self._frame_of_stream(request, following, context)
                 stream.waits()
+                if self._streams.are_ending:
+                    raise Unavailable("the server stops; open the stream again, and send what has no answer yet")
+
+    def end_streams(self, *, idle_alone: bool) -> None:
+        """End streams, because the server stops: those that wait for a frame, or each after its frame."""
+        self._streams.are_ending = not idle_alone
+        self._streams.end_idle()
 
     def ListModels(self, request: messages.ListModelsRequest, context: Context) -> messages.ListModelsResponse:
         with self._calls.record("ListModels", context):

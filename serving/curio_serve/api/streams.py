@@ -48,6 +48,8 @@ class Streams:
         self._most, self._most_of_peer = most, max(_LEAST, most // _FRACTION)
         self._lock = threading.Lock()
         self._open: dict[str, list[Stream]] = {}  # of each connection
+        self.are_ending = False
+        """Whether streams end after the frame that they work on."""
 
     def __len__(self) -> int:
         """Number of open streams."""
@@ -77,6 +79,13 @@ class Streams:
         if not call.add_callback(partial(self._close, stream)):
             self._close(stream)
         return stream
+
+    def end_idle(self) -> None:
+        """Close the streams that wait for a frame, because the server stops."""
+        with self._lock:
+            idle = [stream for streams in self._open.values() for stream in streams if stream.idle_s > _IDLE_S]
+        for stream in idle:
+            stream.call.cancel()
 
     def _replaceable(self, num_own: int) -> Stream:
         """The idle stream that may be closed in favour of a connection with so many streams."""

@@ -9,6 +9,11 @@ import tyro
 from curio_serve.cores import num_cores
 from curio_serve.errors import UsageError
 
+_OF_ANSWERS = (
+    *("objects", "min_confidence", "max_detections", "max_instances"),
+    *("reads", "plane", "refine", "exif_rotation"),
+)
+
 
 @dataclass(frozen=True)
 class DetectArguments:
@@ -112,3 +117,9 @@ class DetectArguments:
         if not all(names):
             raise UsageError(f"--objects {self.objects}: expected names with commas between them, such as ape,can")
         return tuple(dict.fromkeys(names))
+
+    @property
+    def changed_options(self) -> dict[str, object]:
+        """The options that change answers, where they are not the default: each line of a result file has them."""
+        given = {name: getattr(self, name) for name in _OF_ANSWERS}
+        return {name: value for name, value in given.items() if value != getattr(DetectArguments, name)}

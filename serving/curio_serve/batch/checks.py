@@ -24,6 +24,9 @@ from curio_serve.models.repeated import MAX_READS
 from curio_serve.planes.camera_poses import CameraPoseFile
 from curio_serve.planes.plane import FIND_PLANE
 
+_READ = ("--camera", "--plane", "--rig", "--token-file", "--server-ca", "--tls-certificate", "--tls-key")
+"""Flags of files that a call reads."""
+
 
 def check_numbers(arguments: DetectArguments) -> None:
     """Refuse flags that contradict each other, and numbers out of range.
@@ -161,7 +164,7 @@ def refuse_server_flags(arguments: DetectArguments, models: Sequence[str]) -> No
 
 
 def refuse_images(arguments: DetectArguments) -> None:
-    """Refuse to write results over an image, a video or a recording.
+    """Refuse to write results over an image, a video, a recording, or another file that the call reads.
 
     Raises:
         UsageError: ``--out`` is one.
@@ -172,5 +175,9 @@ def refuse_images(arguments: DetectArguments) -> None:
     paths = (path for name in arguments.images if not is_url(name) for path in matching_paths(name))
     if any(os.path.samefile(path, out) for path in paths):
         raise UsageError(f"--out {out} is one of the images; choose another file")
+    read = {flag: getattr(arguments, flag.lstrip("-").replace("-", "_")) for flag in _READ}
+    for flag, path in [*read.items(), *(("--mesh", mesh) for mesh in arguments.mesh)]:
+        if path is not None and os.path.exists(path) and os.path.samefile(path, out):
+            raise UsageError(f"--out {out} is the file of {flag}; choose another file")
     if os.path.isfile(out) and Path(out).suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES:
         raise UsageError(f"--out {out} is an image or a video; choose another file")

@@ -22,8 +22,11 @@ if TYPE_CHECKING:
 
     from curio_serve.batch.estimators import Estimator, Settings
     from curio_serve.batch.images.source_image import SourceImage
+    from curio_serve.batch.progress import Progress
     from curio_serve.batch.results.formats import ImageLines, ResultFormat
-    from curio_serve.batch.results.recorded_poses import Detection3DArrays
+    from curio_serve.batch.results.recorded_poses import Detection3DArrays, PoseRecording
+    from curio_serve.batch.results.result_file import ResultFile
+    from curio_serve.batch.results.result_parts import ResultParts
     from curio_serve.client import PoseClient
     from curio_serve.planes.camera_poses import GivenPlane
 
@@ -66,7 +69,6 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.images.source_image import Topics
     from curio_serve.batch.images.sources import STANDARD_INPUT, PassedOver, check_arguments, images
     from curio_serve.batch.output import open_output, result_format
-    from curio_serve.batch.progress import Progress
     from curio_serve.batch.refinement import outlining, refining
     from curio_serve.batch.rig_images import run_rig
     from curio_serve.batch.tracked import check_tracking, from_the_first, timed
@@ -108,7 +110,7 @@ def run(arguments: DetectArguments) -> int:
             results = over_cluster(arguments.ray, partial(_answering, placed, there, settings), remaining)
         with (
             closing(results),
-            Progress(output.num_images, output.num_errors, is_shown=arguments.out is not None) as progress,
+            _progress(arguments, output) as progress,
         ):
             for result in results:
                 output.write(result)
@@ -172,6 +174,13 @@ def _settings(arguments: DetectArguments) -> "Settings":
         arguments.object_names,
         _plane(arguments),
     )
+
+
+def _progress(arguments: DetectArguments, output: "ResultFile | ResultParts | PoseRecording") -> "Progress":
+    from curio_serve.batch.progress import Progress
+
+    before = output.num_images, output.num_errors
+    return Progress(*before, is_shown=arguments.out is not None, are_compared=arguments.format == "jsonl")
 
 
 def _plane(arguments: DetectArguments) -> "GivenPlane":

@@ -13,6 +13,7 @@ from curio_serve.errors import UsageError
 from curio_serve.rigs.rig import RigCamera
 
 _NUMBER = re.compile(r"\d+")
+_FARTHEST_S = 0.5  # between images of one instant: what moves is elsewhere by then, and what lies is seen again
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ class Unpaired:
 class Instants:
     """The images of each instant.
 
-    Frames of recordings and videos have times, and those that are nearest in time go together. Files have none: those
-    of each camera are taken in the order of their names.
+    Frames of recordings and videos have times, and those that are nearest in time go together, half a second apart at
+    most. Files have none: those of each camera are taken in the order of their names.
     """
 
     cameras: Sequence[Iterator[SourceImage]]
@@ -78,7 +79,7 @@ class Instants:
         return self._by_time([image for image in first if image is not None])
 
     def _by_order(self, first: Sequence[SourceImage | None]) -> Iterator[RigImage]:
-        has_numbers = len({_number(image) for image in first if image is not None}) == 1
+        has_numbers, before = len({_number(image) for image in first if image is not None}) == 1, [""]
         for count, found in enumerate(chain((tuple(first),), zip_longest(*self.cameras))):
             there = [image for image in found if image is not None]
             if not there:
@@ -88,7 +89,10 @@ class Instants:
                 raise UsageError(
                     f"--rig: {ended} has {count} images, others have more; expected as many of each camera"
                 )
-            if has_numbers and len({_number(image) for image in there}) > 1:
+            numbers = [_number(image) for image in there]
+            is_behind = any(number and number in before for number in numbers)  # another camera had it an instant ago
+            before = numbers
+            if len({*numbers}) > 1 and (has_numbers or is_behind):
                 names = " and ".join(image.name for image in there)
                 raise UsageError(f"--rig: {names} come together and have other numbers; is an image missing before?")
             yield RigImage(tuple(there))
@@ -101,12 +105,16 @@ class Instants:
                 while (then := following[number]) is not None and _is_nearer(then, heads[number], latest):
                     self.unpaired.count(heads[number])
                     heads[number], following[number] = then, next(camera, None)
-            yield RigImage(tuple(heads))
-            if any(then is None for then in following):
-                self.unpaired.ended = self.labels[following.index(None)] if any(following) else ""
-                return
-            heads = [then for then in following if then is not None]
-            following = [next(camera, None) for camera in self.cameras]
+            early = [number for number, head in enumerate(heads) if _is_early(head, latest)]
+            for number in early:
+                self.unpaired.count(heads[number])
+            if not early:
+                yield RigImage(tuple(heads))
+            for number in early or range(len(heads)):
+                if (then := following[number]) is None:
+                    self.unpaired.ended = self.labels[number] if early or any(following) else ""
+                    return
+                heads[number], following[number] = then, next(self.cameras[number], None)
 
 
 def refuse_other_images(arguments: Sequence[str], cameras: Sequence[RigCamera]) -> None:
@@ -145,6 +153,12 @@ def _is_nearer(then: SourceImage, now: SourceImage, latest: float) -> bool:
     """Whether a camera's next image is nearer in time; one that is damaged has no time, and is never."""
     at_s, now_s = _time_s(then), _time_s(now)
     return at_s is not None and now_s is not None and abs(at_s - latest) < abs(now_s - latest)
+
+
+def _is_early(image: SourceImage, latest: float) -> bool:
+    """Whether an image was taken too long before another camera's; one that is damaged has no time, and was not."""
+    at_s = _time_s(image)
+    return at_s is not None and latest - at_s > _FARTHEST_S
 
 
 def _number(image: SourceImage) -> str:

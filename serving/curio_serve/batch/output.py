@@ -11,9 +11,10 @@ from curio_serve.batch.estimators import Estimator
 from curio_serve.batch.images.remote_files import is_url
 from curio_serve.batch.images.source_image import SourceImage
 from curio_serve.batch.images.sources import is_recording, names_recordings
-from curio_serve.batch.results.formats import Bop, Csv, JsonLines, ResultFormat, bop_object_ids
+from curio_serve.batch.results.formats import Bop, Csv, JsonLines, ResultFormat
 from curio_serve.batch.results.result_file import ResultFile, values_of
 from curio_serve.batch.results.result_parts import ResultParts
+from curio_serve.bop import bop_object_ids
 from curio_serve.errors import CameraError, UsageError
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def result_format(arguments: DetectArguments, estimators: Sequence[Estimator]) -
 
         return Detection3DArrays([kind for estimator in estimators for kind in estimator.spec.objects])
     if arguments.format == "jsonl":
-        return JsonLines()
+        return JsonLines(arguments.changed_options)
     if arguments.format == "csv":
         return Csv()
     for estimator in estimators:

@@ -32,13 +32,14 @@ class Progress:
         num_before: Images answered by earlier runs.
         num_errors_before: Of these, without an answer.
         is_shown: Whether there may be a bar at all; it appears on a terminal alone.
+        are_compared: Whether answers of earlier runs are known to be of the same options.
     """
 
-    def __init__(self, num_before: int, num_errors_before: int, *, is_shown: bool) -> None:
+    def __init__(self, num_before: int, num_errors_before: int, *, is_shown: bool, are_compared: bool = False) -> None:
         self._bar = _started(num_before, num_errors_before) if is_shown and sys.stderr.isatty() else None
-        self._num_before = num_before
+        self._num_before, self._are_compared = num_before, are_compared
         self._num_new = 0
-        self._num_errors = num_errors_before
+        self._num_errors = self._num_errors_before = num_errors_before
         self._turned, self._wide, self._least_searched = _Some(), _Some(), 1.0
         self._problems: list[str] = []
         self._start_s = time.perf_counter()
@@ -72,8 +73,11 @@ class Progress:
         _say(
             f"{_counted(self._num_new)}{before} in {seconds:.1f} s ({self._num_new / seconds:.1f} images/s) to {label}"
         )
-        if self._num_before:
+        if self._num_before and not self._are_compared:
             _say("answers of earlier runs stay as they are, whatever flags they had; --overwrite answers all again")
+        elif self._num_errors_before:
+            before = _counted(self._num_errors_before, "has", "have")
+            _say(f"{before} no answer in earlier runs and was not tried again; --overwrite answers all again")
         if self._turned.num:
             _say(
                 f"{_counted(self._turned.num, 'has', 'have')} an EXIF rotation that was not applied (first: "

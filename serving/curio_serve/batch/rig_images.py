@@ -150,7 +150,11 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
     except ArgumentError as exc:
         raise UsageError(f"--objects: {exc}") from exc
     estimators = [RigEstimator(model, cameras, arguments.min_confidence, arguments.max_detections) for model in opened]
-    form, passed_over, topics = JsonLines(), PassedOver(), Topics(arguments.topic, arguments.info_topic)
+    form, passed_over, topics = (
+        JsonLines(arguments.changed_options),
+        PassedOver(),
+        Topics(arguments.topic, arguments.info_topic),
+    )
     names = [(model.name, model.version) for model in opened]
     path = None if arguments.out is None else Path(arguments.out)
     first = values_of(cameras[0].camera)
@@ -158,7 +162,10 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
         taken = Instants([images([one], passed_over, topics) for one in arguments.images], arguments.images)
         remaining = output.unanswered(iter(taken))
         results = in_order(partial(answer_instant, estimators, form), remaining, arguments.jobs)
-        with closing(results), Progress(output.num_images, output.num_errors, is_shown=path is not None) as progress:
+        with (
+            closing(results),
+            Progress(output.num_images, output.num_errors, is_shown=path is not None, are_compared=True) as progress,
+        ):
             for result in results:
                 output.write(result)
                 progress.count(result)

@@ -4,6 +4,7 @@ import contextlib
 import logging
 import socket
 import threading
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -44,6 +45,7 @@ _MEMORY_USED = 0.8  # of a container's memory, beyond which streams are ended
 _MEMORY_OF_MODELS = 0.6  # of it, beyond which little is left for requests
 _DEVICE_BATCH = 8  # of a GPU provider
 _HEARING_S = 1.0
+_DRAINING_S = 0.2
 
 
 class PoseServer:
@@ -68,6 +70,15 @@ class PoseServer:
         self._inference = InferenceService(self._repository, self._work, self._metrics)
         self._server: grpc.Server | None = None
         self._stopped = threading.Event()
+        limits = Limits(
+            config.max_pixels,
+            config.max_regions,
+            config.max_models,
+            config.max_streams,
+            config.min_confidence,
+            config.full_decode,
+        )
+        self._pose = PoseService(self._repository, self._work, limits, self._metrics)
 
     def start(self) -> list[str]:
         """Load the models and open the ports.
@@ -116,17 +127,8 @@ class PoseServer:
             options=channel_options(config),
             maximum_concurrent_rpcs=config.max_calls,
         )
-        limits = Limits(
-            config.max_pixels,
-            config.max_regions,
-            config.max_models,
-            config.max_streams,
-            config.min_confidence,
-            config.full_decode,
-        )
-        pose = PoseService(self._repository, self._work, limits, self._metrics)
         receive = self._reception.receive
-        register(server, _POSE, pose, receive, unread=["Detect"])
+        register(server, _POSE, self._pose, receive, unread=["Detect"])
         register(server, _INFERENCE, self._inference, receive, unread=["ModelInfer"])
         register(server, _HEALTH, self._health, receive)
         names = [service.full_name for service in (_POSE, _INFERENCE, _HEALTH, _REFLECTION)]
@@ -187,13 +189,15 @@ class PoseServer:
         self._stopped.set()
 
     def _drain(self) -> None:
-        """Refuse new calls and let accepted ones finish."""
+        """Refuse new calls and let accepted ones finish; streams, which have no end, in half of the time."""
         if self._server is None:
             return
         log(logging.INFO, "draining", grace_s=self.config.grace_s)
         self._inference.drain()
         self._health.enter_graceful_shutdown()
-        self._server.stop(self.config.grace_s).wait()
+        drained, begun_s = self._server.stop(self.config.grace_s), time.monotonic()
+        while not drained.wait(_DRAINING_S):
+            self._pose.end_streams(idle_alone=time.monotonic() - begun_s < self.config.grace_s / 2)
         self._reception.stop()
 
     def _watch(self) -> None:

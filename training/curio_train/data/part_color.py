@@ -25,6 +25,7 @@ _CLEARLY = 0.5  # of the strongest difference: a shadow beside a part is weaker
 _LEAST_AREA, _LARGEST_AREA = 0.001, 0.4  # of the frame
 _LEAST_UNSHADED = 0.2  # of all that differs; below it the part itself is a grey like a shadow
 _WELL_LIT = 0.9  # quantile of the photographs' values: shadows darken some, nothing makes paint lighter
+_LEAST_AGREEING = 0.5  # of those that show something
 _LARGEST_SPREAD = 0.12  # of the photographs' tints, as fractions of the largest channel
 
 
@@ -66,17 +67,18 @@ def find_color(photos: Path, background_image: Path, camera: Intrinsics) -> Foun
     if len(seen) < max(_FEWEST, _LEAST_FRACTION * len(chosen)):
         return None
     agreed = _consensus(seen)
-    return None if agreed is None else FoundColor(_hex(agreed), len(seen), len(chosen))
+    return None if agreed is None else FoundColor(_hex(agreed[0]), agreed[1], len(chosen))
 
 
-def _consensus(colors: Sequence[np.ndarray]) -> np.ndarray | None:
-    """The median tint of linear colours, well lit, [3] sRGB, unless their tints are those of several parts."""
+def _consensus(colors: Sequence[np.ndarray]) -> tuple[np.ndarray, int] | None:
+    """The median tint of linear colours, well lit, [3] sRGB, and how many agree on it; None where too few do."""
     srgb = srgb_from_linear(torch.from_numpy(np.stack(colors))).numpy()
     tints = srgb / srgb.max(axis=1, keepdims=True).clip(1e-3)
     tint: np.ndarray = np.median(tints, axis=0)
-    if np.median(np.abs(tints - tint).max(axis=1)) > _LARGEST_SPREAD:
+    num_agreeing = int((np.abs(tints - tint).max(axis=1) <= _LARGEST_SPREAD).sum())
+    if num_agreeing < _LEAST_AGREEING * len(colors):
         return None
-    return tint / tint.max() * np.quantile(srgb.max(axis=1), _WELL_LIT)
+    return tint / tint.max() * np.quantile(srgb.max(axis=1), _WELL_LIT), num_agreeing
 
 
 def _color_of_piece(frame: np.ndarray, background_image: np.ndarray) -> np.ndarray | None:

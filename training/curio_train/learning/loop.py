@@ -64,8 +64,9 @@ def train(
                     run.save(trainer.state)
                     reporter.pictures(trainer.pairs())
                 saved_at = seconds
-            if outcome:
-                return outcome
+            if outcome:  # a signal may have come while the confidence was calibrated
+                _, signalled = ranks.largest(0.0, interruption.signum or 0)
+                return Outcome.INTERRUPTED if signalled else outcome
             trainer.synthetic.update_pseudo_labels(spent)
             losses = trainer.step(learning_rate_factor(config.recipe, progress.step, spent))
             progress.seconds, clock = progress.seconds + time.monotonic() - clock, time.monotonic()

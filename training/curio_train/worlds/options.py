@@ -261,6 +261,8 @@ class CaptureOptions(WorldOptions):
     def _check_names(self) -> None:
         if len({file.stem for file in self.mesh}) < len(self.mesh):
             raise UsageError(f"--mesh {' '.join(map(str, self.mesh))}: parts are named after their files: rename one")
+        if odd := next((file for file in self.mesh if "," in file.stem), None):
+            raise UsageError(f"--mesh {odd}: parts are named after their files, and --objects has commas between names")
 
     def _given_flags(self, names: tuple[str, ...]) -> str:
         """The flags of these fields whose values are not the defaults."""

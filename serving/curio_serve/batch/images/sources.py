@@ -49,7 +49,7 @@ class PassedOver:
 
     def __init__(self) -> None:
         self._num_files, self._has_heic = 0, False
-        self._first, self._empty = list[str](), list[str]()
+        self._first, self._empty, self._links = list[str](), list[str](), list[str]()
 
     def file(self, name: str) -> None:
         """Count a file that is no image."""
@@ -62,8 +62,16 @@ class PassedOver:
         """Count a folder in which no image lies, at any depth."""
         self._empty.append(path)
 
+    def link(self, name: str) -> None:
+        """Count a link to a folder, which may lead round in a circle."""
+        self._links.append(name)
+
     def lines(self) -> Iterator[str]:
         """The summary, in lines."""
+        if self._links:
+            more = ", …" if len(self._links) > _NAMED else ""
+            named = ", ".join(self._links[:_NAMED]) + more
+            yield f"links to folders are not followed: {named}; name these folders, too, if they hold images"
         yield from (f"{path} holds no image" for path in self._empty)
         if self._num_files:
             unnamed = self._num_files - len(self._first)
@@ -253,7 +261,9 @@ def _entries_after(folder: str, last: _Place | None, passed_over: PassedOver) ->
             is_hidden, is_folder = entry.name.startswith("."), entry.is_dir(follow_symlinks=False)
             is_image = not is_hidden and os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES
             leads_to_folder = _leads_to_folder(entry)
-            if not is_image and last is None and not leads_to_folder:  # in the first pass alone
+            if last is None and leads_to_folder and not is_folder:  # in the first pass alone
+                passed_over.link(entry.name)
+            elif last is None and not is_image and not leads_to_folder:
                 passed_over.file(entry.name)
             if (is_folder and not is_hidden) or (is_image and not leads_to_folder):
                 place = _place(entry.name)

@@ -13,12 +13,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import PurePath
+from types import MappingProxyType
 
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
 
 from curio_serve.batch.images.source_image import RecordedAt
 from curio_serve.batch.results.detection_json import STATUS, detection_json, finite, rows
-from curio_serve.bop import LINEMOD_IDS
 from curio_serve.errors import UsageError
 
 
@@ -107,6 +107,8 @@ class Line:
     """Whether the image had no answer."""
     camera: tuple[float, ...] = ()
     """K row after row and then the distortion, where the format has it and the stored pixels were not turned."""
+    options: Mapping[str, object] | None = None
+    """With which the image was answered, where the format has them."""
 
 
 class ResultFormat(ABC):
@@ -120,6 +122,8 @@ class ResultFormat(ABC):
     """Whether images without detections have a line, too."""
     is_one_line_an_image: bool = False
     """Whether each image has exactly one line of each model."""
+    options: Mapping[str, object] | None = None
+    """Options of the call that its lines hold; None where the format has no place for them."""
 
     def lines(self, results: Sequence[ImageResult]) -> ImageLines:
         """Format the lines of an image, those of one model after those of another."""
@@ -149,11 +153,17 @@ class JsonLines(ResultFormat):
     """One JSON object an image, always with the same keys; ``error`` stands in place of ``detections``.
 
     What does not apply (the rotation of a flat object, the size of what is no image) is null. ``views``,
-    ``cam_from_rig``, ``distortion``, ``exif_rotation`` and ``plane`` are there only where they apply.
+    ``cam_from_rig``, ``distortion``, ``exif_rotation``, ``plane`` and ``options`` are there only where they apply.
+
+    Args:
+        options: Of the call: those that change answers and are not the default.
     """
 
     opening = b'{"image": '
     is_one_line_an_image = True
+
+    def __init__(self, options: Mapping[str, object] = MappingProxyType({})) -> None:
+        self.options = dict(options)
 
     def encode(self, result: ImageResult) -> bytes:
         answer: dict[str, object] = {"detections": [detection_json(detection) for detection in result.detections]}
@@ -170,6 +180,7 @@ class JsonLines(ResultFormat):
             "light": result.light or None,
             **({"plane": result.plane} if result.plane else {}),
             "model": {"name": result.model, "version": result.version},
+            **({"options": self.options} if self.options else {}),
             "milliseconds": {"decode": _rounded(result.decode_ms), "inference": _rounded(result.inference_ms)},
         }
         return json.dumps(record, allow_nan=False).encode() + b"\n"
@@ -185,7 +196,8 @@ class JsonLines(ResultFormat):
             is_stored = record.get("camera_matrix") and not record.get("exif_rotation") and "error" not in record
             values = (*chain(*record["camera_matrix"]), *record.get("distortion", ())) if is_stored else ()
             camera = tuple(float(value) for value in values)
-            return Line(key, opens_image=True, model=model, is_error="error" in record, camera=camera)
+            options = dict(record.get("options", {}))
+            return Line(key, opens_image=True, model=model, is_error="error" in record, camera=camera, options=options)
         except (KeyError, TypeError) as exc:
             raise ValueError("no image or model in it") from exc
 
@@ -283,32 +295,6 @@ class Bop(ResultFormat):
             raise ValueError(f"object id {number}, which this model does not find")
         # the format has no mark for the first row of an image: the file's reader sees the key change
         return Line(f"{int(scene)},{int(image)}", opens_image=False)
-
-
-def bop_object_ids(objects: Sequence[str], given: int | None) -> dict[str, int]:
-    """BOP's number of each object of a model.
-
-    Args:
-        objects: Names in the model's spec.
-        given: What ``--obj-id`` says; None: look the names up among LineMOD's classes.
-
-    Raises:
-        UsageError: A number is missing, or one was given for several objects.
-    """
-    if given is not None:
-        if len(objects) != 1:
-            raise UsageError(
-                f"--obj-id {given} names one object, the model finds {len(objects)}: {', '.join(objects)}; "
-                "choose one of them with --objects"
-            )
-        return {objects[0]: given}
-    unknown = [name for name in objects if name not in LINEMOD_IDS]
-    if unknown:
-        raise UsageError(
-            f"--format bop needs the object id of {', '.join(unknown)}: expected a LineMOD class "
-            f"({', '.join(LINEMOD_IDS)}) or --obj-id NUMBER{' with --objects NAME' * (len(objects) > 1)}"
-        )
-    return {name: LINEMOD_IDS[name] for name in objects}
 
 
 def _detection_cells(detection: Detection | None) -> Iterator[object]:

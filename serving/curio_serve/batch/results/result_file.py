@@ -6,6 +6,7 @@ beginning of that list, in order. The torn end is cut off and the rest of the im
 is the one that an uninterrupted run would have written. Neither the file nor the list is ever held in memory.
 """
 
+import json
 import os
 import stat
 from collections.abc import Callable, Iterator, Sequence
@@ -95,6 +96,7 @@ class ResultFile:
             first = next(images, None)
             if first is None:
                 return images  # earlier results are worth more than none
+            self._form.key(first.name)  # which may be no name in this format
             os.ftruncate(self._descriptor, 0)
             images = chain((first,), images)
         if self._is_regular:
@@ -171,6 +173,9 @@ class ResultFile:
             raise self._mismatch(number, f"what this format does not write ({exc})") from exc
         if record.model is not None and record.model not in self._models:
             raise self._mismatch(number, f"results of model {_label([record.model])}; this is {_label(self._models)}")
+        if record.options is not None and record.options != self._form.options:
+            before, now = (json.dumps(options) for options in (record.options, self._form.options))
+            raise self._mismatch(number, f"answers with other options: {before} instead of {now}")
         return record
 
     def _take(self, last: "_Image", images: Iterator[NamedT], number: int) -> None:
@@ -203,8 +208,8 @@ class ResultFile:
 
     def _mismatch(self, number: int, found: str) -> UsageError:
         return UsageError(
-            f"cannot go on with {self.label}: line {number} holds {found}. Give the same images, camera, model and "
-            "format as before, another --out, or --overwrite to replace the file."
+            f"cannot go on with {self.label}: line {number} holds {found}. Give the same images, camera, model, "
+            "options and format as before, another --out, or --overwrite to replace the file."
         )
 
 

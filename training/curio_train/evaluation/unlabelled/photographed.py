@@ -41,7 +41,7 @@ _NAMES = ("own_view", "second_view")
 _AGREES = {"overlap": 0.75, "explained": 0.4}
 _NUM_IN_SPACE = 48
 _DRAWN_AT_ONCE = 8  # frames of a camera are larger than images of a plane
-_LIKELY = 0.5  # confidence from which several parts are drawn in free space
+_LIKELY = 0.5  # confidence from which parts are drawn in free space, whether they explain the photograph or not
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,10 +130,9 @@ def _in_space(
     world: World, predict: Predict, names: Sequence[str], photographs: Tensor, background_image: Tensor | None
 ) -> Judgement:
     code = dict(predict((photographs * 255).round().byte()))
-    if CONFIDENCE in code:  # the likeliest is drawn however unsure: whether it is right is the question
-        likeliest = code[CONFIDENCE] == code[CONFIDENCE].amax(dim=1, keepdim=True)
-        code[CONFIDENCE] = (likeliest | (code[CONFIDENCE] >= _LIKELY)).to(code[CONFIDENCE])
     differs = None if background_image is None else _differing(photographs, background_image)
+    if CONFIDENCE in code:
+        code[CONFIDENCE] = _shown(world, code, photographs, background_image, differs)
     agreed, images, masks = _agreement(world, code, photographs, background_image, differs)
     measure = "explained" if background_image is None else "overlap"
     order = agreed[measure].argsort()
@@ -150,6 +149,33 @@ def _in_space(
     }
     captions = [f"{names[row]}\n{text}" for row, text in zip(order.tolist(), _captions(agreed, order), strict=True)]
     return Judgement(metrics, verdict, columns, captions)
+
+
+def _shown(
+    world: World, code: SceneCode, photographs: Tensor, background_image: Tensor | None, differs: Tensor | None
+) -> Tensor:
+    """Which parts are drawn, 0 or 1, as the code's confidence.
+
+    The likeliest is, however unsure: whether it is right is the question. So are all that are likely. Of the others,
+    one after the other, those with which the drawing agrees better: a right part may have a low confidence where
+    renderings calibrate it, and which parts a photograph shows is not known.
+    """
+    confidence, num = code[CONFIDENCE], code[CONFIDENCE].shape[1]
+    ranks = confidence.argsort(dim=1, descending=True).argsort(dim=1)
+    shown = (ranks == 0) | (confidence >= _LIKELY)
+    measure = "explained" if differs is None else "overlap"
+
+    def agreement(of_shown: Tensor) -> Tensor:
+        drawn = dict(code) | {CONFIDENCE: of_shown.to(confidence)}
+        return _agreement(world, drawn, photographs, background_image, differs)[0][measure]
+
+    best = agreement(shown) if num > 1 else confidence
+    for rank in range(1, num):
+        more = shown | (ranks == rank)
+        found = agreement(more)
+        shown = torch.where((found > best)[:, None, None], more, shown)
+        best = torch.maximum(best, found)
+    return shown.to(confidence)
 
 
 def _differing(photographs: Tensor, background_image: Tensor) -> Bool[Tensor, "num height width"]:
