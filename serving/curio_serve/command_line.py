@@ -84,11 +84,16 @@ def with_lists_joined(given: Sequence[str], lists: Sequence[str]) -> list[str]:
     Args:
         given: As typed: ``--mesh a --mesh b`` as well as ``--mesh a b``.
         lists: The flags, with their dashes.
+
+    Raises:
+        SystemExit: Such a flag has no value.
     """
     repeated = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for flag in lists:
         repeated.add_argument(flag, dest=flag, nargs="*", action="extend")
     values, others = repeated.parse_known_args(given)
+    if empty := next((flag for flag, typed in vars(values).items() if typed == []), None):
+        repeated.exit(2, f"error: {empty}: found no value, expected one or several\n")
     return [*others, *(word for flag, typed in vars(values).items() if typed is not None for word in (flag, *typed))]
 
 

@@ -57,6 +57,25 @@ def test_good_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.usefixtures("one_thread")  # which the timing would change
+def test_every_mesh_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trimesh.creation.box((80, 40, 20)).export(tmp_path / "good.stl")
+    trimesh.creation.box((30, 30, 60)).export(tmp_path / "other.stl")
+    good, other, missing = (str(tmp_path / name) for name in ("good.stl", "other.stl", "missing.stl"))
+    for meshes, status in (
+        (["--mesh", good, other], 0),
+        (["--mesh", missing, "--mesh", good], 1),
+        (["--mesh", good, missing], 1),
+    ):
+        with pytest.raises(SystemExit) as caught:
+            doctor_command.doctor([*meshes, "--mesh-unit", "mm", "--cache", str(tmp_path)])
+        assert caught.value.code == status
+        told = capsys.readouterr().out
+        assert all(name in told for name in meshes if name != "--mesh")
+    with pytest.raises(SystemExit):
+        doctor_command.doctor(["--mesh", good, other, "--mesh-unit", "mm", "--symmetries", str(tmp_path / "new.json")])
+    assert "is for one --mesh, found 2" in capsys.readouterr().err
+
+
 def test_a_fit_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Training is timed in this process: in small steps, from few images and of a coarse sphere."""
     of_its_own = abilities._trial

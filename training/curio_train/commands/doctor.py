@@ -1,6 +1,7 @@
 """The command ``curio-doctor``. Heavy packages are imported only once its arguments are understood."""
 
 import dataclasses
+import itertools
 import os
 import sys
 from collections.abc import Sequence
@@ -19,10 +20,10 @@ from curio_train.errors import UsageError
 class DoctorCommand:
     """Check the mesh, camera file, photographs and model that are named; without any, this machine."""
 
-    mesh: Path | None = None
-    """Mesh file: PLY, OBJ, STL, glTF, OFF, STEP or IGES."""
+    mesh: tuple[Path, ...] = ()
+    """Mesh file: PLY, OBJ, STL, glTF, OFF, STEP or IGES; of several parts all of them."""
     mesh_unit: Literal["m", "cm", "mm", "inch"] | None = None
-    """Unit of its coordinates; the file's own, or metres, unless given."""
+    """Unit of the coordinates; the file's own, or metres, unless given."""
     body: str | None = None
     """Name of the one body of a STEP or IGES file to take, in its own frame; all of them, as placed, unless given."""
     camera: Path | None = None
@@ -41,15 +42,15 @@ class DoctorCommand:
 
 def doctor(arguments: Sequence[str] | None = None) -> None:
     """``curio-doctor …``: exit status 1 where something will not work."""
-    command = parsed(DoctorCommand, arguments, "curio-doctor")
+    command = parsed(DoctorCommand, arguments, "curio-doctor", lists=("--mesh",))
     sys.exit(answer(lambda _: _examine(command)))
 
 
 def _examine(command: DoctorCommand) -> int:
-    from curio_train.doctor.examine import Subjects, examine, save_symmetries
+    from curio_train.doctor.examine import Subjects, examine, examine_files, save_symmetries
 
     for flag in ("symmetries", "mesh_unit", "body"):
-        if getattr(command, flag) is not None and command.mesh is None:
+        if getattr(command, flag) is not None and not command.mesh:
             name = f"--{flag.replace('_', '-')}"
             raise UsageError(f"{name} {getattr(command, flag)}: found no --mesh that it is about; add that")
     if command.symmetries is not None and os.path.lexists(command.symmetries):
@@ -59,11 +60,17 @@ def _examine(command: DoctorCommand) -> int:
         )
     colours = {"good": "green", "warning": "yellow", "bad": "bold red"}
     console, status = Console(highlight=False, soft_wrap=True), 0
-    names = [field.name for field in dataclasses.fields(Subjects)]
-    for finding in examine(Subjects(**{name: getattr(command, name) for name in names}), command.cache):
+    if command.symmetries is not None and len(command.mesh) > 1:
+        raise UsageError(f"--symmetries {command.symmetries} is for one --mesh, found {len(command.mesh)}")
+    names = [field.name for field in dataclasses.fields(Subjects) if field.name != "mesh"]
+    first = Subjects(next(iter(command.mesh), None), **{name: getattr(command, name) for name in names})
+    others = (dataclasses.replace(first, mesh=mesh, photos=None, background=None) for mesh in command.mesh[1:])
+    of_others = itertools.chain.from_iterable(map(examine_files, others))
+    of_meshes = (finding for finding in of_others if finding.subject.startswith(("mesh", "model mesh")))
+    for finding in itertools.chain(examine(first, command.cache), of_meshes):
         console.print(f"[{colours[finding.state]}]{finding.state:>7}[/]  [bold]{finding.subject}[/]: ", end="")
         console.print(str(finding), markup=False)
         status = max(status, finding.state == "bad")
-    if command.symmetries is not None and command.mesh is not None:
-        save_symmetries(command.mesh, command.mesh_unit, command.body, command.symmetries)
+    if command.symmetries is not None:
+        save_symmetries(command.mesh[0], command.mesh_unit, command.body, command.symmetries)
     return status
