@@ -51,6 +51,14 @@ def test_implausible_distortion(distortion: tuple[float, ...]) -> None:
         PinholeCamera(K, distortion).check_frame(640, 480)
 
 
+@pytest.mark.parametrize("k1", [-0.5, -1.0, -2.0])
+def test_a_distortion_that_folds_inside_the_frame(k1: float) -> None:
+    """Beyond, the lens would see mirrored what it sees nearer to its middle."""
+    camera = PinholeCamera(np.array([[572.0, 0, 320], [0, 572.0, 240], [0, 0, 1]]), (k1, 0, 0, 0))
+    with pytest.raises(CameraError, match=r"turns back at \d\d% of the way to a corner of a frame of 640x480"):
+        camera.check_frame(640, 480)
+
+
 @pytest.mark.parametrize("distortion", [(-0.45, 0.3, 0.01, -0.01), (0.5, -2.6, 0.001, 0, 1.5, 0.4, -2.4, 1.4)])
 def test_distortion_of_wide_lenses(distortion: tuple[float, ...]) -> None:
     PinholeCamera(np.array([[400.0, 0, 320], [0, 400.0, 240], [0, 0, 1]]), distortion).check_frame(640, 480)

@@ -17,6 +17,8 @@ from curio_serve.errors import CameraError
 Array = np.ndarray
 _DISTORTION_SIZES = (0, 4, 5, 8)
 _MIN_DEPTH_M = 1e-9
+_LEAST_REACHED = 0.8  # of the way to a corner: calibrations say little of the corners themselves
+_STEPS_OUTWARD = np.linspace(0, 4, 81)  # times the slope of a corner's ray without distortion
 _MIN_FOCAL_WIDTHS, _MAX_FOCAL_WIDTHS = 0.1, 50.0
 
 
@@ -179,7 +181,7 @@ def _check_matrix(matrix: Array) -> None:
 
 @lru_cache(32)
 def _check_distortion(camera: PinholeCamera, width: int, height: int) -> None:
-    """Refuse a distortion that moves a point of the frame's border by more than half the diagonal: past the centre."""
+    """Refuse a distortion that moves a point of the border by half the diagonal, or that folds inside the frame."""
     x, y = np.meshgrid([-0.5, (width - 1) / 2, width - 0.5], [-0.5, (height - 1) / 2, height - 0.5])
     border = np.stack([x.ravel(), y.ravel(), np.ones(9)])
     moved_px = np.abs(camera.project((np.linalg.inv(camera.matrix) @ border).T) - border[:2].T).max()
@@ -188,6 +190,28 @@ def _check_distortion(camera: PinholeCamera, width: int, height: int) -> None:
             f"the distortion {list(camera.distortion)} moves pixels of a frame of {width}x{height} by up to "
             f"{moved_px:.3g} px; expected the coefficients k1, k2, p1, p2, k3 of this camera, in OpenCV's order"
         )
+    reached = _reached(camera, border[:, [0, 2, 6, 8]])
+    if reached < _LEAST_REACHED:
+        raise CameraError(
+            f"the distortion {list(camera.distortion)} turns back at {reached:.0%} of the way to a corner of a "
+            f"frame of {width}x{height}, beyond which places are seen twice; calibrate again, with boards in corners"
+        )
+
+
+def _reached(camera: PinholeCamera, corners: Array) -> float:
+    """How far from the principal point a lens sees before its distortion turns back, at worst, fraction of the way.
+
+    Args:
+        camera: With distortion.
+        corners: Homogeneous pixels [3, n].
+    """
+    centre, slopes = camera.matrix[:2, 2], (np.linalg.inv(camera.matrix) @ corners)[:2].T
+    along = (_STEPS_OUTWARD[:, None, None] * slopes).reshape(-1, 2)
+    seen = camera.project(np.concatenate([along, np.ones((len(along), 1))], axis=1))
+    seen_px = np.linalg.norm(seen - centre, axis=1).reshape(-1, len(slopes))
+    turns_back = np.concatenate([np.diff(seen_px, axis=0) < 0, np.ones((1, len(slopes)), bool)])
+    farthest_px = seen_px[turns_back.argmax(axis=0), np.arange(len(slopes))]
+    return float((farthest_px / np.linalg.norm(corners[:2].T - centre, axis=1)).min())
 
 
 def scaling(x_scale: float, y_scale: float) -> Array:
