@@ -65,6 +65,9 @@ def test_a_missing_file(tmp_path: Path) -> None:
         open_model(tmp_path / "nothing")
     with pytest.raises(ModelError, match="no model in"):
         open_model(tmp_path)
+    (tmp_path / "models" / "part").mkdir(parents=True)
+    with pytest.raises(ModelError, match=r"is a run: name .*/models/part$"):
+        open_model(tmp_path)
 
 
 def test_no_spec(spot_onnx: MakeOnnx, tmp_path: Path) -> None:

@@ -64,6 +64,7 @@ def test_a_taken_port_is_named(server: Any, models_dir: Path) -> None:
     ("arguments", "status", "words"),
     [
         (["{tmp}/nowhere"], 1, "models folder {tmp}/nowhere cannot be read"),
+        (["{tmp}/run"], 1, "it is a run of curio-train; give its models, {tmp}/run/models"),
         (["{tmp}"], 1, "no model could be loaded from {tmp}: it holds no <name>/<version>/model.onnx"),
         (["{models}/flat"], 1, "it is the folder of one model; give the folder that holds it, {models}"),
         (["{models}", "--token-file", "{tmp}/none"], 2, "--token-file {tmp}/none cannot be read"),
@@ -77,6 +78,7 @@ def test_a_taken_port_is_named(server: Any, models_dir: Path) -> None:
 def test_what_cannot_start_says_why(
     arguments: list[str], status: int, words: str, models_dir: Path, tmp_path: Path
 ) -> None:
+    (tmp_path / "run" / "models").mkdir(parents=True)
     names = {"tmp": str(tmp_path), "models": str(models_dir), "readme": __file__}
     ended = _run(*[argument.format(**names) for argument in arguments], "--port", "0")
     assert ended.returncode == status

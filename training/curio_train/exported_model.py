@@ -7,7 +7,7 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 from curio_serve.errors import InternalError, ModelError
 from curio_serve.files import read_file
 from curio_serve.models import model as serving
-from curio_serve.models.model_folder import MODEL_FILE, versions
+from curio_serve.models.model_folder import MODEL_FILE, in_run, versions
 from torch import Tensor
 
 from curio_train.errors import ExportError, UsageError
@@ -81,9 +81,11 @@ def find_model(path: Path) -> Path:
         found = versions(path) if path.is_dir() else []
     except ModelError as exc:
         raise UsageError(str(exc)) from exc
+    if not found and (where := in_run(path)):
+        raise UsageError(f"{path}: no model{where}")
     if not found:
         raise UsageError(
             f"{path}: neither a run folder (config.json) nor a model (<version>/{MODEL_FILE}); expected what "
-            "curio-train or curio-export wrote"
+            f"curio-train or curio-export wrote"
         )
     return path / str(found[-1]) / MODEL_FILE

@@ -24,6 +24,9 @@ from curio_serve.models.runtime import DEFAULT_RUNTIME, Runtime
 CONFIG_FILE = "config.pbtxt"
 MODEL_FILE = "model.onnx"
 SUMS_FILE = "SHA256SUMS"
+MODELS_OF_RUN = "models"
+"""The folder of models in a run folder of curio-train."""
+
 _MAX_TEXT_BYTES = 1 << 20
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _VERSION = re.compile(r"[1-9][0-9]{0,8}")
@@ -81,6 +84,13 @@ def load_version(folder: Path, version: int, runtime: Runtime = DEFAULT_RUNTIME)
     return model
 
 
+def in_run(path: Path) -> str:
+    """Where the models of a training run are, for messages; empty for any other folder."""
+    folder = path / MODELS_OF_RUN
+    found = sorted(one.name for one in folder.iterdir() if one.is_dir()) if folder.is_dir() else []
+    return f". {path} is a run: name {folder / found[0]}" if found else ""
+
+
 def open_model(path: str | Path, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
     """Load the MODEL of a command line: a model folder (its latest version), a version folder or an .onnx file.
 
@@ -103,7 +113,9 @@ def open_model(path: str | Path, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
         return load(path / MODEL_FILE, runtime=runtime)
     found = versions(path)
     if not found:
-        raise ModelError(f"no model in {path}; expected {path}/<version>/{MODEL_FILE}, as curio-export writes it")
+        raise ModelError(
+            f"no model in {path}; expected {path}/<version>/{MODEL_FILE}, as curio-export writes it{in_run(path)}"
+        )
     return load_version(resolved, found[-1], runtime)
 
 

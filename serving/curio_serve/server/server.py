@@ -25,7 +25,7 @@ from curio_serve.api.registration import register
 from curio_serve.cores import memory_limit, num_cores
 from curio_serve.errors import ModelError, Unavailable, UsageError
 from curio_serve.models.model_check import ChildCheck
-from curio_serve.models.model_folder import MODEL_FILE, versions
+from curio_serve.models.model_folder import MODEL_FILE, MODELS_OF_RUN, versions
 from curio_serve.models.repository import Change, Repository
 from curio_serve.models.runtime import Runtime, on_processor, read_providers
 from curio_serve.server.config import ServeConfig
@@ -115,6 +115,8 @@ class PoseServer:
         folder = Path(self.config.models)
         if versions(folder):
             return f"it is the folder of one model; give the folder that holds it, {folder.absolute().parent}"
+        if (folder / MODELS_OF_RUN).is_dir():
+            return f"it is a run of curio-train; give its models, {folder.absolute() / MODELS_OF_RUN}"
         return f"it holds no <name>/<version>/{MODEL_FILE}; export a model with curio-export"
 
     def _build(self) -> grpc.Server:

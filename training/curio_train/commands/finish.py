@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from curio_serve.models.model_folder import MODELS_OF_RUN
+
 from curio_train.config import RunConfig
 from curio_train.errors import CurioError, ExportError
 from curio_train.second_process import SecondProcess
@@ -16,9 +18,6 @@ if TYPE_CHECKING:
 
     from curio_train.export.ahead import TracingAhead
     from curio_train.export.graph import Graph
-
-MODELS_FOLDER = "models"
-"""Folder of the exported models, in the folder of a run of one's own part."""
 
 
 def end(
@@ -83,7 +82,7 @@ def _exported(
 ) -> str:
     from curio_train.export.write_model import export
 
-    models = run / MODELS_FOLDER
+    models = run / MODELS_OF_RUN
     again = shlex.join(["curio-export", str(run), "--out", str(models)])
     try:
         done = export(run, models, ahead=traced, report=verdict)
