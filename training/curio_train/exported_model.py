@@ -86,6 +86,6 @@ def find_model(path: Path) -> Path:
     if not found:
         raise UsageError(
             f"{path}: neither a run folder (config.json) nor a model (<version>/{MODEL_FILE}); expected what "
-            f"curio-train or curio-export wrote"
+            "curio-train or curio-export wrote"
         )
     return path / str(found[-1]) / MODEL_FILE

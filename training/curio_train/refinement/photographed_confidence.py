@@ -151,7 +151,8 @@ def calibrate_parts_by_agreement(network: ObjectsNetwork, world: SeveralObjectsW
 
 
 def _told(one: Object, agrees: Bool[np.ndarray, " photographs"], *, is_enough: bool = True) -> str:
-    by = "which calibrates its confidence" if is_enough else "too few, so renderings calibrate its confidence"
+    few = f"fewer than {_FEWEST_READ}, so renderings calibrate its confidence; more photographs that show it help"
+    by = "which calibrates its confidence" if is_enough else few
     return f"{one.kind.name}: {agrees.sum()} of {len(agrees)} photographs are read alike, {by}"
 
 
