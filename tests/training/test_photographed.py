@@ -251,7 +251,8 @@ def test_a_part_that_is_read_alike_often_is_calibrated_by_it(
     told = SelfTraining(network, photographed, 0.0, torch.device("cpu")).finish(tmp_path)
     assert told.splitlines() == [
         "chair-0: 21 of 28 photographs are read alike, which calibrates its confidence",
-        "chair-1: 0 of 28 photographs are read alike, too few, so renderings calibrate its confidence",
+        "chair-1: 0 of 28 photographs are read alike, fewer than 20, so renderings calibrate its confidence; more "
+        "photographs that show it help",
     ]
     hook.remove()
     after = network.reader.state_dict()

@@ -71,9 +71,20 @@ class _Client:
             max_attempts: Largest number of attempts a call.
             tls: Encrypts the connection; None: plain, for servers on the loopback.
             token: Bearer token, if the server asks for one.
+
+        Raises:
+            UsageError: An argument is of another kind.
         """
+        for name, value, kind in (
+            ("address", address, str),
+            ("token", token, str),
+            ("max_attempts", max_attempts, int),
+        ):
+            if not isinstance(value, kind) or (name == "address" and not value):
+                raise UsageError(f"{name} {value!r}: expected {'a number' if kind is int else 'text'}")
+        deadline_s(timeout_s)
         self.address = address
-        self._timeout_s = timeout_s
+        self._timeout_s, self._is_closed = timeout_s, False
         self._max_attempts = max_attempts
         token = token.strip()  # files end with a line feed
         if not (token.isascii() and (token.isprintable())):
@@ -85,7 +96,12 @@ class _Client:
             self._channel = self._grpc.secure_channel(address, tls.credentials(), _CHANNEL_OPTIONS)
         self._stub = PoseDetectorStub(self._channel)
 
+    def _refuse_closed(self) -> None:
+        if self._is_closed:
+            raise UsageError("the client is closed; make a new one")
+
     def _attempts(self, timeout_s: float | None) -> Attempts:
+        self._refuse_closed()
         return Attempts(self.address, self._timeout_s if timeout_s is None else timeout_s, self._max_attempts)
 
 
@@ -100,6 +116,7 @@ class PoseClient(_Client):
 
     def close(self) -> None:
         """Ends the connection and every call in flight."""
+        self._is_closed = True
         self._channel.close()
 
     def detect(
@@ -169,6 +186,7 @@ class PoseClient(_Client):
             CurioError: The stream as a whole failed, or the server is out of reach.
             Exception: What the iterable raised, after the answers to the requests before it.
         """
+        self._refuse_closed()
         failed = DeferredError()  # gRPC would call it an unknown error, and drop answers
         call = self._stub.DetectStream(failed.each(requests), timeout=deadline_s(timeout_s), metadata=self._metadata)
         try:
@@ -213,6 +231,7 @@ class AsyncPoseClient(_Client):
 
     async def close(self) -> None:
         """Ends the connection and every call in flight."""
+        self._is_closed = True
         await self._channel.close()
 
     async def detect(
@@ -242,6 +261,7 @@ class AsyncPoseClient(_Client):
         self, requests: AsyncIterable[messages.DetectRequest], *, timeout_s: float
     ) -> AsyncIterator[messages.DetectResponse]:
         """Answers in the order of the requests; see :meth:`PoseClient.detect_stream`."""
+        self._refuse_closed()
         failed = DeferredError()  # gRPC would call it an unknown error, and drop answers
         call = self._stub.DetectStream(
             failed.each_async(requests), timeout=deadline_s(timeout_s), metadata=self._metadata

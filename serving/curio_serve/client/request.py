@@ -144,8 +144,10 @@ def selector(model: str) -> messages.ModelSelector:
     """``name`` (the latest version) or ``name/version``.
 
     Raises:
-        ArgumentError: The version is not a number from 1 to 999999999.
+        ArgumentError: It is no text, or the version is not a number from 1 to 999999999.
     """
+    if not isinstance(model, str):
+        raise ArgumentError(f"model {model!r}: expected a name as text")
     name, slash, version = model.partition("/")
     if slash and not _VERSION.fullmatch(version):
         raise ArgumentError(f"model {model!r}: expected name or name/version with a version from 1 to 999999999")

@@ -9,7 +9,7 @@ from curio_proto.v1.detector_pb2 import DetectResponse
 from google.protobuf.message import DecodeError
 from google.rpc import error_details_pb2, status_pb2
 
-from curio_serve.errors import CurioError, ImageError, Overloaded, Unavailable, error_from_status
+from curio_serve.errors import ArgumentError, CurioError, ImageError, Overloaded, Unavailable, error_from_status
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
 _LONGEST_S = 1e9  # thirty years
@@ -18,7 +18,13 @@ _STATUS_DETAILS_KEY = "grpc-status-details-bin"
 
 
 def deadline_s(timeout_s: float) -> float:
-    """A deadline as gRPC can keep it: longer ones, and none (infinity), would have passed at once."""
+    """A deadline as gRPC can keep it: longer ones, and none (infinity), would have passed at once.
+
+    Raises:
+        ArgumentError: It is no number.
+    """
+    if not isinstance(timeout_s, int | float):
+        raise ArgumentError(f"timeout_s {timeout_s!r}: expected seconds")
     return min(timeout_s, _LONGEST_S)
 
 

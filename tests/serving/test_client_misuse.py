@@ -1,0 +1,51 @@
+"""Clients that are used wrongly: every mistake is an exception of ``curio_serve.errors``, before anything is sent."""
+
+import asyncio
+from typing import Any
+
+import pytest
+from curio_serve.client import AsyncPoseClient, PoseClient
+from curio_serve.errors import ArgumentError, UsageError
+
+NOWHERE = "127.0.0.1:1"
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"address": ""}, "address ''"),
+        ({"address": None}, "address None"),
+        ({"token": None}, "token None: expected text"),
+        ({"max_attempts": "x"}, "max_attempts 'x': expected a number"),
+    ],
+)
+def test_a_client_is_not_made_of_what_is_none(options: dict[str, Any], told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        PoseClient(**{"address": NOWHERE, **options})
+
+
+def test_deadlines_and_models_are_checked_before_a_call() -> None:
+    with pytest.raises(ArgumentError, match="timeout_s None: expected seconds"):
+        PoseClient(NOWHERE, timeout_s=None)  # type: ignore[arg-type]
+    with PoseClient(NOWHERE) as client:
+        with pytest.raises(ArgumentError, match="timeout_s '5': expected seconds"):
+            client.list_models(timeout_s="5")  # type: ignore[arg-type]
+        for model in (5, b"ape"):
+            with pytest.raises(ArgumentError, match="expected a name as text"):
+                client.get_model(model)  # type: ignore[arg-type]
+
+
+def test_a_closed_client_says_so() -> None:
+    with PoseClient(NOWHERE) as client:
+        pass
+    for call in (client.list_models, lambda: list(client.detect_stream([], timeout_s=1))):
+        with pytest.raises(UsageError, match="the client is closed"):
+            call()
+
+    async def closed() -> None:
+        async with AsyncPoseClient(NOWHERE) as other:
+            pass
+        await other.list_models()
+
+    with pytest.raises(UsageError, match="the client is closed"):
+        asyncio.run(closed())
