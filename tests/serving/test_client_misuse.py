@@ -1,10 +1,11 @@
 """Clients that are used wrongly: every mistake is an exception of ``curio_serve.errors``, before anything is sent."""
 
 import asyncio
+from pathlib import Path
 from typing import Any
 
 import pytest
-from curio_serve.client import AsyncPoseClient, PoseClient
+from curio_serve.client import AsyncPoseClient, PoseClient, Tls
 from curio_serve.errors import ArgumentError, UsageError
 
 NOWHERE = "127.0.0.1:1"
@@ -33,6 +34,12 @@ def test_deadlines_and_models_are_checked_before_a_call() -> None:
         for model in (5, b"ape"):
             with pytest.raises(ArgumentError, match="expected a name as text"):
                 client.get_model(model)  # type: ignore[arg-type]
+
+
+def test_tls_takes_pem_files(tmp_path: Path) -> None:
+    (tmp_path / "ca.der").write_bytes(bytes(100))
+    with pytest.raises(UsageError, match=r"ca\.der: expected a PEM file"):
+        PoseClient(NOWHERE, tls=Tls(tmp_path / "ca.der"))
 
 
 def test_a_closed_client_says_so() -> None:

@@ -77,6 +77,12 @@ def test_a_jpeg_of_one_color_has_bytes_enough(progressive: int, channels: int) -
     assert decode(cv2.imencode(".jpg", flat, options)[1].tobytes()).width == 2048
 
 
+def test_an_animated_png_is_no_picture() -> None:
+    still = _encode(_scene(), ".png")
+    with pytest.raises(ImageError, match="the PNG is an animation"):
+        decode(still[:33] + struct.pack(">I", 8) + b"acTL" + bytes(12) + still[33:])
+
+
 def test_a_thumbnails_end_is_not_the_pictures_end() -> None:
     jpeg = _encode(_scene(320, 240), ".jpg")
     body = b"Exif\x00\x00" + _encode(_scene(32, 24), ".jpg")

@@ -199,7 +199,9 @@ def _write_rig(path: Path, poses: list[np.ndarray], **changes: object) -> Path:
     return path
 
 
-def test_curio_detect_takes_a_folder_of_each_camera(models_dir: Path, tmp_path: Path, spot_image: Spot) -> None:
+def test_curio_detect_takes_a_folder_of_each_camera(
+    models_dir: Path, tmp_path: Path, spot_image: Spot, capsys: pytest.CaptureFixture[str]
+) -> None:
     side = np.eye(4)
     side[0, 3] = -0.1
     poses = [side, np.eye(4)]
@@ -212,6 +214,7 @@ def test_curio_detect_takes_a_folder_of_each_camera(models_dir: Path, tmp_path: 
     (folders[1] / "1.png").write_bytes(b"no picture")
     call = DetectArguments(str(models_dir / "pinhole"), tuple(map(str, folders)), rig=rig, out=str(out))
     assert run(call) == 1
+    assert "the middle alone was searched, 59% of the frame" in capsys.readouterr().err
     first, broken, last = (json.loads(line) for line in out.read_text().splitlines())
     assert first["views"] == [str(folder / "0.png") for folder in folders]
     np.testing.assert_allclose(first["detections"][0]["translation_m"], POSITION, atol=0.02)

@@ -62,7 +62,7 @@ class Progress:
         if lines.error:
             self._num_errors += 1
             if len(self._problems) < _NUM_PROBLEMS_SHOWN:
-                self._problems.append(f"{lines.image}: {lines.error}")
+                self._problems.append(_printable(f"{lines.image}: {lines.error}"))
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], advance=1, num_errors=self._num_errors)
 
@@ -107,6 +107,11 @@ def _started(num_images: int, num_errors: int) -> "Bar":
 def _counted(num_images: int, of_one: str = "", of_several: str = "") -> str:
     """The number of images, and the verb that goes with it."""
     return f"1 image {of_one}".rstrip() if num_images == 1 else f"{num_images} images {of_several}".rstrip()
+
+
+def _printable(text: str) -> str:
+    """A text in which a file's name cannot begin a line or colour a terminal."""
+    return "".join(sign if sign.isprintable() else f"\\x{ord(sign):02x}" for sign in text)
 
 
 def _say(text: str) -> None:

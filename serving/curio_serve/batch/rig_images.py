@@ -22,8 +22,9 @@ from curio_serve.batch.results.formats import ImageLines, ImageResult, JsonLines
 from curio_serve.batch.results.result_file import ResultFile, values_of
 from curio_serve.errors import ArgumentError, CameraError, ImageError, InternalError, UsageError
 from curio_serve.imaging import image as decoding
+from curio_serve.imaging.view import searched_fraction
 from curio_serve.models.detector import Detector
-from curio_serve.models.model import Model, answering
+from curio_serve.models.model import Model, answering, canonical_camera
 from curio_serve.models.model_check import ChildCheck
 from curio_serve.models.model_folder import open_model
 from curio_serve.models.runtime import Runtime, read_providers
@@ -39,6 +40,7 @@ class RigEstimator:
     def __init__(self, model: Model, cameras: Sequence[RigCamera], min_confidence: float, most: int | None) -> None:
         self._model, self._detector, self._cameras = model, Detector(model), cameras
         self._min_confidence, self._most = min_confidence, most
+        self._canonical = canonical_camera(model.spec, model.name)
 
     def __call__(self, instant: RigImage) -> ImageResult:
         """The poses in the rig's frame, or what is wrong with an image."""
@@ -68,6 +70,7 @@ class RigEstimator:
             views=names,
             cam_from_rig=views[0].cam_from_rig.ravel().tolist(),
             distortion=views[0].camera.distortion,
+            searched=min(searched_fraction(view.camera, self._canonical, *view.size) for view in views),
         )
 
     def _view(self, image: SourceImage, of: RigCamera) -> RigView:

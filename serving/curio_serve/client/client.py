@@ -297,6 +297,9 @@ def _read(path: Path | None) -> bytes | None:
     if path is None:
         return None
     try:
-        return read_given(path)
+        content = read_given(path)
     except OSError as exc:
         raise UsageError(f"{path}: cannot be read: {exc.strerror}") from exc
+    if b"-----BEGIN " not in content:
+        raise UsageError(f"{path}: expected a PEM file, which begins with -----BEGIN")
+    return content

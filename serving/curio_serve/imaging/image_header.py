@@ -157,6 +157,8 @@ def _read_png(data: bytes) -> Header:
             if not num_data_bytes:
                 raise ImageError("the PNG has no picture data (no IDAT chunk); the file is damaged")
             return Header("png", width, height, num_channels, orientation)
+        if kind == b"acTL":
+            raise ImageError("the PNG is an animation; expected a single picture")
         num_data_bytes += length if kind == b"IDAT" else 0
         if kind == b"eXIf":
             orientation = exif_orientation(data[start : start + length])

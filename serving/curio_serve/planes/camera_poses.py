@@ -19,6 +19,7 @@ from curio_serve.planes.plane import FIND_PLANE, AnyPlane, Plane
 _MAX_BYTES = 1 << 26
 _MAX_SHEAR = 1e-3
 _POSE = "cam_from_world"
+_HIGHEST_M = 100.0
 _MOST_UPWARD = 0.7  # sine of the angle: a camera that looks up farther hardly shows a plane below it
 
 
@@ -106,6 +107,11 @@ class CameraPoseFile:
             raise self.error(
                 f"{self._where(photograph)}: the unit is {unit!r}, expected 'm'; make the file again with --distance-m "
                 "or --objects beside --calibrate --views-out, which bring the scene to metres"
+            )
+        if np.linalg.norm(matrix[:3, 3]) > _HIGHEST_M:
+            raise self.error(
+                f"{self._where(photograph)}: the camera stands {np.linalg.norm(matrix[:3, 3]):.4g} m from the plane's "
+                "origin; expected metres, found millimetres?"
             )
         height, forward = (-matrix[:3, :3].T @ matrix[:3, 3])[1], matrix[2, 1]
         looks = "down" if forward < 0 else "up" if forward > 0 else "straight ahead"

@@ -170,6 +170,7 @@ def test_a_file_of_camera_poses_says_the_plane_in_each_camera(tmp_path: Path) ->
         ('{"cam_from_world": 3}', "expected 4x4"),
         ('{"cam_from_world": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "looks straight ahead"),
         ('{"cam_from_world": [[1,0,0,0],[0,-0.6,-0.8,1],[0,0.8,-0.6,0],[0,0,0,1]]}', "height of 0.6 m and looks up"),
+        ('{"cam_from_world": [[1,0,0,0],[0,-1,0,900],[0,0,-1,0],[0,0,0,1]]}', "found millimetres"),
         ('{"unit": "mm", "cam_from_world": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "the unit is 'mm'"),
     ],
 )

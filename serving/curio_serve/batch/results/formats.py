@@ -292,7 +292,7 @@ class Bop(ResultFormat):
         if len(rest) != 4:
             raise ValueError(f"{3 + len(rest)} columns")
         if int(number) not in self._object_ids.values():
-            raise ValueError(f"object id {number}, which this model does not find")
+            raise ValueError(f"object id {number}, which is none of those looked for now")
         # the format has no mark for the first row of an image: the file's reader sees the key change
         return Line(f"{int(scene)},{int(image)}", opens_image=False)
 
