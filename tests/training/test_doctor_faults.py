@@ -126,7 +126,7 @@ def test_good_files_raise_no_alarm(files: Files) -> None:
         pytest.param([[90, 0, 40], [0, 90, 29], [0, 0, 1]], {}, "other resolution", id="of half the size"),
         pytest.param([[180, 0, 81], [0, 240, 58], [0, 0, 1]], {}, "focal length", id="squeezed pixels"),
         pytest.param([[35, 0, 81], [0, 35, 58], [0, 0, 1]], {}, "focal length", id="in millimetres"),
-        pytest.param(K, {"distortion": [-1.9, 0.3, 0, 0, 0]}, "distortion", id="folding distortion"),
+        pytest.param(K, {"distortion": [-1.9, 0.3, 0, 0, 0]}, "camera unreadable", id="folding distortion"),
         pytest.param([[0, 0, 81], [0, 180, 58], [0, 0, 1]], {}, "focal length", id="singular"),
         pytest.param([[180, 0, 130], [0, 180, 58], [0, 0, 1]], {}, "odd centre", id="of a cut-out"),
     ],

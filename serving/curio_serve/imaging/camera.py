@@ -17,7 +17,7 @@ from curio_serve.errors import CameraError
 Array = np.ndarray
 _DISTORTION_SIZES = (0, 4, 5, 8)
 _MIN_DEPTH_M = 1e-9
-_LEAST_REACHED = 0.8  # of the way to a corner: calibrations say little of the corners themselves
+_LEAST_REACHED = 0.85  # of the way to a corner: calibrations say little of the corners themselves
 _STEPS_OUTWARD = np.linspace(0, 4, 81)  # times the slope of a corner's ray without distortion
 _MIN_FOCAL_WIDTHS, _MAX_FOCAL_WIDTHS = 0.1, 50.0
 
@@ -194,7 +194,8 @@ def _check_distortion(camera: PinholeCamera, width: int, height: int) -> None:
     if reached < _LEAST_REACHED:
         raise CameraError(
             f"the distortion {list(camera.distortion)} turns back at {reached:.0%} of the way to a corner of a "
-            f"frame of {width}x{height}, beyond which places are seen twice; calibrate again, with boards in corners"
+            f"frame of {width}x{height}, beyond which places are seen twice; calibrate again with boards in the "
+            "corners, or without k3"
         )
 
 

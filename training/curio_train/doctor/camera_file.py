@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from curio_train.camera import Intrinsics, load_intrinsics
@@ -13,7 +12,6 @@ from curio_train.errors import CurioError
 _USUAL_VIEW_DEG = (8.0, 110.0)  # of the longer side: from a long lens to a wide one
 _SQUARE = 0.03  # fx and fy of real sensors differ by less
 _CENTRED = 0.12  # principal points lie closer to the middle, in image sizes
-_BENT_BACK = 0.05  # the part of the image that distortion may fold over
 
 
 def examine_camera(path: Path) -> tuple[Intrinsics | None, list[Finding]]:
@@ -25,7 +23,7 @@ def examine_camera(path: Path) -> tuple[Intrinsics | None, list[Finding]]:
     across, down = _view_deg(found)
     bent = "with distortion" if any(found.distortion) else "without distortion"
     text = f"{path}: {found.width}x{found.height} pixels, sees {across:.0f} by {down:.0f} degrees, {bent}"
-    return found, [Finding("camera", "good", text), *_centre(found), *_focal_length(found), *_distortion(found)]
+    return found, [Finding("camera", "good", text), *_centre(found), *_focal_length(found)]
 
 
 def _kind(message: str) -> str:
@@ -80,20 +78,3 @@ def _focal_length(camera: Intrinsics) -> Iterator[Finding]:
         text = f"a view of {widest:.3g} degrees is unusual; the focal length of {fx:.5g} may not be in pixels"
         remedy = "Focal length in pixels = focal length in mm / sensor width in mm x image width"
         yield Finding("camera focal length", "warning", text, remedy, "likely", fault="focal length")
-
-
-def _distortion(camera: Intrinsics) -> Iterator[Finding]:
-    """Radial polynomials fitted to points near the middle may fold the image's border back into it."""
-    if not any(camera.distortion):
-        return
-    corners = np.array([[0, 0], [camera.width - 1, 0], [0, camera.height - 1], [camera.width - 1, camera.height - 1]])
-    rays = (corners - camera.matrix[:2, 2]) / np.diag(camera.matrix)[:2]
-    steps = np.linspace(0, 1, 50)[:, None, None]
-    points = np.concatenate([rays[None] * steps, np.ones((50, len(rays), 1))], axis=2).reshape(-1, 3)
-    seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), np.array(camera.distortion))
-    reach = np.linalg.norm(seen.reshape(50, len(rays), 2), axis=2)
-    folded = float((np.diff(reach, axis=0) < 0).mean())
-    if folded > _BENT_BACK:
-        text = f"distortion {list(camera.distortion)} folds {folded:.0%} of the way to the corners back into the image"
-        remedy = "Calibrate again with the board also near the borders, or leave out k3"
-        yield Finding("camera distortion", "bad", text, remedy, fault="distortion")
