@@ -82,6 +82,10 @@ def test_files_that_are_numbered_alike_stay_so() -> None:
     missing = Instants([iter(files("a/1.png", "a/2.png")), iter(files("b/1.png", "b/3.png"))], LABELS)
     with pytest.raises(UsageError, match=r"a/2\.png and b/3\.png come together"):
         list(missing)
+    of_cameras = Instants(
+        [iter(files("a/f1_cam1.png", "a/f2_cam1.png")), iter(files("b/f1_cam2.png", "b/f2_cam2.png"))], LABELS
+    )
+    assert len(list(of_cameras)) == 2
     late = Instants([iter(files("a/0.png", "a/1.png")), iter(files("b/1.png", "b/2.png"))], LABELS)
     with pytest.raises(UsageError, match=r"a/1\.png and b/2\.png come together"):
         list(late)

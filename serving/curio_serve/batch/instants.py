@@ -79,7 +79,7 @@ class Instants:
         return self._by_time([image for image in first if image is not None])
 
     def _by_order(self, first: Sequence[SourceImage | None]) -> Iterator[RigImage]:
-        has_numbers, before = len({_number(image) for image in first if image is not None}) == 1, [""]
+        has_numbers, before = len({_number(image) for image in first if image is not None}) == 1, list[str]()
         for count, found in enumerate(chain((tuple(first),), zip_longest(*self.cameras))):
             there = [image for image in found if image is not None]
             if not there:
@@ -90,8 +90,7 @@ class Instants:
                     f"--rig: {ended} has {count} images, others have more; expected as many of each camera"
                 )
             numbers = [_number(image) for image in there]
-            is_behind = any(number and number in before for number in numbers)  # another camera had it an instant ago
-            before = numbers
+            is_behind, before = _is_behind(numbers, before), numbers
             if len({*numbers}) > 1 and (has_numbers or is_behind):
                 names = " and ".join(image.name for image in there)
                 raise UsageError(f"--rig: {names} come together and have other numbers; is an image missing before?")
@@ -159,6 +158,16 @@ def _is_early(image: SourceImage, latest: float) -> bool:
     """Whether an image was taken too long before another camera's; one that is damaged has no time, and was not."""
     at_s = _time_s(image)
     return at_s is not None and latest - at_s > _FARTHEST_S
+
+
+def _is_behind(numbers: Sequence[str], before: Sequence[str]) -> bool:
+    """Whether a camera's image has the number that another camera's had an instant ago."""
+    return any(
+        number != "" and number == was
+        for own, number in enumerate(numbers)
+        for other, was in enumerate(before)
+        if own != other
+    )
 
 
 def _number(image: SourceImage) -> str:
