@@ -273,8 +273,8 @@ def test_a_camera_that_moves_has_a_plate_for_each_photograph(folder: Path, tmp_p
         build(options(folder, plane=tmp_path / "views.json"))
 
 
-def test_camera_poses_in_millimetres_are_refused(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "views.json").write_text(json.dumps({"plate-a.png": {"cam_from_world": pose(90, 600.0).tolist()}}))
+def test_camera_poses_that_are_far_too_far_are_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "views.json").write_text(json.dumps({"plate-a.png": {"cam_from_world": pose(90, 60.0).tolist()}}))
     with pytest.raises(CameraError, match=r"m away from the plane.*cam_from_world is in metres"):
         build(options(folder, plane=tmp_path / "views.json"))
 
