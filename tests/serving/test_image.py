@@ -77,6 +77,14 @@ def test_a_jpeg_of_one_color_has_bytes_enough(progressive: int, channels: int) -
     assert decode(cv2.imencode(".jpg", flat, options)[1].tobytes()).width == 2048
 
 
+def test_a_png_whose_checksum_does_not_fit_is_refused_and_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
+    damaged = bytearray(_encode(_scene(), ".png"))
+    damaged[len(damaged) // 2] ^= 8
+    with pytest.raises(ImageError, match="a checksum does not fit"):
+        decode(bytes(damaged))
+    assert capfd.readouterr() == ("", "")
+
+
 def test_an_animated_png_is_no_picture() -> None:
     still = _encode(_scene(), ".png")
     with pytest.raises(ImageError, match="the PNG is an animation"):

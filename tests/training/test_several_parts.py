@@ -107,6 +107,8 @@ def test_no_colour_is_looked_for_beside_parts_that_have_their_own(folder: Path) 
 def test_calls_that_contradict_themselves_are_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="parts are named after their files: rename one"):
         options(folder, mesh=(folder / "block.stl", folder / "block.stl"))
+    with pytest.raises(UsageError, match="--objects has commas between names"):
+        options(folder, mesh=(folder / "block.stl", folder / "pin,long.stl"))
     config = RunConfig(options(folder), method="sleep")
     taught = replace(config, recipe=replace(config.recipe, self_training=0.5))
     with pytest.raises(UsageError, match="several parts in free space are not learned from photographs"):

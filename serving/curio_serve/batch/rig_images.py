@@ -153,11 +153,8 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
     except ArgumentError as exc:
         raise UsageError(f"--objects: {exc}") from exc
     estimators = [RigEstimator(model, cameras, arguments.min_confidence, arguments.max_detections) for model in opened]
-    form, passed_over, topics = (
-        JsonLines(arguments.changed_options),
-        PassedOver(),
-        Topics(arguments.topic, arguments.info_topic),
-    )
+    form = JsonLines(arguments.changed_options)
+    passed_over, topics = PassedOver(), Topics(arguments.topic, arguments.info_topic)
     names = [(model.name, model.version) for model in opened]
     path = None if arguments.out is None else Path(arguments.out)
     first = values_of(cameras[0].camera)

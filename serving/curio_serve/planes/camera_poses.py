@@ -108,9 +108,9 @@ class CameraPoseFile:
                 f"{self._where(photograph)}: the unit is {unit!r}, expected 'm'; make the file again with --distance-m "
                 "or --objects beside --calibrate --views-out, which bring the scene to metres"
             )
-        if np.linalg.norm(matrix[:3, 3]) > _HIGHEST_M:
+        if (distance_m := float(np.linalg.norm(matrix[:3, 3]))) > _HIGHEST_M:
             raise self.error(
-                f"{self._where(photograph)}: the camera stands {np.linalg.norm(matrix[:3, 3]):.4g} m from the plane's "
+                f"{self._where(photograph)}: the camera stands {distance_m:.4g} m from the plane's "
                 "origin; expected metres, found millimetres?"
             )
         height, forward = (-matrix[:3, :3].T @ matrix[:3, 3])[1], matrix[2, 1]

@@ -41,10 +41,8 @@ def _other_mesh(spec: ModelSpec, mesh: Mesh) -> Iterator[Finding]:
     own = next((kind for kind in spec.objects if kind.mesh_sha256 == mesh.sha256), None)
     if own is not None:
         if abs(mesh.diameter_m / own.diameter_m - 1) >= _SAME_SIZE:
-            text = (
-                f"{own.name} has a diameter of {own.diameter_m * 1000:.4g} mm in the model, and its mesh file one of "
-            )
-            text += f"{mesh.diameter_m * 1000:.4g} mm"
+            in_model, in_file = (f"{one.diameter_m * 1000:.4g} mm" for one in (own, mesh))
+            text = f"{own.name} has a diameter of {in_model} in the model, and its mesh file one of {in_file}"
             yield Finding("model mesh", "bad", text, "Set --mesh-unit: a unit was mistaken", fault="mesh unit")
         return
     ratios = [mesh.diameter_m / kind.diameter_m for kind in spec.objects if kind.diameter_m > 0]

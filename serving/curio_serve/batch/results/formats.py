@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import PurePath
-from types import MappingProxyType
 
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
 
@@ -162,8 +161,8 @@ class JsonLines(ResultFormat):
     opening = b'{"image": '
     is_one_line_an_image = True
 
-    def __init__(self, options: Mapping[str, object] = MappingProxyType({})) -> None:
-        self.options = dict(options)
+    def __init__(self, options: Mapping[str, object] | None = None) -> None:
+        self.options = dict(options or {})
 
     def encode(self, result: ImageResult) -> bytes:
         answer: dict[str, object] = {"detections": [detection_json(detection) for detection in result.detections]}

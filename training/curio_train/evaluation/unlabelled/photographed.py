@@ -163,13 +163,15 @@ def _shown(
     confidence, num = code[CONFIDENCE], code[CONFIDENCE].shape[1]
     ranks = confidence.argsort(dim=1, descending=True).argsort(dim=1)
     shown = (ranks == 0) | (confidence >= _LIKELY)
+    if num == 1:
+        return shown.to(confidence)
     measure = "explained" if differs is None else "overlap"
 
     def agreement(of_shown: Tensor) -> Tensor:
         drawn = dict(code) | {CONFIDENCE: of_shown.to(confidence)}
         return _agreement(world, drawn, photographs, background_image, differs)[0][measure]
 
-    best = agreement(shown) if num > 1 else confidence
+    best = agreement(shown)
     for rank in range(1, num):
         more = shown | (ranks == rank)
         found = agreement(more)
