@@ -5,8 +5,8 @@
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
 10c6bff; models/lmo/5 has seen them), and no label of a frame is opened in training. A call goes on with
-what is there. The last line, also in OUT/halves.json, is of both halves: by one read, by nine, and by one and three of
-``curio-export --fast``; as served, after render-and-compare, and with ``--plane objects`` (one read and nine).
+what is there. The last line, also in OUT/halves.json, is of both halves: by one read, by nine, and by one, three and
+nine of ``curio-export --fast``; as served, after render-and-compare, and with ``--plane objects`` (one read and nine).
 """
 
 import argparse
@@ -48,7 +48,7 @@ def main() -> None:
         scores.append({"reads_1": _evaluate(run, others, 1), "reads_9": _evaluate(run, others, 9)})
         fast = _fast(run, out / f"fast-{half}")
         scores[-1] |= {f"reads_{reads}_plane": _evaluate(run, others, reads, on_plane=True) for reads in (1, 9)}
-        scores[-1] |= {"fast": _evaluate(fast, others, 1), "fast_reads_3": _evaluate(fast, others, 3)}
+        scores[-1] |= {f"fast_reads_{reads}": _evaluate(fast, others, reads) for reads in (1, 3, 9)}
     result = {name: _mean([one[name] for one in scores]) for name in scores[0]} | {
         "init": "/".join(arguments.init.parts[-2:]),
         "images": arguments.images,
@@ -87,7 +87,7 @@ def _learn(run: Path, data: Path, photographs: Path, arguments: argparse.Namespa
 
 
 def _fast(run: Path, models: Path) -> Path:
-    """The run as a model that looks at each object in one crop a pass."""
+    """The run as a model that looks at each object once, in one crop of half the resolution."""
     model = models / "lmo"
     if not model.exists():
         _call("curio-export", run, "--out", models, "--name", "lmo", "--half", "--fast")

@@ -28,7 +28,7 @@ def factor(picture: Tensor, distance: float, centre: tuple[float, float]) -> flo
     angle = torch.arange(64) * (2 * torch.pi / 64)
     outward = torch.stack([angle.cos(), angle.sin(), torch.zeros(64)], dim=1)[None]
     pose = Aligned(torch.eye(3)[None], torch.tensor([[*centre, distance]]), torch.ones(1))
-    return float(outline_log_factor(picture, outward / 2, outward, pose, torch.tensor([FOCAL_PX])))
+    return float(outline_log_factor(picture, outward / 2, outward, pose, torch.tensor([FOCAL_PX]), picture.shape[-1]))
 
 
 @pytest.mark.parametrize("error", [-0.04, -0.01, 0.0, 0.02, 0.05])

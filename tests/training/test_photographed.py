@@ -26,7 +26,6 @@ from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS, num_views
-from curio_train.networks.templates.reader import PoseReader
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
 from curio_train.refinement.agreeing_reads import NUM_READS_BY_TEMPLATES
 from curio_train.refinement.photographed_confidence import (
@@ -175,10 +174,8 @@ def test_the_exported_graph_equals_torch_whichever_objects_are_asked_for(
     monkeypatch.setattr(template_geometry, "NUM_VIEWS", 48)
     network = with_random_templates(world)
     network.outline = chair_outlines(network)
-    steps = PoseReader(network.geometries, (1, 0, 0))
-    steps.load_state_dict(network.reader.state_dict())
-    network.reader = steps
     network.look_less()
+    network.reader.effort = network.reader.effort._replace(hypotheses=2, steps=(0, 1, 1))  # more take long to trace
     graph, names = _Graph(network).eval(), ["translation_m", "rotation_6d", "light", "confidence"]
     assert tracing_of(network) == Tracing(one_image=True, num_slots=2)
     session = onnxruntime.InferenceSession(to_onnx(graph, 640, 480, names, tracing_of(network)).SerializeToString())

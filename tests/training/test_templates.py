@@ -14,14 +14,16 @@ from curio_train.export.onnx import Tracing, to_onnx
 from curio_train.geometry import random_rotations
 from curio_train.networks.crop_camera import about_axis, cut_crops
 from curio_train.networks.layers import fold_batch_norm
+from curio_train.networks.pose_steps import turn
+from curio_train.networks.several_objects.locator import FrameFeatures
 from curio_train.networks.templates import geometry as template_geometry
-from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
+from curio_train.networks.templates.alignment import Aligned, FeatureMaps, InCrop, align
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, Bank
 from curio_train.networks.templates.bank import RANK as BANK_RANK
 from curio_train.networks.templates.descriptors import Descriptors
 from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, QUARTER_TURNS, Geometry, num_views, viewpoints
 from curio_train.networks.templates.localiser import RANK, Localiser
-from curio_train.networks.templates.network import STEPS, TemplateNetwork
+from curio_train.networks.templates.network import TemplateNetwork
 from curio_train.networks.templates.quick_trunk import quicken
 from curio_train.networks.templates.rolls import ROLLS_DEG, upright_rolls
 from curio_train.networks.templates.trunk import COARSE_STRIDE, COARSE_WIDTH, FINE_WIDTH, Trunk
@@ -46,6 +48,23 @@ def test_the_trunk_says_the_same_of_an_image_wherever_it_is_in_a_batch() -> None
     assert not any(parameter.requires_grad for parameter in trunk.parameters())
 
 
+def test_a_halved_image_is_read_as_if_it_were_doubled() -> None:
+    trunk, images = Trunk.pretrained(), torch.rand(2, 3, 72, 72, generator=torch.Generator().manual_seed(0))
+    doubled = trunk(nn.functional.interpolate(images, scale_factor=2, mode="bilinear"))
+    for found, expected in zip(trunk(images, halved=True), doubled, strict=True):
+        assert found.shape == expected.shape
+        torch.testing.assert_close(found[..., 6:-6, 6:-6], expected[..., 6:-6, 6:-6], atol=1e-3, rtol=1e-3)
+
+
+def test_the_locator_sees_the_fine_cells_side_by_side_with_the_coarse_ones() -> None:
+    features, images = FrameFeatures().eval(), torch.rand(2, 3, 96, 128, generator=torch.Generator().manual_seed(0))
+    features.trunk.load_state_dict(Trunk.pretrained().state_dict())
+    with torch.no_grad():
+        fine, coarse = features.trunk(images)
+        expected = features.context(torch.cat([nn.functional.pixel_unshuffle(fine, 2), coarse], dim=1))
+        torch.testing.assert_close(features(images), expected, atol=1e-4, rtol=1e-4)
+
+
 def test_the_quick_trunk_says_the_same() -> None:
     trunk, images = Trunk.pretrained(), torch.rand(5, 3, 160, 128, generator=torch.Generator().manual_seed(0))
     folded = copy.deepcopy(trunk)
@@ -56,6 +75,9 @@ def test_the_quick_trunk_says_the_same() -> None:
         for found, expected in zip(copy.deepcopy(network)(images), trunk(images), strict=True):
             torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
         assert network.state_dict().keys() == nn.Sequential(of_torch).state_dict().keys()
+        halved = (part(images, halved=True) for part in (network[0], of_torch))
+        for found, expected in zip(*halved, strict=True):
+            torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
         for weights in network.parameters():
             weights.zero_()
         assert network(images)[1].any()  # torch's weights are not asked any more
@@ -160,6 +182,21 @@ def test_a_pose_is_aligned_with_the_crop_that_it_belongs_to() -> None:
     assert float(found.score) > 0.98
 
 
+def test_derivatives_by_a_pose_are_those_of_small_changes() -> None:
+    random = np.random.default_rng(1)
+    rotation = random_rotations(3, random).double()
+    position = torch.from_numpy(random.uniform([-0.3, -0.3, 1.2], [0.3, 0.3, 1.8], (3, 3)))
+    points, focal = torch.from_numpy(random.uniform(-0.5, 0.5, (3, 7, 3))), torch.tensor([90.0, 130.0, 150.0]).double()
+    derivatives = torch.stack(InCrop.of(rotation, position, points).jacobians(focal), dim=1)  # [3, 2, 6, points]
+    for number, change in enumerate(1e-5 * torch.eye(6).double()):
+        turned = turn(change[None, :3]) @ rotation
+        by_change = (
+            InCrop.of(turned, position + change[3:], points).cells(focal, 40)
+            - InCrop.of(rotation, position, points).cells(focal, 40)
+        ) / 1e-5
+        torch.testing.assert_close(derivatives[:, :, number], by_change, atol=2e-3, rtol=1e-3)
+
+
 def test_the_localiser_finds_the_template_it_holds() -> None:
     localiser = Localiser(GEOMETRY)
     features = torch.randn(1, 40, *GEOMETRY.frame_cells, generator=torch.Generator().manual_seed(0))
@@ -177,9 +214,9 @@ def test_the_localiser_finds_the_template_it_holds() -> None:
     assert float(found.score[0, 0]) > 0.9
 
 
-def _random_network(steps: tuple[int, int, int] = STEPS, geometry: Geometry = GEOMETRY) -> TemplateNetwork:
+def _random_network(geometry: Geometry = GEOMETRY) -> TemplateNetwork:
     random = torch.Generator().manual_seed(0)
-    network = TemplateNetwork(geometry, steps, has_color=geometry.any_side)
+    network = TemplateNetwork(geometry, has_color=geometry.any_side)
     network.trunk.load_state_dict(Trunk.pretrained().state_dict())
     for name, buffer in (*network.localiser.named_buffers(), *network.reader.banks.named_buffers()):
         if buffer.is_floating_point() and name.startswith(("filters", "weights")):
@@ -205,7 +242,7 @@ def _random_bank(random: torch.Generator, views: int) -> Bank:
 @pytest.mark.parametrize("geometry", [GEOMETRY, FROM_ANY_SIDE])
 def test_a_frame_is_read_the_same_alone_and_among_others(geometry: Geometry, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(template_geometry, "NUM_VIEWS", 24)
-    network = _random_network(geometry=geometry)
+    network = _random_network(geometry)
     assert len(network.color) == 3 * geometry.any_side
     network.color.fill_(0.25)
     images = torch.rand(2, 3, 480, 640, generator=torch.Generator().manual_seed(1))
@@ -232,7 +269,9 @@ class _Graph(torch.nn.Module):
 def test_the_exported_graph_equals_torch_for_any_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     # With 220 each image is compared with 1,540 templates; with half of 48 the confidence hangs on rounding.
     monkeypatch.setattr(template_geometry, "NUM_VIEWS", 48)
-    graph, random = _Graph(_random_network((1, 0, 0))).eval(), np.random.default_rng(0)
+    network, random = _random_network(), np.random.default_rng(0)
+    network.reader.effort = network.reader.effort._replace(steps=(1, 0, 0))  # more take long to trace
+    graph = _Graph(network).eval()
     names = ["translation_m", "rotation_6d", "light", "confidence"]
     session = onnxruntime.InferenceSession(to_onnx(graph, 640, 480, names, Tracing(one_image=True)).SerializeToString())
     coarse = torch.from_numpy(random.integers(0, 255, (3, 3, 60, 80))).float()

@@ -35,7 +35,8 @@ class ExportCommand:
     """Convolutions in int8: faster and smaller, with --half also what is left. Draws renderings; refused if accuracy
     falls by a point."""
     fast: FlagCreatePairsOff[bool] = False
-    """Look at each of several objects in one crop a pass: a fourth of the time. For runs that learned from --photos."""
+    """Look at each of several objects once, in one crop of half the resolution: an eighth of the time. For runs that
+    learned from --photos."""
     cache: Path = CACHE
     """Where image sets that a world draws once are kept, for --int8 and --intervals."""
     intervals: FlagCreatePairsOff[bool] = False

@@ -39,7 +39,10 @@ from curio_train.worlds import build
 from curio_train.worlds.base import World
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
-_FAST = "; looks at each object in one crop a pass (--fast), which the confidence was not calibrated for"
+_FAST = (
+    "; looks at each object once, in one crop of half the resolution (--fast), which the confidence was not calibrated "
+    "for"
+)
 _LARGEST_STEP = 5e-4  # that rounding may move an answer in int8 by: half of what servers let golden answers differ by
 
 
@@ -92,7 +95,7 @@ def export(
         out: Folder of models.
         name: Of the model; unless given, made of the object's: a LineMOD class or the name of a mesh file.
         half: Store weights as float16, half as large; they are computed with in float32.
-        fast: Let a detector for several objects look at each in one crop a pass.
+        fast: Let a detector for several objects look at each once, in one crop of half the resolution.
         reduce: Applied to the float32 graph once that agrees with torch; stores the rest as ``half`` says.
         ahead: Gives the traced graph, where it has been traced before; not together with ``half``.
         report: Returns once the run's report is written, which the card quotes.

@@ -9,13 +9,18 @@ _CROSS = [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 
 
 
 def solve(matrix: Float[Tensor, "batch n n"], right: Float[Tensor, "batch n"]) -> Float[Tensor, "batch n"]:
-    """Solve by Gauss–Jordan elimination, written out: a positive definite matrix needs no pivots.
+    """Solve equations with a positive definite matrix."""
+    return solve_augmented(torch.cat([matrix, right.unsqueeze(2)], dim=2))
 
-    ``narrow`` instead of slices, of which an export traces one for each dimension that stays whole, too.
+
+def solve_augmented(system: Float[Tensor, "batch n n+1"]) -> Float[Tensor, "batch n"]:
+    """Solve equations whose right side is the last column, by Gauss–Jordan elimination, written out.
+
+    A positive definite matrix needs no pivots. ``narrow`` instead of slices, of which an export traces one for each
+    dimension that stays whole, too.
     """
-    count = matrix.shape[1]
-    identity = torch.eye(count, dtype=matrix.dtype, device=matrix.device)
-    system = torch.cat([matrix, right.unsqueeze(2)], dim=2)
+    count = system.shape[1]
+    identity = torch.eye(count, dtype=system.dtype, device=system.device)
     for number in range(count):
         row, column = system.narrow(1, number, 1), system.narrow(2, number, 1)
         system = system - (column - identity.narrow(1, number, 1)) * (row / row.narrow(2, number, 1))

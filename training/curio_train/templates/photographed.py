@@ -18,10 +18,10 @@ from curio_train.geometry import Pose, rotation_between
 from curio_train.metrics.poses import in_view
 from curio_train.networks.crop_camera import about_axis, cut_crops
 from curio_train.networks.several_objects.network import ObjectsNetwork
-from curio_train.networks.templates.alignment import FeatureMaps
+from curio_train.networks.templates.alignment import FeatureMaps, InCrop
 from curio_train.networks.templates.bank import RANK
 from curio_train.networks.templates.geometry import CROP_PX, FILL, NUM_ROLLS
-from curio_train.networks.templates.trunk import COARSE_STRIDE, FINE_STRIDE, FINE_WIDTH
+from curio_train.networks.templates.trunk import COARSE_STRIDE
 from curio_train.templates.describe import low_rank
 
 _RENDERED_POINTS, _RENDERED_CELLS = 0.3, 0.5  # weights of the renderings; a photograph from the very direction has 1
@@ -150,8 +150,7 @@ def _lean(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
 
 def _at_points(seen: _Seen, roll: int, points: Float[Tensor, "near points 3"]) -> Float[Tensor, "near points size"]:
     """Descriptors of a crop where it shows surface points."""
-    x, y, z = (points @ seen.pose.rotation[roll].T + seen.pose.translation_m[roll]).unbind(-1)
-    middle, scale = (seen.points.side * FINE_STRIDE - 1) / 2, seen.focal_px / z
+    where = InCrop.of(seen.pose.rotation[roll][None], seen.pose.translation_m[roll][None], points)
+    place = where.cells(seen.focal_px[None], seen.points.side)
     crop = torch.full((len(points),), roll)
-    found = seen.points.at(crop, (scale * x + middle) / FINE_STRIDE, (scale * y + middle) / FINE_STRIDE)
-    return F.normalize(found[..., :FINE_WIDTH], dim=-1)
+    return F.normalize(seen.points.around(crop, place).of(seen.points.here), dim=-1)

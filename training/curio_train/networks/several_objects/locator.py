@@ -54,9 +54,26 @@ class FrameFeatures(nn.Module):
         """Features of sRGB images in [0, 1]."""
         with torch.no_grad():
             fine, coarse = self.trunk(images)
-        together = torch.cat([F.pixel_unshuffle(fine, COARSE_STRIDE // FINE_STRIDE), coarse], dim=1)
-        features: Tensor = self.context(together)
+        beginning, *others = self.context
+        assert isinstance(beginning, nn.Sequential)
+        first, *rest = beginning
+        assert isinstance(first, nn.Conv2d)
+        features = _of_both(first, fine, coarse)
+        for layer in (*rest, *others):
+            features = layer(features)
         return features
+
+
+def _of_both(first: nn.Conv2d, fine: Tensor, coarse: Tensor) -> Tensor:
+    """The first convolution, of the fine map's cells side by side (``pixel_unshuffle``) and the coarse map.
+
+    The fine map's weights are laid out as its cells are, so that an exported graph does not move cells.
+    """
+    ratio = COARSE_STRIDE // FINE_STRIDE
+    of_fine, of_coarse = first.weight.split((ratio**2 * FINE_WIDTH, COARSE_WIDTH), dim=1)
+    cells = of_fine.unflatten(1, (FINE_WIDTH, ratio, ratio))  # [outputs, channels, down, across, rows, columns]
+    of_fine = cells.permute(0, 1, 4, 2, 5, 3).flatten(4, 5).flatten(2, 3)
+    return F.conv2d(fine, of_fine, None, ratio, ratio) + F.conv2d(coarse, of_coarse, first.bias, padding=1)
 
 
 class LocatorNetwork(StageNetwork):
@@ -85,36 +102,41 @@ class LocatorNetwork(StageNetwork):
         self, features: Float[Tensor, "batch channels rows columns"]
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """No raw values, and the likeliest position of each object, with all proposals beside it."""
-        heat, proposals = self._proposals(features)
-        found = self._top(heat, proposals, 1)
-        confidence = found.logit.sigmoid()
-        return {}, {
-            TRANSLATION: found.position_m[:, :, 0],
-            CONFIDENCE: confidence,
-            HEAT_MAPS: heat,
-            PROPOSALS: proposals,
-        }
+        values = self._values(features)
+        heat, proposals = values[:, 0], self._proposals(values, self.grid.pixels)
+        cells, logit = self._top(heat, 1)
+        position = proposals.gather(2, cells[..., None].expand(-1, -1, -1, 3))[:, :, 0]
+        code = {TRANSLATION: position, CONFIDENCE: logit.sigmoid()}
+        return {}, code | {HEAT_MAPS: heat, PROPOSALS: proposals}
 
     def places(self, images: Float[Tensor, "batch 3 height width"], num: int, slots: Int[Tensor, " objects"]) -> Found:
         """The likeliest ``num`` places, not beside each other, of each of the objects in ``slots``."""
-        heat, proposals = self._proposals(self.encoder(images))
-        return self._top(heat[:, slots], proposals[:, slots], num)
+        values = self._values(self.encoder(images)).index_select(2, slots)
+        cells, logit = self._top(values[:, 0], num)
+        pixels = self.grid.pixels.index_select(0, cells.flatten()).unflatten(0, (-1, *cells.shape[1:]))
+        chosen = values.gather(3, cells[:, None].expand(-1, _VALUES, -1, -1))
+        return Found(self._proposals(chosen, pixels), logit)
+
+    def _values(self, features: Tensor) -> Float[Tensor, "batch 4 objects cells"]:
+        """Heat, column, row and distance, of each object in each cell."""
+        return self.head(features).flatten(2).unflatten(1, (_VALUES, self._num))
 
     def _proposals(
-        self, features: Tensor
-    ) -> tuple[Float[Tensor, "batch objects cells"], Float[Tensor, "batch objects cells 3"]]:
-        values = self.head(features).flatten(2).unflatten(1, (_VALUES, self._num))
-        heat, shift, along = values[:, 0], values[:, 1:3].permute(0, 2, 3, 1), values[:, 3, ..., None]
-        return heat, self.grid.locate(self.grid.pixels + STRIDE * shift, along.tanh())
+        self, values: Float[Tensor, "batch 4 objects cells"], pixels: Float[Tensor, "*objects cells 2"]
+    ) -> Float[Tensor, "batch objects cells 3"]:
+        """The positions that cells at these pixels propose."""
+        shift, along = values[:, 1:3].permute(0, 2, 3, 1), values[:, 3, ..., None]
+        return self.grid.locate(pixels + STRIDE * shift, along.tanh())
 
-    def _top(self, heat: Tensor, proposals: Tensor, num: int) -> Found:
-        """Non-maximum suppression: the likeliest cell, the likeliest of those not near it, and so on."""
-        pixels = self.grid.pixels
-        positions, logits = [], []
+    def _top(
+        self, heat: Float[Tensor, "batch objects cells"], num: int
+    ) -> tuple[Int[Tensor, "batch objects num"], Float[Tensor, "batch objects num"]]:
+        """Non-maximum suppression: the likeliest cell, the likeliest of those not near it, and so on; their logits."""
+        pixels, cells, logits = self.grid.pixels, [], []
         for _ in range(num):
             logit, best = heat.max(dim=2)
             logits.append(logit)
-            positions.append(proposals.gather(2, best[..., None, None].expand(-1, -1, 1, 3))[:, :, 0])
+            cells.append(best)
             near = (pixels - pixels[best][:, :, None]).square().sum(dim=-1) < (_APART_CELLS * STRIDE) ** 2
             heat = torch.where(near, _SUPPRESSED, heat)
-        return Found(torch.stack(positions, dim=2), torch.stack(logits, dim=2))
+        return torch.stack(cells, dim=2), torch.stack(logits, dim=2)

@@ -56,12 +56,13 @@ class ObjectsNetwork(nn.Module):
         self.register_buffer("_diameter_m", diameter_m, persistent=False)
 
     def look_less(self) -> None:
-        """Look at the likeliest place of each object alone, in one crop a pass: a fourth of the time.
+        """Look at the likeliest place of each object alone, once, in one crop of half the resolution.
 
-        For locators that learned from photographs, whose first place is right nine times in ten
-        (docs/experiments/real_photographs.md). The confidence stays calibrated for looking more.
+        It takes an eighth of the time. For locators that learned from photographs, whose first place is right nine
+        times in ten (docs/experiments/real_photographs.md). The confidence stays calibrated for looking more.
         """
-        self._num_places, self.reader.effort = 1, Effort(hypotheses=1, closer=1, rolls_deg=(0.0,))
+        self._num_places = 1
+        self.reader.effort = Effort(closer=0, rolls_deg=(0.0,), margin_px=8, steps=(0, 3, 4), halved=True)
 
     def forward(
         self, images: Float[Tensor, "batch 3 height width"], slots: Int[Tensor, " objects"] | None = None
@@ -92,4 +93,4 @@ class ObjectsNetwork(nn.Module):
     def _aligned(self, images: Tensor, code: dict[str, Tensor], slots: Tensor) -> dict[str, Tensor]:
         if self.outline is None:
             return code
-        return self.outline.of_objects(images, self._matrix, code, self._diameter_m[slots], slots)
+        return self.outline.of_objects(images, self._matrix, code, self._diameter_m.index_select(0, slots), slots)

@@ -8,51 +8,78 @@ it can be part of an exported graph.
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from curio_train.networks.pose_steps import solve, turn
-from curio_train.networks.templates.trunk import FINE_STRIDE, FINE_WIDTH
+from curio_train.networks.pose_steps import solve_augmented, turn
+from curio_train.networks.templates.trunk import FINE_STRIDE
 
 _DAMPING = 1e-2  # of the Hessian's diagonal
 _RIDGE = 1e-6
 _LARGEST_STEP = 0.2  # radians and diameters together
+_NEAREST = 1e-3  # diameters
 _OUTLIER = 0.5  # squared distance of descriptors at which a point counts a quarter (Geman and McClure 1985)
+
+_BY_ARM = [  # what rotations and shifts move x, then y, then z by, from the arm: six rows each
+    *([0, 0, 0], [0, 0, 1], [0, -1, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]),
+    *([0, 0, -1], [0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]),
+    *([0, 1, 0], [-1, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]),
+]
+_BY_SHIFT = [[float(row in (3, 10, 17))] for row in range(18)]  # and without it
 
 
 class FeatureMaps(NamedTuple):
-    """Descriptors of crops, and their derivatives across and down a cell; cell (i, j) lies at crop pixel (4 i, 4 j)."""
+    """Descriptors of crops, and twice their derivatives across and down a cell.
 
-    values: Float[Tensor, "crops*side*side 3*size"]
-    """Cell after cell, row after row, crop after crop."""
+    In each map, cell after cell, row after row, crop after crop; cell (i, j) lies at crop pixel (4 i, 4 j).
+    """
+
+    here: Float[Tensor, "crops*side*side size"]
+    """Descriptors."""
+    across: Float[Tensor, "crops*side*side size"]
+    """Those of the cell to the right less those of the cell to the left."""
+    down: Float[Tensor, "crops*side*side size"]
+    """Those of the cell below less those of the cell above."""
     side: int
     """Cells along a side of the crop."""
 
     @classmethod
     def of(cls, descriptors: Float[Tensor, "crops size side side"]) -> "FeatureMaps":
         """The maps of descriptors."""
-        padded = F.pad(descriptors, (1, 1, 1, 1), mode="replicate")
-        across = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
-        down = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
-        together = torch.cat([descriptors, across, down], dim=1)
-        return cls(together.permute(0, 2, 3, 1).flatten(0, 2), descriptors.shape[-1])
+        here, side = descriptors.permute(0, 2, 3, 1), descriptors.shape[-1]
+        cells = torch.arange(side, device=descriptors.device)
+        before, after = (cells - 1).clamp(min=0), (cells + 1).clamp(max=side - 1)
+        across, down = (here.index_select(axis, after) - here.index_select(axis, before) for axis in (2, 1))
+        here, across, down = (values.flatten(0, 2) for values in (here, across, down))
+        return cls(here, across, down, side)
 
-    def at(
-        self, crop: Int[Tensor, " batch"], column: Float[Tensor, "batch points"], row: Float[Tensor, "batch points"]
-    ) -> Float[Tensor, "batch points 3*size"]:
-        """Bilinear values; those of the border where a point lies outside."""
-        column, row = column.clamp(0, self.side - 1), row.clamp(0, self.side - 1)
-        left, top = column.floor().clamp(max=self.side - 2), row.floor().clamp(max=self.side - 2)
-        right, below = (column - left)[..., None], (row - top)[..., None]
-        first = (crop[:, None] * self.side + top.long()) * self.side + left.long()
-        # index_select and sums, not indexing and lerp, which take an exported graph several times as long.
-        upper_left, upper_right, lower_left, lower_right = (
-            self.values.index_select(0, (first + step).flatten()).unflatten(0, first.shape)
-            for step in (0, 1, self.side, self.side + 1)
+    def around(self, crop: Int[Tensor, " batch"], place: Float[Tensor, "batch 2 points"]) -> "Corners":
+        """The cells around columns and rows; those at the border where a point lies outside."""
+        place = place.clamp(0, self.side - 1)
+        first = place.floor().clamp(max=self.side - 2)
+        column, row = first.split(1, dim=1)
+        number = (self.side * row + column).long() + (crop * self.side**2)[:, None, None]
+        right, below = (place - first).split(1, dim=1)
+        left, above = 1 - right, 1 - below
+        return Corners(
+            number + torch.tensor([[0], [1], [self.side], [self.side + 1]], device=number.device),
+            torch.cat([left * above, right * above, left * below, right * below], dim=1),
         )
-        upper, lower = upper_left + right * (upper_right - upper_left), lower_left + right * (lower_right - lower_left)
-        return upper + below * (lower - upper)
+
+
+class Corners(NamedTuple):
+    """The four cells around each of a number of points, with bilinear weights."""
+
+    cell: Int[Tensor, "batch 4 points"]
+    """Numbers of the cells in a map."""
+    weight: Float[Tensor, "batch 4 points"]
+    """Sum to 1 for each point."""
+
+    def of(self, values: Float[Tensor, "cells size"]) -> Float[Tensor, "batch points size"]:
+        """Bilinear values of a map."""
+        # index_select and a sum, not indexing and lerp, which take an exported graph several times as long.
+        corners = values.index_select(0, self.cell.flatten()).unflatten(0, (-1, *self.cell.shape[1:]))
+        return (self.weight[..., None] * corners).sum(dim=1)
 
 
 class Aligned(NamedTuple):
@@ -90,21 +117,46 @@ def align(
     for _ in range(num_steps):
         step = _step(maps, crop, points, wanted, rotation, position, focal_px)
         rotation, position = turn(step[:, :3]) @ rotation, position + step[:, 3:]
-    _, seen = _sample(maps, crop, points, rotation, position, focal_px)
-    here = seen[..., :FINE_WIDTH]
+    here = maps.around(crop, InCrop.of(rotation, position, points).cells(focal_px, maps.side)).of(maps.here)
     cosine = (here * wanted).sum(dim=-1) / here.square().sum(dim=-1).clamp(min=1e-12).sqrt()
     return Aligned(rotation, position, cosine.mean(dim=1))
 
 
-def _sample(
-    maps: FeatureMaps, crop: Tensor, points: Tensor, rotation: Tensor, position: Tensor, focal_px: Tensor
-) -> tuple[Float[Tensor, "batch points 3"], Float[Tensor, "batch points 3*size"]]:
-    """Points in the crop's camera, and the maps where it sees them."""
-    seen = points @ rotation.transpose(1, 2) + position[:, None]
-    middle = (maps.side * FINE_STRIDE - 1) / 2
-    x, y, z = seen.unbind(-1)
-    scale = focal_px[:, None] / z.clamp(min=1e-3)
-    return seen, maps.at(crop, (scale * x + middle) / FINE_STRIDE, (scale * y + middle) / FINE_STRIDE)
+class InCrop(NamedTuple):
+    """Points in the cameras of their crops; the points are last, which exported graphs compute quickest."""
+
+    arm: Float[Tensor, "batch 3 points"]
+    """From the object's centre to the points, diameters."""
+    slope: Float[Tensor, "batch 2 points"]
+    """Columns and rows, divided by the focal length, from the middle of the crop."""
+    nearness: Float[Tensor, "batch 1 points"]
+    """One over the distance along the optical axis."""
+
+    @classmethod
+    def of(
+        cls,
+        rotation: Float[Tensor, "batch 3 3"],
+        position: Float[Tensor, "batch 3"],
+        points: Float[Tensor, "batch points 3"],
+    ) -> "InCrop":
+        """Points of objects in poses, diameters."""
+        arm = rotation @ points.transpose(1, 2)
+        across, along = (arm + position[..., None]).split((2, 1), dim=1)
+        nearness = 1 / along.clamp(min=_NEAREST)
+        return cls(arm, across * nearness, nearness)
+
+    def cells(self, focal_px: Float[Tensor, " batch"], side: int) -> Float[Tensor, "batch 2 points"]:
+        """Columns and rows of a map of ``side`` cells."""
+        middle = (side * FINE_STRIDE - 1) / 2
+        return self.slope * (focal_px / FINE_STRIDE)[:, None, None] + middle / FINE_STRIDE
+
+    def jacobians(self, focal_px: Float[Tensor, " batch"]) -> list[Float[Tensor, "batch 6 points"]]:
+        """Derivatives of columns, and of rows, in cells, by a rotation vector and by a shift."""
+        by_arm, by_shift = (self.arm.new_tensor(values) for values in (_BY_ARM, _BY_SHIFT))
+        *of_across, of_along = (by_arm @ self.arm + by_shift).split(6, dim=1)
+        scale = self.nearness * (focal_px / FINE_STRIDE)[:, None, None]
+        slopes = self.slope.split(1, dim=1)
+        return [(moved - slope * of_along) * scale for moved, slope in zip(of_across, slopes, strict=True)]
 
 
 def _step(
@@ -117,33 +169,25 @@ def _step(
     focal_px: Tensor,
 ) -> Float[Tensor, "batch 6"]:
     """A rotation vector about the object's centre, then a shift in diameters."""
-    seen, found = _sample(maps, crop, points, rotation, position, focal_px)
-    here, across, down = found.split(FINE_WIDTH, dim=-1)
-    residual = here - wanted
-    weight = 1 / (1 + residual.square().sum(dim=-1) / _OUTLIER).square()
-    x, y, z = seen.unbind(-1)
-    scale, zero = focal_px[:, None] / FINE_STRIDE / z, torch.zeros_like(z)
-    arm = seen - position[:, None]
-    u = _by_pose(torch.stack([scale, zero, -scale * x / z], dim=-1), arm)
-    v = _by_pose(torch.stack([zero, scale, -scale * y / z], dim=-1), arm)
-    jacobian = torch.cat([u, v], dim=1)  # [batch, 2 points, 6]
-    uu, uv, vv = ((a * b).sum(dim=-1) * weight for a, b in ((across, across), (across, down), (down, down)))
-    of_u = uu[..., None] * u + uv[..., None] * v
-    of_v = uv[..., None] * u + vv[..., None] * v
-    hessian = jacobian.transpose(1, 2) @ torch.cat([of_u, of_v], dim=1)
-    slope = torch.cat([(across * residual).sum(dim=-1) * weight, (down * residual).sum(dim=-1) * weight], dim=1)
-    gradient = (jacobian.transpose(1, 2) @ slope[..., None])[..., 0]
-    step = -solve(_damped(hessian), gradient)
+    seen = InCrop.of(rotation, position, points)
+    corners = maps.around(crop, seen.cells(focal_px, maps.side))
+    here, across, down = (corners.of(values) for values in (maps.here, maps.across, maps.down))
+    lacking = wanted - here
+    weight = 1 / (1 + lacking.square().sum(dim=-1) / _OUTLIER).square()
+    uu, uv, vv, u, v = (
+        ((one * other).sum(dim=-1) * weight)[:, None]
+        for one, other in ((across, across), (across, down), (down, down), (across, lacking), (down, lacking))
+    )
+    by_u, by_v = seen.jacobians(focal_px / 2)  # the maps hold twice the derivatives
+    of_u, of_v = (torch.cat([a * by_u + b * by_v, right], dim=1) for a, b, right in ((uu, uv, u), (uv, vv, v)))
+    normal = torch.cat([by_u, by_v], dim=2) @ torch.cat([of_u, of_v], dim=2).transpose(1, 2)
+    step = solve_augmented(_damped(normal))
     length = step.square().sum(dim=1, keepdim=True).clamp(min=1e-12).sqrt()
     return step * (_LARGEST_STEP / length).clamp(max=1)
 
 
-def _by_pose(by_point: Float[Tensor, "batch points 3"], arm: Float[Tensor, "batch points 3"]) -> Tensor:
-    """The derivative by rotation and shift from the one by a point's position, [batch, points, 6]."""
-    return torch.cat([torch.linalg.cross(arm, by_point), by_point], dim=-1)
-
-
-def _damped(hessian: Float[Tensor, "batch 6 6"]) -> Float[Tensor, "batch 6 6"]:
-    identity = torch.eye(6, dtype=hessian.dtype, device=hessian.device)
-    diagonal = (hessian * identity).sum(dim=2)
-    return hessian + identity * (_DAMPING * diagonal + _RIDGE * (1 + diagonal.mean(dim=1, keepdim=True)))[:, None]
+def _damped(system: Float[Tensor, "batch 6 7"]) -> Float[Tensor, "batch 6 7"]:
+    """Normal equations, the right side last, with a heavier diagonal."""
+    identity = torch.eye(6, 7, dtype=system.dtype, device=system.device)
+    mean = (system * identity).sum(dim=(1, 2), keepdim=True) / 6
+    return system * (1 + _DAMPING * identity) + _RIDGE * (1 + mean) * identity

@@ -117,13 +117,13 @@ class Banks(nn.Module):
     ) -> Float[Tensor, "batch asked num shifts templates"]:
         """Mean cosine over each template's silhouette, at every shift of whole cells, of the objects in ``slots``."""
         columns, side = features.shape[-1], self.filters.shape[-1]
-        centred = features.flatten(-2).transpose(-1, -2) - self.coarse_mean[slots][:, None, None]
-        described = normalised(centred @ self.coarse_projection[slots].transpose(1, 2)[:, None], dim=-1)
+        centred = features.flatten(-2).transpose(-1, -2) - self.coarse_mean.index_select(0, slots)[:, None, None]
+        described = normalised(centred @ self.coarse_projection.index_select(0, slots).transpose(1, 2)[:, None], dim=-1)
         cells = _windows(columns, side).to(features.device)
         windows = described.index_select(-2, cells.flatten()).unflatten(-2, cells.shape).flatten(-2)
         # As floats before the choice: a runtime then converts them once, not with every image.
         filters = self.filters.permute(0, 3, 4, 2, 1).flatten(1, 3).float().index_select(0, slots)
-        filtered = windows @ filters[:, None] * self.match_scale[slots][:, None, None]
+        filtered = windows @ filters[:, None] * self.match_scale.index_select(0, slots)[:, None, None]
         found: Tensor = filtered @ self.weights.transpose(1, 2).float().index_select(0, slots)[:, None]
         return found
 
@@ -132,7 +132,9 @@ class Banks(nn.Module):
     ) -> Float[Tensor, "batch*asked*num channels rows columns"]:
         """Descriptors at stride 4 of crops, ``num`` an object."""
         by_object = features.unflatten(0, (-1, slots.shape[0], num))
-        return normalised(by_object - self.fine_mean[slots][:, None, :, None, None], dim=3).flatten(0, 2)
+        return normalised(by_object - self.fine_mean.index_select(0, slots)[:, None, :, None, None], dim=3).flatten(
+            0, 2
+        )
 
     def surface(
         self, templates: Int[Tensor, "batch*asked num"], slots: Int[Tensor, " asked"]
@@ -141,7 +143,10 @@ class Banks(nn.Module):
         count, by_object = self.points.shape[1], templates.unflatten(0, (-1, slots.shape[0]))
         number = slots[:, None].expand_as(by_object).flatten()
         row = number * count + by_object.flatten()
-        points = self.points.flatten(0, 1).index_select(0, row).float() * self.points_scale[number][:, None, None]
+        points = (
+            self.points.flatten(0, 1).index_select(0, row).float()
+            * self.points_scale.index_select(0, number)[:, None, None]
+        )
         first = number[:, None, None] * _PARTS + torch.arange(_PARTS, device=templates.device)
         codeword = first * CODEWORDS + self.codes.flatten(0, 1).index_select(0, row).long()
         described = self.codewords.flatten(0, 2).float().index_select(0, codeword.flatten())
@@ -153,7 +158,10 @@ class Banks(nn.Module):
         """Points on the outlines of templates, diameters, and vectors out of them; a template an object."""
         number = slots.expand(templates.unflatten(0, (-1, slots.shape[0])).shape).flatten()
         row = number * self.outline.shape[1] + torch.div(templates, NUM_ROLLS, rounding_mode="floor")
-        points = self.outline.flatten(0, 1).index_select(0, row).float() * self.outline_scale[number][:, None, None]
+        points = (
+            self.outline.flatten(0, 1).index_select(0, row).float()
+            * self.outline_scale.index_select(0, number)[:, None, None]
+        )
         return points, self.outward.flatten(0, 1).index_select(0, row).float()
 
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from curio_train.networks.outline_alignment import OutlineAlignment
 from curio_train.networks.templates.geometry import FRAME_STRIDE, Geometry, num_views
 from curio_train.networks.templates.localiser import Localiser
-from curio_train.networks.templates.reader import STEPS, CalibrationFeatures, Places, PoseReader
+from curio_train.networks.templates.reader import CalibrationFeatures, Places, PoseReader
 from curio_train.networks.templates.trunk import Trunk
 from curio_train.scene_code import COLOR, TRANSLATION
 
@@ -35,7 +35,6 @@ class TemplateNetwork(nn.Module):
     def __init__(
         self,
         geometry: Geometry,
-        steps: tuple[int, int, int] = STEPS,
         *,
         has_color: bool = False,
         aligns_outlines: bool = False,
@@ -44,12 +43,11 @@ class TemplateNetwork(nn.Module):
 
         Args:
             geometry: Of frames and object.
-            steps: See :data:`STEPS`.
             has_color: Whether codes have a colour.
             aligns_outlines: Whether poses are aligned with the object's outline in the end.
         """
         super().__init__()
-        self.trunk, self.localiser, self.reader = Trunk(), Localiser(geometry), PoseReader([geometry], steps)
+        self.trunk, self.localiser, self.reader = Trunk(), Localiser(geometry), PoseReader([geometry])
         self.outline = OutlineAlignment(num_views(geometry.any_side)) if aligns_outlines else None
         self.geometry = geometry
         self.register_buffer("_matrix", torch.from_numpy(geometry.matrix).float(), persistent=False)

@@ -26,15 +26,17 @@ def outline_log_factor(
     outward: Float[Tensor, "rows points 3"],
     pose: Aligned,
     focal_px: Float[Tensor, " rows"],
+    side: int,
 ) -> Float[Tensor, " rows"]:
     """Logarithm of what distances have to be multiplied by, so that outlines lie on the clearest edges; at most 6 %.
 
     Args:
-        pictures: Crops, sRGB in [0, 1].
+        pictures: Crops, sRGB in [0, 1], at any resolution.
         outline: Points of the object that are seen on its outline, diameters, object frame.
         outward: What turns away from the object there, across the line of sight, object frame.
         pose: Of the object in its crop's camera.
         focal_px: Of the crops' cameras, whose principal points are their middles.
+        side: Of the crops' cameras, pixels.
     """
     turn = pose.rotation.transpose(1, 2)
     seen = outline @ turn + pose.position[:, None]
@@ -42,9 +44,9 @@ def outline_log_factor(
     across = F.normalize(along[..., :2] - slope * along[..., 2:], dim=-1)
     centre = pose.position[:, None, :2] / pose.position[:, None, 2:].clamp(min=1e-3)
     lever_px = focal_px[:, None] * ((slope - centre) * across).sum(dim=-1)
-    middle = (pictures.shape[-1] - 1) / 2
+    middle = (side - 1) / 2
     shift_px = _shifts_px(slope)
-    edges = _edges(pictures, focal_px[:, None, None] * slope + middle + shift_px * across, across)
+    edges = _edges(pictures, focal_px[:, None, None] * slope + middle + shift_px * across, across, side)
     factors = torch.linspace(-_FARTHEST, _FARTHEST, _NUM_SCALES, device=pictures.device)
     column = (_REACH_PX - lever_px[..., None] * factors - shift_px).clamp(0, 2 * _REACH_PX)
     left = column.floor().clamp(max=2 * _REACH_PX - 1)
@@ -63,14 +65,14 @@ def _shifts_px(points: Float[Tensor, "rows points 2"]) -> Float[Tensor, "points 
 
 
 def _edges(
-    pictures: Tensor, pixels: Float[Tensor, "rows points 2"], across: Float[Tensor, "rows points 2"]
+    pictures: Tensor, pixels: Float[Tensor, "rows points 2"], across: Float[Tensor, "rows points 2"], side: int
 ) -> Float[Tensor, "rows points offsets"]:
     """How clear an edge is at each whole pixel from ``_REACH_PX`` inside to as far outside, 0 to 1."""
     reach = _REACH_PX + _WIDTH_PX
     offsets = torch.arange(-reach, reach + 1, device=pictures.device, dtype=pictures.dtype)
     places = pixels[:, :, None] + offsets[:, None] * across[:, :, None]
     border = 1 - 1 / pictures.shape[-1]
-    grid = ((2 * places + 1) / pictures.shape[-1] - 1).clamp(-border, border)  # as the grids of crop cameras
+    grid = ((2 * places + 1) / side - 1).clamp(-border, border)  # as the grids of crop cameras
     colors = F.grid_sample(pictures, grid, align_corners=False)  # [rows, 3, points, offsets]
     strips = F.avg_pool2d(colors, (1, _WIDTH_PX), stride=1)
     difference = (strips[..., _WIDTH_PX + 1 :] - strips[..., : -_WIDTH_PX - 1]).square().sum(dim=1)

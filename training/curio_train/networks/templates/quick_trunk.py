@@ -1,6 +1,7 @@
 """The frozen trunk as onnxruntime computes it on a CPU, in a tenth of torch's time."""
 
 import copy
+from collections.abc import Iterable
 from typing import Any, Self
 
 import numpy as np
@@ -27,24 +28,26 @@ def quicken(network: nn.Module) -> None:
     """
     for module in network.modules():
         if isinstance(module, Trunk):
-            module.quick = _Session(_Graph(module).content)
+            module.quick = _Sessions(module)
 
 
-class _Session:
-    """What onnxruntime runs; copies of a network share it."""
+class _Sessions:
+    """What onnxruntime runs, for images as they are and for halved ones; copies of a network share it."""
 
-    def __init__(self, content: bytes) -> None:
-        self._session = open_session(content, "the pretrained features", (CPU,))
+    def __init__(self, trunk: Trunk) -> None:
+        name = "the pretrained features"
+        self._sessions = [open_session(_Graph(trunk, halved).content, name, (CPU,)) for halved in (False, True)]
 
-    def __call__(self, images: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, images: Tensor, halved: bool) -> tuple[Tensor, Tensor]:
         """As the trunk does, a few images at a time."""
-        num = max(1, _PIXELS_AT_ONCE // (images.shape[2] * images.shape[3]))
-        fine, coarse = zip(*(self._few(part) for part in images.detach().split(num)), strict=True)
-        return torch.cat(fine), torch.cat(coarse)
-
-    def _few(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        fine, coarse = self._session.run([_FINE, _COARSE], {_IMAGES: images.contiguous().numpy()})
-        return torch.from_numpy(fine), torch.from_numpy(coarse)
+        session = self._sessions[halved]
+        num = max(1, _PIXELS_AT_ONCE // (images.shape[2] * images.shape[3] * (4 if halved else 1)))
+        parts = (part.contiguous().numpy() for part in images.detach().split(num))
+        found = [session.run([_FINE, _COARSE], {_IMAGES: part}) for part in parts]
+        fine, coarse = (
+            torch.cat([torch.from_numpy(values) for values in of_all]) for of_all in zip(*found, strict=True)
+        )
+        return fine, coarse
 
     def __deepcopy__(self, memo: object) -> Self:
         return self
@@ -53,7 +56,7 @@ class _Session:
 class _Graph:
     """A trunk written down as an ONNX graph: it is simple, and tracing it takes seconds at each start."""
 
-    def __init__(self, trunk: Trunk) -> None:
+    def __init__(self, trunk: Trunk, halved: bool) -> None:
         trunk = copy.deepcopy(trunk).cpu().eval()
         fold_batch_norm(trunk)
         self._nodes: list[NodeProto] = []
@@ -61,7 +64,10 @@ class _Graph:
         scaled = self._add("Mul", _IMAGES, self._constant(np.float32(255 / SPREAD)))
         scaled = self._add("Sub", scaled, self._constant(np.float32(MEAN / SPREAD)))
         self._limits = [self._constant(np.float32(limit)) for limit in (0, 6)]  # of ReLU6
-        features = self._layers(trunk.stem, scaled)
+        first, *others = trunk.stem
+        assert isinstance(first, nn.Conv2d)
+        first.weight.data, first.stride = trunk.first_weight(halved), (1, 1) if halved else (2, 2)
+        features = self._layers((first, *others), scaled)
         ends = []
         for block in trunk.blocks:
             assert isinstance(block, Block)
@@ -85,7 +91,7 @@ class _Graph:
         content: bytes = model.SerializeToString()
         return content
 
-    def _layers(self, layers: nn.Sequential, values: str) -> str:
+    def _layers(self, layers: Iterable[nn.Module], values: str) -> str:
         for layer in layers:
             if isinstance(layer, nn.Conv2d):
                 assert layer.bias is not None  # batch norm's

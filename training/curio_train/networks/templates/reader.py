@@ -20,13 +20,9 @@ from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 NUM_NEIGHBOURS = 4
 """Templates around the best hypothesis whose answers are averaged, in each crop of its place."""
 
-STEPS = (3, 5, 4)
-"""Steps of the alignment: in the first pass, in the second, and of the best hypothesis with its neighbours."""
-
 LAMP = (0.0, -0.7, -0.7)
 """The light that templates are drawn under and that is answered: it is not read from images."""
 
-_MARGIN_PX = 16  # of crops in which templates are shifted, to each side
 _ALIKE_COS = 0.94  # 20 degrees between the rotations of hypotheses at one place
 _ONE_PLACE = 0.5  # diameters
 _SHARPNESS = 20.0  # of the neighbours' weights, a unit of score
@@ -39,9 +35,15 @@ class Effort(NamedTuple):
     hypotheses: int = 3
     """Poses that each pass aligns."""
     closer: int = 2
-    """Number of poses of the first pass around which crops are cut again, at their own distance."""
+    """Number of poses of the first pass around which crops are cut again, at their own distance; 0: one pass is all."""
     rolls_deg: tuple[float, ...] = ROLLS_DEG
-    """Rolls of the crops of the second pass; an odd number around 0."""
+    """Rolls of the crops of the second pass; an odd number around 0, and 0 alone where there is no second pass."""
+    margin_px: int = 16
+    """Pixels of crops in which templates are shifted, to each side; a multiple of the coarse stride."""
+    steps: tuple[int, int, int] = (3, 5, 4)
+    """Steps of the alignment: in the first of two passes, in the last, and of the best pose with its neighbours."""
+    halved: bool = False
+    """Whether crops are cut at half of the resolution, and the trunk reads them as if they were doubled."""
 
 
 class Places(NamedTuple):
@@ -104,7 +106,7 @@ class _Hypotheses(NamedTuple):
 
     def in_frame(self, crops: _Crops) -> Float[Tensor, "rows 3"]:
         """Positions in the camera frame of the image, diameters."""
-        return (crops.cam_from_crop[self.crop] @ self.pose.position[..., None])[..., 0]
+        return (crops.cam_from_crop.index_select(0, self.crop) @ self.pose.position[..., None])[..., 0]
 
 
 class PoseReader(nn.Module):
@@ -123,17 +125,16 @@ class PoseReader(nn.Module):
     _nearest_m: Tensor
     _lamp: Tensor
 
-    def __init__(self, geometries: Sequence[Geometry], steps: tuple[int, int, int] = STEPS) -> None:
+    def __init__(self, geometries: Sequence[Geometry]) -> None:
         """Build for objects in frames of one camera; all templates are still empty.
 
         Args:
             geometries: One an object.
-            steps: See :data:`STEPS`.
         """
         super().__init__()
         num, self.effort = len(geometries), Effort()
         self._any_side = geometries[0].any_side
-        self.banks, self._steps = Banks(num, self._any_side), steps
+        self.banks = Banks(num, self._any_side)
         self.register_buffer("pose_correct", torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]).repeat(num, 1))
         for name, values in {
@@ -147,7 +148,7 @@ class PoseReader(nn.Module):
     def forward(self, trunk: Trunk, images: Float[Tensor, "batch 3 height width"], places: Places) -> dict[str, Tensor]:
         """Codes in the frame's camera: metres, 6D rotation and confidence [batch, objects, …], light [batch, 3]."""
         code, features = self.read(trunk, images, places)
-        right, there = self.pose_correct[places.slots], self.presence[places.slots]
+        right, there = (of_all.index_select(0, places.slots) for of_all in (self.pose_correct, self.presence))
         sure = _probability(features.right, right) * _probability(features.there, there)
         return code | {CONFIDENCE: sure[..., None]}
 
@@ -155,18 +156,19 @@ class PoseReader(nn.Module):
         self, trunk: Trunk, images: Float[Tensor, "batch 3 height width"], places: Places
     ) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code without its confidence, and what that is made of."""
-        places, roll = self._closer(trunk, images, places)
+        places, roll = self._closer(trunk, images, places) if self.effort.closer else self._turned(places)
         crops = self._crops(trunk, images, places, roll)
-        best = self._best(self._aligned(crops, self._hypotheses(crops, places), self._steps[1]))
+        best = self._best(self._aligned(crops, self._hypotheses(crops, places), self.effort.steps[1]))
         pose, spread = self._averaged(crops, best)
         pose, gap = self._between(crops, best.crop, pose)
 
         found, by_object = best._replace(pose=pose), crops.by_object
-        position_m = by_object(found.in_frame(crops)) * self._diameter_m[places.slots][:, None]
+        cam_from_crop = crops.cam_from_crop.index_select(0, best.crop)
+        position_m = by_object(found.in_frame(crops)) * self._diameter_m.index_select(0, places.slots)[:, None]
         score, place = by_object(10 * pose.score), by_object(best.place_score)
         return {
             TRANSLATION: position_m,
-            ROTATION_6D: by_object(rotation_6d_from_matrix(crops.cam_from_crop[best.crop] @ pose.rotation)),
+            ROTATION_6D: by_object(rotation_6d_from_matrix(cam_from_crop @ pose.rotation)),
             LIGHT: self._lamp.expand(images.shape[0], 3),
         }, CalibrationFeatures(
             torch.stack([score, by_object(-100 * spread), by_object(-100 * gap.abs())], dim=2),
@@ -181,16 +183,19 @@ class PoseReader(nn.Module):
         """
         places, turn = self._turned(places)
         crops = self._crops(trunk, images, places, turn)
-        found = self._aligned(crops, self._hypotheses(crops, places), self._steps[0])
-        upward = (crops.cam_from_crop[found.crop] @ found.pose.rotation)[..., 2]
+        found = self._aligned(crops, self._hypotheses(crops, places), self.effort.steps[0])
+        upward = (crops.cam_from_crop.index_select(0, found.crop) @ found.pose.rotation)[..., 2]
         score, position, place_score, upward = (
             values.unflatten(0, (-1, self.effort.hypotheses))
             for values in (found.pose.score, found.in_frame(crops), found.place_score, upward)
         )
         best = score.topk(self.effort.closer, dim=1).indices
         of_rows = best[..., None].expand(-1, -1, 3)
-        chosen = crops.by_object(position.gather(1, of_rows)) * self._diameter_m[places.slots][:, None, None]
-        in_front = torch.maximum(chosen[..., 2:], self._nearest_m[places.slots][:, None, None])
+        diameter_m, nearest_m = (
+            of_all.index_select(0, places.slots)[:, None, None] for of_all in (self._diameter_m, self._nearest_m)
+        )
+        chosen = crops.by_object(position.gather(1, of_rows)) * diameter_m
+        in_front = torch.maximum(chosen[..., 2:], nearest_m)
         closer = torch.cat([chosen[..., :2], in_front], dim=3)
         of_places = crops.by_object(place_score.gather(1, best))
         rolls_deg = self.effort.rolls_deg
@@ -207,15 +212,19 @@ class PoseReader(nn.Module):
 
     def _crops(self, trunk: Trunk, images: Tensor, places: Places, roll: Tensor | None = None) -> _Crops:
         """Crops in which templates can be shifted."""
-        num, side, slots = places.score.shape[2], CROP_PX + 2 * _MARGIN_PX, places.slots
+        num, side, slots = places.score.shape[2], self._side, places.slots
         by_image = places.position_m.flatten(1, 2)
         nearest, diameter_m = (
-            of_all[slots][:, None].expand_as(places.score).flatten() for of_all in (self._nearest_m, self._diameter_m)
+            of_all.index_select(0, slots)[:, None].expand_as(places.score).flatten()
+            for of_all in (self._nearest_m, self._diameter_m)
         )
         distance_m = torch.maximum(by_image.flatten(0, 1).square().sum(dim=1).sqrt(), nearest)
         focal_px = FILL * CROP_PX * distance_m / diameter_m
-        pictures, crop_from_cam = cut_crops(images, self._matrix, by_image, focal_px, side, oversampling=1, roll=roll)
-        fine, coarse = trunk(pictures)
+        scale = 2 if self.effort.halved else 1
+        pictures, crop_from_cam = cut_crops(
+            images, self._matrix, by_image, focal_px / scale, side // scale, oversampling=1, roll=roll
+        )
+        fine, coarse = trunk(pictures, halved=self.effort.halved)
         by_object = coarse.unflatten(0, (-1, slots.shape[0], num))
         maps = FeatureMaps.of(self.banks.fine(fine, slots, num))
         return _Crops(pictures, maps, by_object, crop_from_cam.transpose(1, 2), distance_m, focal_px, slots)
@@ -225,42 +234,47 @@ class PoseReader(nn.Module):
         num = places.score.shape[2]
         scores, shift = (found.flatten(0, 1) for found in self.banks.match(crops.coarse, places.slots).max(dim=3))
         positions_m, place_scores = places.position_m.flatten(0, 1), places.score.flatten()
-        shifts, diameter_m = _shifts().to(scores), self._diameter_of(places)
-        picked = self._pick(scores, positions_m, _ONE_PLACE * diameter_m)
-        place, template, score = (torch.stack(values, dim=1).flatten() for values in zip(*picked, strict=True))
-        row = torch.arange(scores.shape[0], device=scores.device).repeat_interleave(len(picked))
-        crop = row * num + place
-        slope = shifts[shift[row, place, template]] / crops.focal_px[crop][:, None]
+        shifts, diameter_m = _shifts(self.effort.margin_px).to(scores), self._diameter_of(places)
+        count = scores.shape[2]
+        score, best = self._pick(scores, positions_m, _ONE_PLACE * diameter_m)
+        place, template = (torch.div(best, count, rounding_mode="floor"), (best % count).flatten())
+        row = torch.arange(scores.shape[0], device=scores.device)
+        crop = (row[:, None] * num + place).flatten()
+        shift = shift.flatten(1).gather(1, best).flatten()
+        slope = shifts.index_select(0, shift) / crops.focal_px.index_select(0, crop)[:, None]
         ray = torch.cat([slope, torch.ones_like(slope[:, :1])], dim=1)
-        far = crops.distance_m[crop] / diameter_m[row]
+        far = crops.distance_m.index_select(0, crop) / diameter_m.repeat_interleave(best.shape[1])
         position = ray / ray.square().sum(dim=1, keepdim=True).sqrt() * far[:, None]
-        rotation = _seen_along(position) @ self.banks.rotations[template]
-        return _Hypotheses(Aligned(rotation, position, score), crop, place_scores[crop])
+        rotation = _seen_along(position) @ self.banks.rotations.index_select(0, template)
+        return _Hypotheses(Aligned(rotation, position, score.flatten()), crop, place_scores.index_select(0, crop))
 
     def _pick(
         self,
         scores: Float[Tensor, "rows num templates"],
         positions_m: Float[Tensor, "rows num 3"],
         apart_m: Float[Tensor, " rows"],
-    ) -> list[tuple[Int[Tensor, " rows"], Int[Tensor, " rows"], Float[Tensor, " rows"]]]:
-        """Place, template and score of each hypothesis; hypotheses at one place differ in rotation."""
+    ) -> tuple[Float[Tensor, "rows hypotheses"], Int[Tensor, "rows hypotheses"]]:
+        """Scores of hypotheses, and which templates at which places they are; at one place they differ in rotation."""
         turns = self.banks.rotations.flatten(1)
-        count, picked = turns.shape[0], []
+        count, found, picked = turns.shape[0], [], []
         for _ in range(self.effort.hypotheses):
             score, best = scores.flatten(1).max(dim=1)
+            found.append(score)
+            picked.append(best)
             place, template = torch.div(best, count, rounding_mode="floor"), best % count
-            picked.append((place, template, score))
-            alike = (turns[template] @ turns.T - 1) / 2 > _ALIKE_COS
-            chosen = positions_m[torch.arange(best.shape[0], device=best.device), place]
-            beside = (positions_m - chosen[:, None]).square().sum(dim=-1) < apart_m[:, None] ** 2
+            alike = (turns.index_select(0, template) @ turns.T - 1) / 2 > _ALIKE_COS
+            chosen = positions_m.gather(1, place[:, None, None].expand(-1, 1, 3))
+            beside = (positions_m - chosen).square().sum(dim=-1) < apart_m[:, None] ** 2
             scores = torch.where(beside[:, :, None] & alike[:, None], _SUPPRESSED, scores)
-        return picked
+        return torch.stack(found, dim=1), torch.stack(picked, dim=1)
 
     def _aligned(self, crops: _Crops, found: _Hypotheses, num_steps: int) -> _Hypotheses:
         """Each hypothesis moved to where the template nearest to it fits best."""
         templates = self._nearest(found.pose, 1).unflatten(0, (-1, self.effort.hypotheses))[..., 0]
         surface = self.banks.surface(templates, crops.slots)
-        pose = align(crops.fine, found.crop, *surface, found.pose, crops.focal_px[found.crop], num_steps)
+        pose = align(
+            crops.fine, found.crop, *surface, found.pose, crops.focal_px.index_select(0, found.crop), num_steps
+        )
         return found._replace(pose=pose)
 
     def _averaged(self, crops: _Crops, best: _Hypotheses) -> tuple[Aligned, Float[Tensor, " rows"]]:
@@ -270,10 +284,10 @@ class PoseReader(nn.Module):
         surface = self.banks.surface(templates, crops.slots)
         start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in pose))
         crop = rolled.repeat_interleave(NUM_NEIGHBOURS)
-        found = align(crops.fine, crop, *surface, start, crops.focal_px[crop], self._steps[2])
+        found = align(crops.fine, crop, *surface, start, crops.focal_px.index_select(0, crop), self.effort.steps[2])
         rotation, position, score = (of_all.unflatten(0, templates.shape) for of_all in found)
-        cam_from_crop = crops.cam_from_crop[crop].unflatten(0, templates.shape)
-        back = crops.cam_from_crop[best.crop].transpose(1, 2)[:, None] @ cam_from_crop
+        cam_from_crop = crops.cam_from_crop.index_select(0, crop).unflatten(0, templates.shape)
+        back = crops.cam_from_crop.index_select(0, best.crop).transpose(1, 2)[:, None] @ cam_from_crop
         rotation, position = back @ rotation, (back @ position[..., None])[..., 0]
         weight = (_SHARPNESS * score).softmax(dim=1)
         log_depth = position[..., 2].clamp(min=1e-3).log()
@@ -291,7 +305,8 @@ class PoseReader(nn.Module):
         outlines = self.banks.outlines(self._nearest(pose, 1)[:, 0], crops.slots)
         points, outward = (of_all.repeat_interleave(num, dim=0) for of_all in outlines)
         rolled, seen = self._in_all_rolls(crops, crop, pose)
-        gaps = outline_log_factor(crops.pictures[rolled], points, outward, seen, crops.focal_px[rolled])
+        pictures, focal_px = (of_all.index_select(0, rolled) for of_all in (crops.pictures, crops.focal_px))
+        gaps = outline_log_factor(pictures, points, outward, seen, focal_px, self._side)
         gap = gaps.unflatten(0, (-1, num)).mean(dim=1)
         return pose._replace(position=pose.position * (gap / 2).exp()[:, None]), gap
 
@@ -300,7 +315,9 @@ class PoseReader(nn.Module):
         num = self.effort.hypotheses
         by_object = found.pose.score.unflatten(0, (-1, num))
         row = torch.arange(by_object.shape[0], device=by_object.device) * num + by_object.argmax(dim=1)
-        return _Hypotheses(Aligned(*(of_all[row] for of_all in found.pose)), found.crop[row], found.place_score[row])
+        pose, crop, place_score = found
+        best = Aligned(*(of_all.index_select(0, row) for of_all in pose))
+        return _Hypotheses(best, crop.index_select(0, row), place_score.index_select(0, row))
 
     def _in_all_rolls(
         self, crops: _Crops, crop: Int[Tensor, " rows"], pose: Aligned
@@ -308,7 +325,8 @@ class PoseReader(nn.Module):
         """The crops of the same place in all rolls, and poses in their cameras, one after the other."""
         num = len(self.effort.rolls_deg)
         rolled = (crop - crop % num)[:, None] + torch.arange(num, device=crop.device)
-        turn = crops.cam_from_crop[rolled].transpose(2, 3) @ crops.cam_from_crop[crop][:, None]
+        others = crops.cam_from_crop.index_select(0, rolled.flatten()).unflatten(0, (-1, num))
+        turn = others.transpose(2, 3) @ crops.cam_from_crop.index_select(0, crop)[:, None]
         rotation, position = turn @ pose.rotation[:, None], (turn @ pose.position[:, None, :, None])[..., 0]
         scores = pose.score.repeat_interleave(num)
         return rolled.flatten(), Aligned(rotation.flatten(0, 1), position.flatten(0, 1), scores)
@@ -318,9 +336,14 @@ class PoseReader(nn.Module):
         turn = _seen_along(pose.position).transpose(1, 2) @ pose.rotation
         return (turn.flatten(1) @ self.banks.rotations.flatten(1).T).topk(num, dim=1).indices
 
+    @property
+    def _side(self) -> int:
+        """Of crops, pixels."""
+        return CROP_PX + 2 * self.effort.margin_px
+
     def _diameter_of(self, places: Places) -> Float[Tensor, " batch*objects"]:
         """Diameters of the objects, metres."""
-        return self._diameter_m[places.slots].expand(places.score.shape[:2]).flatten()
+        return self._diameter_m.index_select(0, places.slots).expand(places.score.shape[:2]).flatten()
 
 
 def _seen_along(position: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3 3"]:
@@ -328,9 +351,9 @@ def _seen_along(position: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3 3"]:
     return rotation_between(position.new_tensor([0.0, 0.0, 1.0]).expand_as(position), position)
 
 
-def _shifts() -> Float[Tensor, "shifts 2"]:
+def _shifts(margin_px: int) -> Float[Tensor, "shifts 2"]:
     """Crop pixels by which templates are shifted, (x, y), in the order of :meth:`Banks.match`."""
-    steps = COARSE_STRIDE * torch.arange(-(_MARGIN_PX // COARSE_STRIDE), _MARGIN_PX // COARSE_STRIDE + 1)
+    steps = COARSE_STRIDE * torch.arange(-(margin_px // COARSE_STRIDE), margin_px // COARSE_STRIDE + 1)
     down, across = torch.meshgrid(steps, steps, indexing="ij")
     return torch.stack([across, down], dim=-1).flatten(0, 1).float()
 

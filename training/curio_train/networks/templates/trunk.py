@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -35,8 +36,11 @@ _BLOCKS = (  # inputs, outputs, expansion, kernel, stride
 )
 
 
-Features = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""sRGB images in [0, 1] to features, as :meth:`Trunk.forward`."""
+_DOUBLING = ((0.75, 0.25, 0.0), (0.25, 0.75, 0.75), (0.0, 0.0, 0.25))
+"""What pixels before, at and after a place have in the three that the first convolution sees of the doubled image."""
+
+Features = Callable[[Tensor, bool], tuple[Tensor, Tensor]]
+"""sRGB images in [0, 1], and whether they are halved, to features, as :meth:`Trunk.forward`."""
 
 
 class Trunk(nn.Module):
@@ -53,18 +57,41 @@ class Trunk(nn.Module):
         self.blocks = nn.ModuleList(Block(*sizes) for sizes in _BLOCKS)
 
     def forward(
-        self, images: Float[Tensor, "batch 3 height width"]
+        self, images: Float[Tensor, "batch 3 height width"], *, halved: bool = False
     ) -> tuple[Float[Tensor, "batch 24 fine_rows fine_columns"], Float[Tensor, "batch 40 rows columns"]]:
-        """Features of sRGB images in [0, 1], at stride 4 and at stride 8."""
+        """Features at stride 4 and at stride 8.
+
+        Args:
+            images: sRGB in [0, 1].
+            halved: Read images as if they were doubled in width and height (bilinear) before: strides are 2 and 4.
+        """
         if self.quick is not None and images.device.type == "cpu":
-            return self.quick(images)
-        fine = self.stem((255 * images - MEAN) / SPREAD)
-        for block in self.blocks[: self.NUM_FINE]:
-            fine = block(fine)
+            return self.quick(images, halved)
+        first, *others = self.stem
+        assert isinstance(first, nn.Conv2d)
+        stride = 1 if halved else 2
+        scaled = 255 / SPREAD * images - MEAN / SPREAD
+        fine = F.conv2d(scaled, self.first_weight(halved), first.bias, stride, padding=1)
+        for layer in (*others, *self.blocks[: self.NUM_FINE]):
+            fine = layer(fine)
         coarse = fine
         for block in self.blocks[self.NUM_FINE :]:
             coarse = block(coarse)
         return fine, coarse
+
+    def first_weight(self, halved: bool) -> Float[Tensor, "32 3 3 3"]:
+        """The first convolution's weight.
+
+        Doubling and a convolution that looks at every second pixel are a convolution of the halved image: it takes a
+        quarter of the samples, and differs only at the borders, beyond which it sees grey.
+        """
+        first = self.stem[0]
+        assert isinstance(first, nn.Conv2d)
+        weight: Tensor = first.weight
+        if not halved:
+            return weight
+        taps = weight.new_tensor(_DOUBLING)
+        return torch.einsum("pi,qj,ocij->ocpq", taps, taps, weight)
 
     def train(self, mode: bool = True) -> "Trunk":
         """Stay in evaluation mode: batch norm's statistics are frozen, too."""
