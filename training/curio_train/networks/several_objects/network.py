@@ -13,8 +13,9 @@ from torch import Tensor, nn
 
 from curio_train.networks.outline_alignment import OutlineAlignment
 from curio_train.networks.several_objects.locator import LocatorNetwork
+from curio_train.networks.templates.effort import Effort
 from curio_train.networks.templates.geometry import FRAME_STRIDE, Geometry, num_views
-from curio_train.networks.templates.reader import CalibrationFeatures, Effort, Places, PoseReader
+from curio_train.networks.templates.reader import CalibrationFeatures, Places, PoseReader
 
 NUM_PLACES = 3
 """Centre proposals of each object that templates are compared with."""

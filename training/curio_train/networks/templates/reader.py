@@ -11,9 +11,10 @@ from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matri
 from curio_train.networks.crop_camera import about_axis, cut_crops
 from curio_train.networks.templates.alignment import Aligned, FeatureMaps, align
 from curio_train.networks.templates.banks import Banks
+from curio_train.networks.templates.effort import Effort
 from curio_train.networks.templates.geometry import CROP_PX, FILL, QUARTER_TURNS, Geometry
 from curio_train.networks.templates.outline import outline_log_factor
-from curio_train.networks.templates.rolls import ROLLS_DEG, upright_rolls
+from curio_train.networks.templates.rolls import upright_rolls
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
 from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
 
@@ -27,23 +28,6 @@ _ALIKE_COS = 0.94  # 20 degrees between the rotations of hypotheses at one place
 _ONE_PLACE = 0.5  # diameters
 _SHARPNESS = 20.0  # of the neighbours' weights, a unit of score
 _SUPPRESSED = -10.0
-
-
-class Effort(NamedTuple):
-    """How much is tried for each object: accuracy for time (docs/experiments/real_photographs.md)."""
-
-    hypotheses: int = 3
-    """Poses that each pass aligns."""
-    closer: int = 2
-    """Number of poses of the first pass around which crops are cut again, at their own distance; 0: one pass is all."""
-    rolls_deg: tuple[float, ...] = ROLLS_DEG
-    """Rolls of the crops of the second pass; an odd number around 0, and 0 alone where there is no second pass."""
-    margin_px: int = 16
-    """Pixels of crops in which templates are shifted, to each side; a multiple of the coarse stride."""
-    steps: tuple[int, int, int] = (3, 5, 4)
-    """Steps of the alignment: in the first of two passes, in the last, and of the best pose with its neighbours."""
-    halved: bool = False
-    """Whether crops are cut at half of the resolution, and the trunk reads them as if they were doubled."""
 
 
 class Places(NamedTuple):
