@@ -5,8 +5,8 @@
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
 10c6bff; models/lmo/5 has seen them), and no label of a frame is opened in training. A call goes on with
-what is there. The last line, also in OUT/halves.json, is of both halves: by one read, by nine, and by one, three and
-nine of ``curio-export --fast``; as served, after render-and-compare, and with ``--plane objects`` (one read and nine).
+what is there. The last line, also in OUT/halves.json, is of both halves: by one read and by nine, of the runs and of
+what ``curio-export --fast`` makes of them; as served, after render-and-compare, and with ``--plane objects``.
 """
 
 import argparse
@@ -40,15 +40,16 @@ def main() -> None:
     frames = sorted(data.glob("test/*/rgb/*.*"))
     if len({frame.parent for frame in frames}) != 1:
         sys.exit(f"{data}: expected the test frames of one scene, found {len(frames)} frames")
-    scores = []
+    scores: list[dict[str, Any]] = []
     for half in range(2):
         run = out / f"run-{half}"
         _learn(run, data, _linked(out / f"frames-{half}", frames[half::2]), arguments)
         others = _scored(out / f"scored-{1 - half}", data, {int(frame.stem) for frame in frames[1 - half :: 2]})
-        scores.append({"reads_1": _evaluate(run, others, 1), "reads_9": _evaluate(run, others, 9)})
-        fast = _fast(run, out / f"fast-{half}")
-        scores[-1] |= {f"reads_{reads}_plane": _evaluate(run, others, reads, on_plane=True) for reads in (1, 9)}
-        scores[-1] |= {f"fast_reads_{reads}": _evaluate(fast, others, reads) for reads in (1, 3, 9)}
+        scores.append({})
+        for name, network in (("", run), ("fast_", _fast(run, out / f"fast-{half}"))):
+            for reads in (1, 9):
+                scores[-1][f"{name}reads_{reads}"] = _evaluate(network, others, reads)
+                scores[-1][f"{name}reads_{reads}_plane"] = _evaluate(network, others, reads, on_plane=True)
     result = {name: _mean([one[name] for one in scores]) for name in scores[0]} | {
         "init": "/".join(arguments.init.parts[-2:]),
         "images": arguments.images,

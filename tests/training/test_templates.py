@@ -21,6 +21,7 @@ from curio_train.networks.templates.alignment import Aligned, FeatureMaps, InCro
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_OUTLINE_POINTS, NUM_POINTS, Bank
 from curio_train.networks.templates.bank import RANK as BANK_RANK
 from curio_train.networks.templates.descriptors import Descriptors
+from curio_train.networks.templates.effort import ONE_LOOK, Effort
 from curio_train.networks.templates.geometry import CROP_PX, NUM_ROLLS, QUARTER_TURNS, Geometry, num_views, viewpoints
 from curio_train.networks.templates.localiser import RANK, Localiser
 from curio_train.networks.templates.network import TemplateNetwork
@@ -239,10 +240,14 @@ def _random_bank(random: torch.Generator, views: int) -> Bank:
     )
 
 
+@pytest.mark.parametrize("effort", [Effort(), ONE_LOOK])
 @pytest.mark.parametrize("geometry", [GEOMETRY, FROM_ANY_SIDE])
-def test_a_frame_is_read_the_same_alone_and_among_others(geometry: Geometry, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_is_read_the_same_alone_and_among_others(
+    geometry: Geometry, effort: Effort, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(template_geometry, "NUM_VIEWS", 24)
     network = _random_network(geometry)
+    network.reader.effort = effort
     assert len(network.color) == 3 * geometry.any_side
     network.color.fill_(0.25)
     images = torch.rand(2, 3, 480, 640, generator=torch.Generator().manual_seed(1))

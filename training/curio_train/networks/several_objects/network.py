@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from curio_train.networks.outline_alignment import OutlineAlignment
 from curio_train.networks.several_objects.locator import LocatorNetwork
-from curio_train.networks.templates.effort import Effort
+from curio_train.networks.templates.effort import ONE_LOOK
 from curio_train.networks.templates.geometry import FRAME_STRIDE, Geometry, num_views
 from curio_train.networks.templates.reader import CalibrationFeatures, Places, PoseReader
 
@@ -62,8 +62,7 @@ class ObjectsNetwork(nn.Module):
         It takes an eighth of the time. For locators that learned from photographs, whose first place is right nine
         times in ten (docs/experiments/real_photographs.md). The confidence stays calibrated for looking more.
         """
-        self._num_places = 1
-        self.reader.effort = Effort(closer=0, rolls_deg=(0.0,), margin_px=8, steps=(0, 3, 4), halved=True)
+        self._num_places, self.reader.effort = 1, ONE_LOOK
 
     def forward(
         self, images: Float[Tensor, "batch 3 height width"], slots: Int[Tensor, " objects"] | None = None
