@@ -4,9 +4,9 @@
 
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
-10c6bff; models/lmo/5 has seen them), and no label of a frame is opened in training. A call goes on with
-what is there. The last line, also in OUT/halves.json, is of both halves: by one read and by nine, of the runs and of
-what ``curio-export --fast`` makes of them; as served, after render-and-compare, and with ``--plane objects``.
+10c6bff; models/lmo/5 has seen them), and no label of a frame is opened in training. A call goes on with what is there.
+The last line, also in OUT/halves.json, is of both halves: by one read and by nine, of the runs and of what
+``curio-export --fast`` makes of them; as served, after render-and-compare, and with ``--plane objects``.
 """
 
 import argparse
@@ -40,16 +40,15 @@ def main() -> None:
     frames = sorted(data.glob("test/*/rgb/*.*"))
     if len({frame.parent for frame in frames}) != 1:
         sys.exit(f"{data}: expected the test frames of one scene, found {len(frames)} frames")
-    scores: list[dict[str, Any]] = []
+    scores: list[dict[str, Any]] = [{}, {}]
     for half in range(2):
         run = out / f"run-{half}"
         _learn(run, data, _linked(out / f"frames-{half}", frames[half::2]), arguments)
         others = _scored(out / f"scored-{1 - half}", data, {int(frame.stem) for frame in frames[1 - half :: 2]})
-        scores.append({})
         for name, network in (("", run), ("fast_", _fast(run, out / f"fast-{half}"))):
             for reads in (1, 9):
-                scores[-1][f"{name}reads_{reads}"] = _evaluate(network, others, reads)
-                scores[-1][f"{name}reads_{reads}_plane"] = _evaluate(network, others, reads, on_plane=True)
+                scores[half][f"{name}reads_{reads}"] = _evaluate(network, others, reads)
+                scores[half][f"{name}reads_{reads}_plane"] = _evaluate(network, others, reads, on_plane=True)
     result = {name: _mean([one[name] for one in scores]) for name in scores[0]} | {
         "init": "/".join(arguments.init.parts[-2:]),
         "images": arguments.images,
