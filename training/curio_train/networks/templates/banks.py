@@ -114,7 +114,7 @@ class Banks(nn.Module):
 
     def match(
         self, features: Float[Tensor, "batch asked num channels rows columns"], slots: Int[Tensor, " asked"]
-    ) -> Float[Tensor, "batch asked num shifts templates"]:
+    ) -> Float[Tensor, "batch asked num templates shifts"]:
         """Mean cosine over each template's silhouette, at every shift of whole cells, of the objects in ``slots``."""
         columns, side = features.shape[-1], self.filters.shape[-1]
         centred = features.flatten(-2).transpose(-1, -2) - self.coarse_mean.index_select(0, slots)[:, None, None]
@@ -122,9 +122,11 @@ class Banks(nn.Module):
         cells = _windows(columns, side).to(features.device)
         windows = described.index_select(-2, cells.flatten()).unflatten(-2, cells.shape).flatten(-2)
         # As floats before the choice: a runtime then converts them once, not with every image.
-        filters = self.filters.permute(0, 3, 4, 2, 1).flatten(1, 3).float().index_select(0, slots)
-        filtered = windows @ filters[:, None] * self.match_scale.index_select(0, slots)[:, None, None]
-        found: Tensor = filtered @ self.weights.transpose(1, 2).float().index_select(0, slots)[:, None]
+        filters = self.filters.permute(0, 1, 3, 4, 2).flatten(2).float().index_select(0, slots)
+        filtered = (
+            filters[:, None] @ windows.transpose(-1, -2) * self.match_scale.index_select(0, slots)[:, None, :, None]
+        )
+        found: Tensor = self.weights.float().index_select(0, slots)[:, None] @ filtered
         return found
 
     def fine(

@@ -18,9 +18,11 @@ class Effort(NamedTuple):
     """Pixels of crops in which templates are shifted, to each side; a multiple of the coarse stride."""
     steps: tuple[int, int, int] = (3, 5, 4)
     """Steps of the alignment: in the first of two passes, in the last, and of the best pose with its neighbours."""
+    neighbours: int = 4
+    """Templates around the best pose whose answers are averaged, in each crop of its place."""
     halved: bool = False
     """Whether crops are cut at half of the resolution, and the trunk reads them as if they were doubled."""
 
 
-ONE_LOOK = Effort(closer=0, rolls_deg=(0.0,), margin_px=8, steps=(0, 3, 4), halved=True)
+ONE_LOOK = Effort(closer=0, rolls_deg=(0.0,), margin_px=8, steps=(0, 3, 4), neighbours=3, halved=True)
 """One pass over one crop of half the resolution: an eighth of the time, one place an object."""
