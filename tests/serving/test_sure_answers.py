@@ -135,7 +135,7 @@ def test_what_cannot_be_asked_of_a_detector_is_refused(ape: Detector, pixels: np
 
 
 def test_models_of_one_stream_give_no_number_twice(ape: Detector, pixels: np.ndarray) -> None:
-    other = Detector(open_model(ROOT / "models" / "lmo-fast").of(["ape"]))
+    other = Detector(open_model(ROOT / "models" / "lmo").of(["ape"]))
     stream, results = FollowingStream(), messages.DetectResponse().results
     for restart in (False, False, True):
         track = messages.Tracking(restart=restart)

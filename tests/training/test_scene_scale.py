@@ -95,7 +95,7 @@ def test_what_tells_no_scale_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
     told: list[str] = []
     with pytest.raises(UsageError, match=str(tmp_path)):
         scale_by_objects(tmp_path, data, camera, told.append)
-    (tmp_path / "lmo").symlink_to(MODELS / "lmo-fast")
+    (tmp_path / "lmo").symlink_to(MODELS / "lmo")
     with pytest.raises(DataError, match=r"none of the objects .*--distance-m"):
         scale_by_objects(tmp_path, data, camera, told.append)(still)
     assert told == [f"{name}: seen too seldom to tell" for name in BopDataset(data).classes], "all that one model finds"

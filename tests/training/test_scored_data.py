@@ -46,7 +46,7 @@ def test_a_model_is_scored_with_its_own_meshes_alone(data: Path) -> None:
 
 def test_a_data_set_without_a_models_objects(data: Path) -> None:
     with pytest.raises(DataError, match="there is no mesh of cat here; found meshes of: ape can"):
-        load_subject(MODELS / "lmo-fast", data)
+        load_subject(MODELS / "lmo", data)
 
 
 def test_a_run_whose_data_have_moved_is_scored_with_those_that_are_given(data: Path, tmp_path: Path, write_run) -> None:

@@ -89,4 +89,4 @@ def test_weights_fit_and_give_the_golden_answer(version: Path) -> None:
 
 
 def test_there_are_shipped_models() -> None:
-    assert {version.parent.name for version in VERSIONS} == {"ape", "lmo", "lmo-fast"}
+    assert {version.parent.name for version in VERSIONS} == {"ape", "lmo"}

@@ -90,7 +90,7 @@ def _read(brick: Object, place_m: list[float], factor: float) -> Estimate:
     rotation = Rotation.from_euler("xy", [90, 30 * place_m[0]], degrees=True).as_matrix()
     lowest_m = (brick.mesh.vertices_m @ rotation.T)[:, 1].max()
     origin_m = np.array([place_m[0], 0.2 - lowest_m, place_m[1]])
-    return Estimate(Frame(0, 0, Path("a.png"), np.eye(3), 640, 480), Pose(rotation, factor * origin_m), 0.9, 0.1)
+    return Estimate(Frame(0, 0, Path("a.png"), np.eye(3), 640, 480), Pose(rotation, factor * origin_m), 0.9, 0.9, 0.1)
 
 
 def test_estimates_move_until_they_stand_on_the_plane(brick: Object) -> None:

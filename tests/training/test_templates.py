@@ -277,7 +277,7 @@ def test_the_exported_graph_equals_torch_for_any_batch(monkeypatch: pytest.Monke
     network, random = _random_network(), np.random.default_rng(0)
     network.reader.effort = network.reader.effort._replace(steps=(1, 0, 0))  # more take long to trace
     graph = _Graph(network).eval()
-    names = ["translation_m", "rotation_6d", "light", "confidence"]
+    names = ["translation_m", "rotation_6d", "light", "confidence", "presence"]
     session = onnxruntime.InferenceSession(to_onnx(graph, 640, 480, names, Tracing(one_image=True)).SerializeToString())
     coarse = torch.from_numpy(random.integers(0, 255, (3, 3, 60, 80))).float()
     smooth = torch.nn.functional.interpolate(coarse, (480, 640), mode="bilinear")

@@ -21,6 +21,8 @@ ROTATION_6D = "rotation_6d"
 YAW = "yaw_ij"
 COLOR = "color"
 CONFIDENCE = "confidence"
+PRESENCE = "presence"
+"""The probability that an object is in the image, which some networks answer beside the code."""
 LIGHT = "light"
 
 

@@ -168,7 +168,7 @@ class PoseInterval(_message.Message):
     def __init__(self, level: _Optional[float] = ..., lateral_m: _Optional[float] = ..., depth_m: _Optional[float] = ..., rotation_deg: _Optional[float] = ...) -> None: ...
 
 class Detection(_message.Message):
-    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range", "track", "views", "status", "interval", "on_plane")
+    __slots__ = ("object", "confidence", "translation_m", "rotation_6d", "rotation", "quaternion_xyzw", "color", "box_px", "outside_trained_range", "track", "views", "status", "interval", "presence", "on_plane")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     TRANSLATION_M_FIELD_NUMBER: _ClassVar[int]
@@ -182,6 +182,7 @@ class Detection(_message.Message):
     VIEWS_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
     INTERVAL_FIELD_NUMBER: _ClassVar[int]
+    PRESENCE_FIELD_NUMBER: _ClassVar[int]
     ON_PLANE_FIELD_NUMBER: _ClassVar[int]
     object: str
     confidence: float
@@ -196,8 +197,9 @@ class Detection(_message.Message):
     views: _containers.RepeatedScalarFieldContainer[int]
     status: DetectionStatus
     interval: PoseInterval
+    presence: float
     on_plane: bool
-    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ..., track: _Optional[_Union[Track, _Mapping]] = ..., views: _Optional[_Iterable[int]] = ..., status: _Optional[_Union[DetectionStatus, str]] = ..., interval: _Optional[_Union[PoseInterval, _Mapping]] = ..., on_plane: bool = ...) -> None: ...
+    def __init__(self, object: _Optional[str] = ..., confidence: _Optional[float] = ..., translation_m: _Optional[_Iterable[float]] = ..., rotation_6d: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., color: _Optional[_Iterable[float]] = ..., box_px: _Optional[_Iterable[float]] = ..., outside_trained_range: bool = ..., track: _Optional[_Union[Track, _Mapping]] = ..., views: _Optional[_Iterable[int]] = ..., status: _Optional[_Union[DetectionStatus, str]] = ..., interval: _Optional[_Union[PoseInterval, _Mapping]] = ..., presence: _Optional[float] = ..., on_plane: bool = ...) -> None: ...
 
 class Track(_message.Message):
     __slots__ = ("track_id", "age_s", "unseen_s", "predicted", "translation_m", "rotation", "quaternion_xyzw", "velocity_m_s", "position_std_m", "rotation_std_rad")

@@ -84,6 +84,7 @@ def fill(
             quaternion_xyzw=quaternion_xyzw(rotation) if rotation else (),
             color=values["color"][row] if "color" in values else (),
             box_px=crop.project(transformed(slots[row].box_corners, rotation or UPRIGHT, translation)),
+            presence=values["presence"][row] if "presence" in values else None,
             outside_trained_range=not depths_m[0] <= _depth_m(values, row, slots[row]) <= depths_m[1],
         )
 

@@ -49,10 +49,11 @@ _OUTPUT_SHAPES: dict[str, tuple[tuple[int, ...], bool]] = {
     "rotation": ((3, 3), True),
     "color": ((3,), True),
     "confidence": ((), True),
+    "presence": ((), True),
     "light": ((3,), False),
 }
-# Outputs that the exporter derives from another field, so that the spec need not list them.
-_DERIVED = {"rotation", "rotation_6d"}
+_ROTATIONS = {"rotation", "rotation_6d"}
+_UNLISTED = {*_ROTATIONS, "presence"}  # outputs that the spec need not list: no scene code has them, or one alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,11 +257,11 @@ def _check_graph(session: "onnxruntime.InferenceSession", model: Model) -> None:
     found = set(model.output_names)
     if missing := specified - found:
         raise ModelError(f"model {model.label}: its spec has {sorted(missing)}, its graph gives {sorted(found)}")
-    if unknown := found - specified - _DERIVED:
+    if unknown := found - specified - _UNLISTED:
         raise ModelError(f"model {model.label}: its graph gives {sorted(unknown)}, which its spec does not describe")
     if strange := found - _OUTPUT_SHAPES.keys():
         raise ModelError(f"model {model.label}: unknown outputs {sorted(strange)}; known are {sorted(_OUTPUT_SHAPES)}")
-    if "translation_m" not in found or len(found & _DERIVED) == 1:
+    if "translation_m" not in found or len(found & _ROTATIONS) == 1:
         raise ModelError(
             f"model {model.label}: its graph gives {sorted(found)}; expected translation_m, "
             "and rotation and rotation_6d both or neither"

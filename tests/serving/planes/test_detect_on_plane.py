@@ -93,7 +93,7 @@ def test_the_plane_is_found_where_two_objects_stand_on_it(standing: Path, pair: 
 
 
 def test_objects_that_are_chosen_stand_on_a_plane() -> None:
-    model = open_model(ROOT / "models" / "lmo-fast").of(["can", "ape", "cat"])
+    model = open_model(ROOT / "models" / "lmo").of(["can", "ape", "cat"])
     assert [one.object for one in model.spec.stable_poses.objects] == ["ape", "can", "cat"]
     pixels = cv2.imread(str(ROOT / "samples" / "00.jpg"))[..., ::-1]
     camera = json.loads((ROOT / "samples" / "camera.json").read_text())["camera_matrix"]

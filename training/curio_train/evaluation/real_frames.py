@@ -25,7 +25,7 @@ from curio_train.evaluation.on_plane import shapes_of, standing_on
 from curio_train.evaluation.real_scores import Estimate, scored, together
 from curio_train.evaluation.subject import Subject
 from curio_train.geometry import Pose
-from curio_train.scene_code import CONFIDENCE, TRANSLATION, SceneCode, poses
+from curio_train.scene_code import CONFIDENCE, PRESENCE, TRANSLATION, poses
 from curio_train.worlds.base import Camera, World
 
 _BATCH = 16
@@ -105,10 +105,10 @@ def refuse_unscorable(world: World, data: Path) -> None:
 
 
 def _absent(dataset: BopDataset, names: Sequence[str], found: Mapping[tuple[int, int], list[Estimate]]) -> list[float]:
-    """Confidences of objects in frames that do not show them."""
+    """Presence of objects in frames that do not show them, rounded as those of targets are."""
     shown = [{_key(one) for one in dataset.annotations(SPLIT, name)} for name in names]
     return [
-        estimate.confidence
+        round(estimate.presence, 4)
         for key, estimates in found.items()
         for estimate, frames in zip(estimates, shown, strict=True)
         if key not in frames
@@ -158,16 +158,20 @@ def _estimates(subject: Subject, frames: Sequence[Frame]) -> Iterator[list[Estim
     code = subject.predict(images)
     seconds = (time.perf_counter() - start) / len(frames)
     by_object = [poses(code, slot) for slot in range(code[TRANSLATION].shape[1])]
+    confidence = code.get(CONFIDENCE, torch.ones_like(code[TRANSLATION][..., :1]))[..., 0]
+    presence = code[PRESENCE][..., 0] if PRESENCE in code else confidence
     for number, (frame, crop) in enumerate(zip(frames, crops, strict=True)):
         cam_from_canonical = Pose(crop.canonical_from_cam.T, np.zeros(3))
         yield [
-            Estimate(frame, cam_from_canonical @ of_object[number], _confidence(code, number, slot), seconds)
+            Estimate(
+                frame,
+                cam_from_canonical @ of_object[number],
+                float(confidence[number, slot]),
+                float(presence[number, slot]),
+                seconds,
+            )
             for slot, of_object in enumerate(by_object)
         ]
-
-
-def _confidence(code: SceneCode, number: int, slot: int) -> float:
-    return float(code[CONFIDENCE][number, slot]) if CONFIDENCE in code else 1.0
 
 
 def _whole_frame(frame: Frame, camera: Camera) -> PinholeCrop:

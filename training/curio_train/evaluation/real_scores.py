@@ -40,6 +40,8 @@ class Estimate:
     """Cam_from_obj, metres."""
     confidence: float
     """1 where the model has none."""
+    presence: float
+    """The probability that the object is in the frame; the confidence where the model does not tell it from that."""
     seconds: float
     """Seconds spent on the frame, including decoding; the mean over frames of one batch."""
 
@@ -69,7 +71,7 @@ def together(each: Mapping[str, dict[str, Any]], absent: Sequence[float]) -> dic
 
     Args:
         each: Of :func:`scored`, by the object's name.
-        absent: Confidences of objects in frames that do not show them.
+        absent: Presence of objects in frames that do not show them.
     """
     rows = [row for one in each.values() for row in one["targets"]]
     metrics = mean_of_objects([one["metrics"] for one in each.values()])
@@ -81,7 +83,7 @@ def together(each: Mapping[str, dict[str, Any]], absent: Sequence[float]) -> dic
     confidences, correct = _confidences(rows)
     metrics["confidence_ece"] = calibration_error(confidences, correct)
     if absent:
-        metrics["present_auroc"] = auroc(confidences, absent)
+        metrics["present_auroc"] = auroc([row["presence"] for row in rows], absent)
     return {
         "num_targets": len(rows),
         "num_targets_visible_80": sum(one["num_targets_visible_80"] for one in each.values()),
@@ -135,6 +137,7 @@ def _row(estimate: Estimate, target: Annotation, points: np.ndarray, info: Model
         "image_id": target.image_id,
         "visible_fraction": target.visible_fraction,
         "confidence": round(estimate.confidence, 4),
+        "presence": round(estimate.presence, 4),
         "add_diameters": round(add_errors(found, true, points, info)[0], 4),
         "rotation_deg": round(float(rotation_errors_deg(found, true, info)[0]), 2),
         "translation_mm": round(translation_error_m(estimate.pose, target.pose) * 1000, 2),

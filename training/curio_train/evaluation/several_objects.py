@@ -4,7 +4,7 @@ from curio_train.errors import UsageError
 from curio_train.evaluation.scores import add_errors, mean_of_objects, pose_scores
 from curio_train.metrics.calibration import auroc, calibration_error
 from curio_train.metrics.poses import ADD_THRESHOLD
-from curio_train.scene_code import CONFIDENCE, SceneCode, index, poses
+from curio_train.scene_code import CONFIDENCE, PRESENCE, SceneCode, index, poses
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
 _MOST_POINTS = 2_000  # vertices that ADD is measured at, about
@@ -14,12 +14,13 @@ def several_objects_scores(world: SeveralObjectsWorld, predicted: SceneCode, tru
     """Means of the objects' pose scores where they are shown, and what all confidences say together.
 
     ``confidence_ece`` takes a confidence as the probability that ADD(-S) is below a tenth of the diameter, and
-    ``present_auroc`` as a sign that an object is shown.
+    ``present_auroc`` takes its presence, where the network answers one, as a sign that an object is shown.
 
     Raises:
         UsageError: No rendering shows any object.
     """
-    each, confidences, correct = [], [], []
+    each, confidences, correct, present = [], [], [], []
+    presence = predicted.get(PRESENCE, predicted[CONFIDENCE])[..., 0]
     there = true[CONFIDENCE][..., 0] > 0
     for slot, member in enumerate(world.members):
         shown = there[:, slot]
@@ -30,11 +31,12 @@ def several_objects_scores(world: SeveralObjectsWorld, predicted: SceneCode, tru
         each.append(pose_scores(found, wanted, points, member.kind.info))
         errors = add_errors(found, wanted, points, member.kind.info)
         confidences += predicted[CONFIDENCE][shown, slot, 0].tolist()
+        present += presence[shown, slot].tolist()
         correct += [error < ADD_THRESHOLD for error in errors]
     if not each:
         raise UsageError(f"--num-images {len(there)}: none of them shows an object; expected more")
     scores = mean_of_objects(each)
     scores["confidence_ece"] = calibration_error(confidences, correct)
     if not there.all():
-        scores["present_auroc"] = auroc(confidences, predicted[CONFIDENCE][..., 0][~there].tolist())
+        scores["present_auroc"] = auroc(present, presence[~there].tolist())
     return scores

@@ -154,7 +154,8 @@ def _outputs(spec: ModelSpec, shapes: Mapping[str, Sequence[int]]) -> Iterable[t
     for name, shape in shapes.items():
         field = fields.get(name)
         sizes = ", ".join(["batch", *map(str, shape)])
-        yield f"`{name}`", f"[{sizes}]", field.unit if field else "1", (field.frame if field else "camera") or "–"
+        frame = field.frame if field else "camera" * (name == "rotation")
+        yield f"`{name}`", f"[{sizes}]", field.unit if field else "1", frame or "–"
 
 
 def _objects(spec: ModelSpec, objects: Sequence[ObjectKind]) -> Iterable[tuple[str, ...]]:

@@ -21,6 +21,7 @@ from curio_train.refinement.scene_labels import SceneLabels
 from curio_train.scene_code import SceneCode
 from curio_train.templates.photographed import learn_appearance
 from curio_train.worlds.base import StagedWorld, World
+from curio_train.worlds.several_objects.confidence import calibrate
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.two_stage import TwoStageWorld
 
@@ -94,7 +95,7 @@ class SelfTraining:
             assert isinstance(network, ObjectsNetwork)
             evidence = read_by_others(network, world, labels)
             learn_appearance(network, labels.frames, labels.poses)
-            world.calibrate_confidence(network, cache)
+            calibrate(network, world, cache, by_heat_map=True)
             calibrate_by(network, evidence)
         elif isinstance(world, StagedWorld):
             world.calibrate_confidence(network, cache)

@@ -27,7 +27,6 @@ _FEWEST = 8  # correct poses, and wrong ones, that a calibration needs
 _READ_AT_ONCE = 2
 _NUM_READ, _FEWEST_READ = 100, 20  # photographs; each takes a third of a second for one part, twice as long for two
 _TOO_FEW = f"confidence is calibrated by renderings, because there are fewer than {_FEWEST_READ} photographs"
-_CERTAIN = 20.0  # a logit whose probability is 1
 
 
 class Evidence(NamedTuple):
@@ -118,9 +117,9 @@ def calibrate_by_agreement(network: TwoStageNetwork, world: TwoStageWorld) -> st
 def calibrate_parts_by_agreement(network: ObjectsNetwork, world: SeveralObjectsWorld) -> str:
     """Make the confidence of each part the share of photographs of which both reads agree, in place.
 
-    Templates of a plain part match photographs half as well as renderings, so that renderings teach that a part with
-    such scores is absent (docs/experiments/captures.md). Photographs therefore tell both at once here: that a part is
-    there, and that its pose is correct. A part that few photographs show, or that is seldom read alike, stays as
+    Templates of a plain part match photographs half as well as renderings, so that renderings teach that such poses are
+    wrong (docs/experiments/captures.md). Photographs therefore tell both at once here: that a part is there, and that
+    its pose is correct. A part that few photographs show, or that is seldom read alike, stays as
     renderings calibrate it.
 
     Args:
@@ -146,7 +145,7 @@ def calibrate_parts_by_agreement(network: ObjectsNetwork, world: SeveralObjectsW
         told.append(_told(member, agrees, is_enough=bool(is_enough)))
         if is_enough:
             reader.pose_correct[slot] = _share(features[:, slot], agrees)
-            reader.presence[slot] = torch.tensor([0.0, 0.0, _CERTAIN])
+            reader.presence_power[slot] = 0
     return "\n".join(told)
 
 

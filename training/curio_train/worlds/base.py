@@ -18,7 +18,7 @@ from curio_train.geometry import matrix_from_rotation_6d, rotation_6d_from_matri
 from curio_train.metrics.assignment import nearest_alike, scene_error
 from curio_train.networks.base import StageNetwork
 from curio_train.networks.paper.network import PoseNetwork
-from curio_train.scene_code import CONFIDENCE, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
+from curio_train.scene_code import CONFIDENCE, PRESENCE, ROTATION_6D, TRANSLATION, Field, Layout, SceneCode
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -146,8 +146,8 @@ class CameraFrameOutputs:
         """The outputs for scene codes, all in the camera frame.
 
         Returns:
-            The fields; beside ``rotation_6d`` also ``rotation`` [batch, slots, 3, 3], and ``confidence`` without its
-            last dimension, [batch, slots].
+            The fields; beside ``rotation_6d`` also ``rotation`` [batch, slots, 3, 3], and ``confidence`` and
+            ``presence``, where there is one, without their last dimension, [batch, slots].
         """
         outputs = {field.name: code[field.name] for field in self._layout.fields}
         if ROTATION_6D in code:
@@ -155,15 +155,12 @@ class CameraFrameOutputs:
             outputs[ROTATION_6D] = rotation_6d_from_matrix(outputs["rotation"])
         if self._centers_m is not None:
             outputs[TRANSLATION] = outputs[TRANSLATION] - self._from_origin(outputs)
-        if CONFIDENCE in code:
-            outputs[CONFIDENCE] = code[CONFIDENCE].squeeze(-1)
-        return outputs
+        return outputs | {name: code[name].squeeze(-1) for name in (CONFIDENCE, PRESENCE) if name in code}
 
     def to_code(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The scene codes that :meth:`from_code` made these outputs of."""
         code = {field.name: outputs[field.name] for field in self._layout.fields}
-        if CONFIDENCE in code:
-            code[CONFIDENCE] = code[CONFIDENCE].unsqueeze(-1)
+        code |= {name: outputs[name].unsqueeze(-1) for name in (CONFIDENCE, PRESENCE) if name in outputs}
         if self._centers_m is not None:
             code[TRANSLATION] = code[TRANSLATION] + self._from_origin(outputs)
         return code

@@ -16,10 +16,11 @@ STATUS = {DETECTION_STATUS_SURE: "sure", DETECTION_STATUS_UNSURE: "unsure"}
 
 
 def detection_json(detection: Detection) -> dict[str, object]:
-    """Its keys are always the same, but for those of tracks, of several cameras, of planes and of measured models."""
+    """Its keys are always the same, but for those of tracks, several cameras, planes, presence and measured models."""
     added: dict[str, object] = {"track": _track_json(detection.track)} if detection.HasField("track") else {}
     added |= {"views": list(detection.views)} if detection.views else {}
     added |= {"status": STATUS[detection.status]} if detection.status in STATUS else {}
+    added |= {"presence": round(detection.presence, 6)} if detection.HasField("presence") else {}
     added |= {"on_plane": True} if detection.on_plane else {}
     added |= {"interval": _interval_json(detection.interval)} if detection.HasField("interval") else {}
     return {

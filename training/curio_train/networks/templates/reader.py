@@ -16,10 +16,7 @@ from curio_train.networks.templates.geometry import CROP_PX, FILL, QUARTER_TURNS
 from curio_train.networks.templates.outline import outline_log_factor
 from curio_train.networks.templates.rolls import upright_rolls
 from curio_train.networks.templates.trunk import COARSE_STRIDE, Trunk
-from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
-
-NUM_NEIGHBOURS = 4
-"""Templates around the best hypothesis whose answers are averaged, in each crop of its place."""
+from curio_train.scene_code import CONFIDENCE, LIGHT, PRESENCE, ROTATION_6D, TRANSLATION
 
 LAMP = (0.0, -0.7, -0.7)
 """The light that templates are drawn under and that is answered: it is not read from images."""
@@ -40,10 +37,22 @@ class Places(NamedTuple):
     slots: Int[Tensor, " objects"]
     """Which objects these are, of all that the network knows."""
 
-    def repeated(self, count: int) -> "Places":
-        """Each centre proposal ``count`` times in a row."""
-        position_m, score = (of_all.repeat_interleave(count, dim=2) for of_all in self[:2])
-        return Places(position_m, score, self.slots)
+
+class _Aims(NamedTuple):
+    """Where cameras of crops look, some at each object."""
+
+    position_m: Float[Tensor, "batch objects num 3"]
+    """Camera frame of the image."""
+    slots: Int[Tensor, " objects"]
+    """Which objects are there."""
+
+    def repeated(self, count: int) -> "_Aims":
+        """Each position ``count`` times in a row."""
+        return self._replace(position_m=self.position_m.repeat_interleave(count, dim=2))
+
+    def of_crops(self, of_all: Float[Tensor, " known"]) -> Float[Tensor, " crops"]:
+        """Each crop's value of what all objects have."""
+        return of_all.index_select(0, self.slots)[:, None].expand(self.position_m.shape[:3]).flatten()
 
 
 class CalibrationFeatures(NamedTuple):
@@ -52,7 +61,7 @@ class CalibrationFeatures(NamedTuple):
     right: Float[Tensor, "batch objects 3"]
     """Ten times the final score, and how well the neighbours, and descriptors and outline, agree about the distance."""
     there: Float[Tensor, "batch objects 2"]
-    """Ten times the final score, and the score of the place that it was found at."""
+    """Ten times the final score, and the highest score of a place of the object."""
 
 
 class _Crops(NamedTuple):
@@ -85,8 +94,6 @@ class _Hypotheses(NamedTuple):
     """Positions in diameters."""
     crop: Int[Tensor, " rows"]
     """Crop in which the object is seen."""
-    place_score: Float[Tensor, " rows"]
-    """Score of the centre proposal that the crop looks at."""
 
     def in_frame(self, crops: _Crops) -> Float[Tensor, "rows 3"]:
         """Positions in the camera frame of the image, diameters."""
@@ -104,6 +111,8 @@ class PoseReader(nn.Module):
     """Weights of the pose-correct logit's features and its offset, [objects, 4]; calibrated on renderings."""
     presence: Tensor
     """Weights of the presence logit's features and its offset, [objects, 3]; calibrated on renderings."""
+    presence_power: Tensor
+    """Power with which presence enters the confidence, [objects]: 1, or 0 where the other factor tells both."""
     _matrix: Tensor
     _diameter_m: Tensor
     _nearest_m: Tensor
@@ -121,6 +130,7 @@ class PoseReader(nn.Module):
         self.banks = Banks(num, self._any_side)
         self.register_buffer("pose_correct", torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]).repeat(num, 1))
+        self.register_buffer("presence_power", torch.ones(num))
         for name, values in {
             "_matrix": torch.from_numpy(geometries[0].matrix).float(),
             "_diameter_m": torch.tensor([geometry.diameter_m for geometry in geometries]),
@@ -130,78 +140,74 @@ class PoseReader(nn.Module):
             self.register_buffer(name, values, persistent=False)
 
     def forward(self, trunk: Trunk, images: Float[Tensor, "batch 3 height width"], places: Places) -> dict[str, Tensor]:
-        """Codes in the frame's camera: metres, 6D rotation and confidence [batch, objects, …], light [batch, 3]."""
+        """Codes in the frame's camera: metres, 6D rotation, confidence and presence [batch, objects, …], light."""
         code, features = self.read(trunk, images, places)
-        right, there = (of_all.index_select(0, places.slots) for of_all in (self.pose_correct, self.presence))
-        sure = _probability(features.right, right) * _probability(features.there, there)
-        return code | {CONFIDENCE: sure[..., None]}
+        calibration = (self.pose_correct, self.presence, self.presence_power)
+        right, there, power = (of_all.index_select(0, places.slots) for of_all in calibration)
+        presence = _probability(features.there, there)
+        confidence = presence**power * _probability(features.right, right)
+        return code | {CONFIDENCE: confidence[..., None], PRESENCE: presence[..., None]}
 
     def read(
         self, trunk: Trunk, images: Float[Tensor, "batch 3 height width"], places: Places
     ) -> tuple[dict[str, Tensor], CalibrationFeatures]:
         """The code without its confidence, and what that is made of."""
-        places, roll = self._closer(trunk, images, places) if self.effort.closer else self._turned(places)
-        crops = self._crops(trunk, images, places, roll)
-        best = self._best(self._aligned(crops, self._hypotheses(crops, places), self.effort.steps[1]))
+        aims = _Aims(places.position_m, places.slots)
+        aims, roll = self._closer(trunk, images, aims) if self.effort.closer else self._turned(aims)
+        crops = self._crops(trunk, images, aims, roll)
+        best = self._best(self._aligned(crops, self._hypotheses(crops, aims), self.effort.steps[1]))
         pose, spread = self._averaged(crops, best)
         pose, gap = self._between(crops, best.crop, pose)
 
         found, by_object = best._replace(pose=pose), crops.by_object
         cam_from_crop = crops.cam_from_crop.index_select(0, best.crop)
         position_m = by_object(found.in_frame(crops)) * self._diameter_m.index_select(0, places.slots)[:, None]
-        score, place = by_object(10 * pose.score), by_object(best.place_score)
+        score = by_object(10 * pose.score)
         return {
             TRANSLATION: position_m,
             ROTATION_6D: by_object(rotation_6d_from_matrix(cam_from_crop @ pose.rotation)),
             LIGHT: self._lamp.expand(images.shape[0], 3),
         }, CalibrationFeatures(
             torch.stack([score, by_object(-100 * spread), by_object(-100 * gap.abs())], dim=2),
-            torch.stack([score, place], dim=2),
+            torch.stack([score, places.score.amax(dim=2)], dim=2),
         )
 
-    def _closer(self, trunk: Trunk, images: Tensor, places: Places) -> tuple[Places, Float[Tensor, "crops 3 3"]]:
+    def _closer(self, trunk: Trunk, images: Tensor, aims: _Aims) -> tuple[_Aims, Float[Tensor, "crops 3 3"]]:
         """Where the likeliest hypotheses put each object, and by what angles crops there are rolled.
 
         Places are some per cent too near or too far, and objects lean to one side. Templates match better in crops at
         the distance that alignment finds, and where the object leans as it does in templates.
         """
-        places, turn = self._turned(places)
-        crops = self._crops(trunk, images, places, turn)
-        found = self._aligned(crops, self._hypotheses(crops, places), self.effort.steps[0])
+        aims, turn = self._turned(aims)
+        crops = self._crops(trunk, images, aims, turn)
+        found = self._aligned(crops, self._hypotheses(crops, aims), self.effort.steps[0])
         upward = (crops.cam_from_crop.index_select(0, found.crop) @ found.pose.rotation)[..., 2]
-        score, position, place_score, upward = (
-            values.unflatten(0, (-1, self.effort.hypotheses))
-            for values in (found.pose.score, found.in_frame(crops), found.place_score, upward)
-        )
+        rows = (found.pose.score, found.in_frame(crops), upward)
+        score, position, upward = (values.unflatten(0, (-1, self.effort.hypotheses)) for values in rows)
         best = score.topk(self.effort.closer, dim=1).indices
         of_rows = best[..., None].expand(-1, -1, 3)
-        diameter_m, nearest_m = (
-            of_all.index_select(0, places.slots)[:, None, None] for of_all in (self._diameter_m, self._nearest_m)
-        )
+        both = (self._diameter_m, self._nearest_m)
+        diameter_m, nearest_m = (of_all.index_select(0, aims.slots)[:, None, None] for of_all in both)
         chosen = crops.by_object(position.gather(1, of_rows)) * diameter_m
         in_front = torch.maximum(chosen[..., 2:], nearest_m)
         closer = torch.cat([chosen[..., :2], in_front], dim=3)
-        of_places = crops.by_object(place_score.gather(1, best))
         rolls_deg = self.effort.rolls_deg
         roll = upright_rolls(closer.flatten(0, 2), upward.gather(1, of_rows).flatten(0, 1), rolls_deg)
-        return Places(closer, of_places, places.slots).repeated(len(rolls_deg)), roll
+        return _Aims(closer, aims.slots).repeated(len(rolls_deg)), roll
 
-    def _turned(self, places: Places) -> tuple[Places, Float[Tensor, "crops 3 3"] | None]:
-        """Places in all quarter turns where objects may be rolled in any way; else as they are."""
+    def _turned(self, aims: _Aims) -> tuple[_Aims, Float[Tensor, "crops 3 3"] | None]:
+        """Aims in all quarter turns where objects may be rolled in any way; else as they are."""
         if not self._any_side:
-            return places, None
-        quarters = places.score.new_tensor([[1, 0], [0, 1], [-1, 0], [0, -1]])
-        turns = about_axis(quarters).expand(*places.score.shape, -1, -1, -1).flatten(0, 3)
-        return places.repeated(QUARTER_TURNS), turns
+            return aims, None
+        quarters = aims.position_m.new_tensor([[1, 0], [0, 1], [-1, 0], [0, -1]])
+        turns = about_axis(quarters).expand(*aims.position_m.shape[:3], -1, -1, -1).flatten(0, 3)
+        return aims.repeated(QUARTER_TURNS), turns
 
-    def _crops(self, trunk: Trunk, images: Tensor, places: Places, roll: Tensor | None = None) -> _Crops:
+    def _crops(self, trunk: Trunk, images: Tensor, aims: _Aims, roll: Tensor | None = None) -> _Crops:
         """Crops in which templates can be shifted."""
-        num, side, slots = places.score.shape[2], self._side, places.slots
-        by_image = places.position_m.flatten(1, 2)
-        nearest, diameter_m = (
-            of_all.index_select(0, slots)[:, None].expand_as(places.score).flatten()
-            for of_all in (self._nearest_m, self._diameter_m)
-        )
+        num, side, slots = aims.position_m.shape[2], self._side, aims.slots
+        by_image = aims.position_m.flatten(1, 2)
+        nearest, diameter_m = aims.of_crops(self._nearest_m), aims.of_crops(self._diameter_m)
         distance_m = torch.maximum(by_image.flatten(0, 1).square().sum(dim=1).sqrt(), nearest)
         focal_px = FILL * CROP_PX * distance_m / diameter_m
         scale = 2 if self.effort.halved else 1
@@ -213,24 +219,24 @@ class PoseReader(nn.Module):
         maps = FeatureMaps.of(self.banks.fine(fine, slots, num))
         return _Crops(pictures, maps, by_object, crop_from_cam.transpose(1, 2), distance_m, focal_px, slots)
 
-    def _hypotheses(self, crops: _Crops, places: Places) -> _Hypotheses:
+    def _hypotheses(self, crops: _Crops, aims: _Aims) -> _Hypotheses:
         """The best match, the best of those that differ from it, and so on, of each object in each image."""
-        num = places.score.shape[2]
-        scores, shift = (found.flatten(0, 1) for found in self.banks.match(crops.coarse, places.slots).max(dim=3))
-        positions_m, place_scores = places.position_m.flatten(0, 1), places.score.flatten()
-        shifts, diameter_m = _shifts(self.effort.margin_px).to(scores), self._diameter_of(places)
+        num = aims.position_m.shape[2]
+        scores, shift = (found.flatten(0, 1) for found in self.banks.match(crops.coarse, aims.slots).max(dim=4))
+        positions_m, diameter_m = aims.position_m.flatten(0, 1), aims.of_crops(self._diameter_m)
+        shifts = _shifts(self.effort.margin_px).to(scores)
         count = scores.shape[2]
-        score, best = self._pick(scores, positions_m, _ONE_PLACE * diameter_m)
+        score, best = self._pick(scores, positions_m, _ONE_PLACE * diameter_m[::num])
         place, template = (torch.div(best, count, rounding_mode="floor"), (best % count).flatten())
         row = torch.arange(scores.shape[0], device=scores.device)
         crop = (row[:, None] * num + place).flatten()
         shift = shift.flatten(1).gather(1, best).flatten()
         slope = shifts.index_select(0, shift) / crops.focal_px.index_select(0, crop)[:, None]
         ray = torch.cat([slope, torch.ones_like(slope[:, :1])], dim=1)
-        far = crops.distance_m.index_select(0, crop) / diameter_m.repeat_interleave(best.shape[1])
+        far = (crops.distance_m / diameter_m).index_select(0, crop)
         position = ray / ray.square().sum(dim=1, keepdim=True).sqrt() * far[:, None]
         rotation = _seen_along(position) @ self.banks.rotations.index_select(0, template)
-        return _Hypotheses(Aligned(rotation, position, score.flatten()), crop, place_scores.index_select(0, crop))
+        return _Hypotheses(Aligned(rotation, position, score.flatten()), crop)
 
     def _pick(
         self,
@@ -263,11 +269,12 @@ class PoseReader(nn.Module):
 
     def _averaged(self, crops: _Crops, best: _Hypotheses) -> tuple[Aligned, Float[Tensor, " rows"]]:
         """The mean of what the templates around a pose answer, and the spread of the logarithm of their distances."""
+        num = self.effort.neighbours
         rolled, pose = self._in_all_rolls(crops, best.crop, best.pose)
-        templates = self._nearest(pose, NUM_NEIGHBOURS).unflatten(0, (-1, len(self.effort.rolls_deg))).flatten(1)
+        templates = self._nearest(pose, num).unflatten(0, (-1, len(self.effort.rolls_deg))).flatten(1)
         surface = self.banks.surface(templates, crops.slots)
-        start = Aligned(*(of_all.repeat_interleave(NUM_NEIGHBOURS, dim=0) for of_all in pose))
-        crop = rolled.repeat_interleave(NUM_NEIGHBOURS)
+        start = Aligned(*(of_all.repeat_interleave(num, dim=0) for of_all in pose))
+        crop = rolled.repeat_interleave(num)
         found = align(crops.fine, crop, *surface, start, crops.focal_px.index_select(0, crop), self.effort.steps[2])
         rotation, position, score = (of_all.unflatten(0, templates.shape) for of_all in found)
         cam_from_crop = crops.cam_from_crop.index_select(0, crop).unflatten(0, templates.shape)
@@ -296,12 +303,10 @@ class PoseReader(nn.Module):
 
     def _best(self, found: _Hypotheses) -> _Hypotheses:
         """The hypothesis of each object in each image that has the highest score."""
-        num = self.effort.hypotheses
-        by_object = found.pose.score.unflatten(0, (-1, num))
-        row = torch.arange(by_object.shape[0], device=by_object.device) * num + by_object.argmax(dim=1)
-        pose, crop, place_score = found
-        best = Aligned(*(of_all.index_select(0, row) for of_all in pose))
-        return _Hypotheses(best, crop.index_select(0, row), place_score.index_select(0, row))
+        best = found.pose.score.unflatten(0, (-1, self.effort.hypotheses)).argmax(dim=1)
+        row = torch.arange(best.shape[0], device=best.device) * self.effort.hypotheses + best
+        pose = Aligned(*(of_all.index_select(0, row) for of_all in found.pose))
+        return _Hypotheses(pose, found.crop.index_select(0, row))
 
     def _in_all_rolls(
         self, crops: _Crops, crop: Int[Tensor, " rows"], pose: Aligned
@@ -324,10 +329,6 @@ class PoseReader(nn.Module):
     def _side(self) -> int:
         """Of crops, pixels."""
         return CROP_PX + 2 * self.effort.margin_px
-
-    def _diameter_of(self, places: Places) -> Float[Tensor, " batch*objects"]:
-        """Diameters of the objects, metres."""
-        return self._diameter_m.index_select(0, places.slots).expand(places.score.shape[:2]).flatten()
 
 
 def _seen_along(position: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3 3"]:

@@ -21,12 +21,19 @@ _NUM_POINTS = 500  # vertices that ADD is measured at, about
 
 
 @torch.no_grad()
-def calibrate(network: ObjectsNetwork, world: ObjectScenes, cache: Path) -> None:
-    """Make each object's confidence the probability of a correct pose, in place.
+def calibrate(network: ObjectsNetwork, world: ObjectScenes, cache: Path, *, by_heat_map: bool = False) -> None:
+    """Make each object's confidence the probability of a correct pose, and its presence that it is there, in place.
 
     Frames that show the object tell whether its pose is correct; those that don't show its absence. They are not
     augmented: confidence calibrated on augmented ones is farther off in photographs
     (docs/experiments/real_photographs.md).
+
+    Args:
+        network: With all of its templates.
+        world: Of its objects.
+        cache: Folder with generated data.
+        by_heat_map: Whether the locator's heat maps alone tell presence, in the same way for all objects, and not how
+            well templates match, too. Of a locator that learned from photographs they say more about those than both.
 
     Raises:
         DataError: The backgrounds cannot be read.
@@ -49,6 +56,9 @@ def calibrate(network: ObjectsNetwork, world: ObjectScenes, cache: Path) -> None
         seen = shown[:, number]
         network.reader.pose_correct[number] = _fit(right[seen, number], hit[seen, number])
         network.reader.presence[number] = _fit(there[:, number], seen)
+    if by_heat_map:
+        network.reader.presence[:, 0] = 0
+        network.reader.presence[:, 1:] = _fit(there[..., 1:].reshape(-1, 1), shown.ravel())
 
 
 def _correct(world: ObjectScenes, found: SceneCode, true: SceneCode) -> np.ndarray:
