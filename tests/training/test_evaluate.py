@@ -22,7 +22,7 @@ from curio_train.evaluation.scores import pose_scores, rotation_errors_deg, scen
 from curio_train.evaluation.several_objects import several_objects_scores
 from curio_train.evaluation.subject import Subject
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
-from curio_train.scene_code import CONFIDENCE, LIGHT, ROTATION_6D, TRANSLATION
+from curio_train.scene_code import CONFIDENCE, LIGHT, PRESENCE, ROTATION_6D, TRANSLATION
 from curio_train.worlds.generated.circles import Circles
 from curio_train.worlds.linemod import build
 from curio_train.worlds.options import LinemodOptions
@@ -119,6 +119,16 @@ def test_renderings_that_show_nothing_are_too_few(brick: Object) -> None:
     code[CONFIDENCE][:] = 0
     with pytest.raises(UsageError, match="--num-images 2: none of them shows an object"):
         several_objects_scores(world, code, code)
+
+
+def test_presence_tells_what_is_shown_and_confidence_where_there_is_none(brick: Object) -> None:
+    world = SeveralObjectsWorld("linemod", [brick])
+    true = world.sample(4, (1,))
+    true[CONFIDENCE][:, 0, 0] = torch.tensor([1.0, 1.0, 0.0, 0.0])
+    found = {**true, CONFIDENCE: torch.tensor([0.1, 0.2, 0.3, 0.4])[:, None, None]}
+    assert several_objects_scores(world, found, true)["present_auroc"] == 0
+    found[PRESENCE] = torch.tensor([0.9, 0.8, 0.3, 0.4])[:, None, None]
+    assert several_objects_scores(world, found, true)["present_auroc"] == 1
 
 
 K = [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1]

@@ -218,6 +218,19 @@ def test_confidence_is_calibrated_by_photographs_that_agree_and_templates_stay(w
     assert ((logits > 0) == right).mean() > 0.85
 
 
+@pytest.mark.parametrize("by_heat_map", [False, True])
+def test_the_heat_maps_alone_tell_presence_where_photographs_taught_them(
+    world: SeveralObjectsWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, by_heat_map: bool
+) -> None:
+    monkeypatch.setattr(confidence_of_several, "NUM_FRAMES", 6)
+    network = with_random_templates(world)
+    network.look_less()
+    confidence_of_several.calibrate(network, world, tmp_path, by_heat_map=by_heat_map)
+    first, second = network.reader.presence
+    assert (float(first[0]) == 0 == float(second[0])) == by_heat_map, "the weight of the templates' score"
+    assert torch.equal(first, second) == by_heat_map, "one calibration for all objects"
+
+
 @torch.no_grad()
 def test_a_part_that_is_read_alike_often_is_calibrated_by_it(
     world: SeveralObjectsWorld, tmp_path: Path, greys: Callable[[int], Any], monkeypatch: pytest.MonkeyPatch

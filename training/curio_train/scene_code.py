@@ -139,6 +139,11 @@ class Layout:
                 raise ValueError(f"{field.name} has shape {found}, expected {self.shape(field, found[0])}")
 
 
+def presence_of(code: SceneCode) -> Tensor:
+    """The probability that each object is there, [batch, slots]: its confidence where no presence is answered."""
+    return code.get(PRESENCE, code[CONFIDENCE])[..., 0]
+
+
 def index(code: SceneCode, rows: Tensor | slice) -> dict[str, Tensor]:
     """The code of some images of the batch."""
     return {name: value[rows] for name, value in code.items()}

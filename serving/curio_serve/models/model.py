@@ -53,7 +53,8 @@ _OUTPUT_SHAPES: dict[str, tuple[tuple[int, ...], bool]] = {
     "light": ((3,), False),
 }
 _ROTATIONS = {"rotation", "rotation_6d"}
-_UNLISTED = {*_ROTATIONS, "presence"}  # outputs that the spec need not list: no scene code has them, or one alone
+# Outputs that the spec need not list: one rotation is derived from the other, and presence is no field of a scene code.
+_UNLISTED = {*_ROTATIONS, "presence"}
 
 
 @dataclass(frozen=True, eq=False)

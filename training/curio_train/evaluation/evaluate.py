@@ -25,7 +25,7 @@ from curio_train.learning.runs.provenance import machine
 from curio_train.metrics.calibration import auroc, calibration_error, reliability_bins
 from curio_train.metrics.poses import ADD_THRESHOLD
 from curio_train.refinement.predictions import with_refinement
-from curio_train.scene_code import CONFIDENCE, SceneCode, index, joined, poses
+from curio_train.scene_code import CONFIDENCE, SceneCode, index, joined, poses, presence_of
 from curio_train.worlds.base import Split, World
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 from curio_train.worlds.single_object.world import SingleObjectWorld
@@ -206,14 +206,14 @@ def score(
 
 
 def calibration(world: World, predicted: SceneCode, true: SceneCode, on_empty: SceneCode) -> dict[str, float]:
-    """Scores the confidence of one object.
+    """Scores the confidence of one object as the probability that ADD(-S) is below a tenth of the diameter.
 
-    Once as the probability that ADD(-S) is below a tenth of the diameter, once as a sign that the object is there.
+    And its presence, or its confidence where there is none, as a sign that the object is there.
     """
     confidences, correct = _confidences(world, predicted, true)
     return {
         "confidence_ece": calibration_error(confidences, correct),
-        "present_auroc": auroc(confidences, on_empty[CONFIDENCE].flatten().tolist()),
+        "present_auroc": auroc(presence_of(predicted).flatten().tolist(), presence_of(on_empty).flatten().tolist()),
     }
 
 

@@ -25,7 +25,7 @@ from curio_train.evaluation.on_plane import shapes_of, standing_on
 from curio_train.evaluation.real_scores import Estimate, scored, together
 from curio_train.evaluation.subject import Subject
 from curio_train.geometry import Pose
-from curio_train.scene_code import CONFIDENCE, PRESENCE, TRANSLATION, poses
+from curio_train.scene_code import CONFIDENCE, TRANSLATION, poses, presence_of
 from curio_train.worlds.base import Camera, World
 
 _BATCH = 16
@@ -156,10 +156,10 @@ def _estimates(subject: Subject, frames: Sequence[Frame]) -> Iterator[list[Estim
     crops = [_whole_frame(frame, subject.world.camera) for frame in frames]
     images = torch.from_numpy(np.stack([crop.image for crop in crops])).permute(0, 3, 1, 2).contiguous()
     code = subject.predict(images)
+    code = {CONFIDENCE: torch.ones_like(code[TRANSLATION][..., :1]), **code}
     seconds = (time.perf_counter() - start) / len(frames)
     by_object = [poses(code, slot) for slot in range(code[TRANSLATION].shape[1])]
-    confidence = code.get(CONFIDENCE, torch.ones_like(code[TRANSLATION][..., :1]))[..., 0]
-    presence = code[PRESENCE][..., 0] if PRESENCE in code else confidence
+    confidence, presence = code[CONFIDENCE][..., 0], presence_of(code)
     for number, (frame, crop) in enumerate(zip(frames, crops, strict=True)):
         cam_from_canonical = Pose(crop.canonical_from_cam.T, np.zeros(3))
         yield [

@@ -4,7 +4,7 @@ from curio_train.errors import UsageError
 from curio_train.evaluation.scores import add_errors, mean_of_objects, pose_scores
 from curio_train.metrics.calibration import auroc, calibration_error
 from curio_train.metrics.poses import ADD_THRESHOLD
-from curio_train.scene_code import CONFIDENCE, PRESENCE, SceneCode, index, poses
+from curio_train.scene_code import CONFIDENCE, SceneCode, index, poses, presence_of
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
 
 _MOST_POINTS = 2_000  # vertices that ADD is measured at, about
@@ -14,13 +14,13 @@ def several_objects_scores(world: SeveralObjectsWorld, predicted: SceneCode, tru
     """Means of the objects' pose scores where they are shown, and what all confidences say together.
 
     ``confidence_ece`` takes a confidence as the probability that ADD(-S) is below a tenth of the diameter, and
-    ``present_auroc`` takes its presence, where the network answers one, as a sign that an object is shown.
+    ``present_auroc`` takes the presence, or the confidence where there is none, as a sign that an object is shown.
 
     Raises:
         UsageError: No rendering shows any object.
     """
     each, confidences, correct, present = [], [], [], []
-    presence = predicted.get(PRESENCE, predicted[CONFIDENCE])[..., 0]
+    presence = presence_of(predicted)
     there = true[CONFIDENCE][..., 0] > 0
     for slot, member in enumerate(world.members):
         shown = there[:, slot]

@@ -67,7 +67,7 @@ class ObjectsNetwork(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch 3 height width"], slots: Int[Tensor, " objects"] | None = None
     ) -> dict[str, Tensor]:
-        """Codes in the frame's camera: metres, 6D rotation, confidence and presence [batch, objects, …], light.
+        """Codes in the frame's camera: metres, 6D rotation, confidence, presence [batch, objects, …]; light [batch, 3].
 
         Args:
             images: sRGB in [0, 1].

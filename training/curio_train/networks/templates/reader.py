@@ -140,7 +140,7 @@ class PoseReader(nn.Module):
             self.register_buffer(name, values, persistent=False)
 
     def forward(self, trunk: Trunk, images: Float[Tensor, "batch 3 height width"], places: Places) -> dict[str, Tensor]:
-        """Codes in the frame's camera: metres, 6D rotation, confidence and presence [batch, objects, …], light."""
+        """In the frame's camera: metres, 6D rotation, confidence, presence [batch, objects, …]; light [batch, 3]."""
         code, features = self.read(trunk, images, places)
         calibration = (self.pose_correct, self.presence, self.presence_power)
         right, there, power = (of_all.index_select(0, places.slots) for of_all in calibration)
