@@ -127,8 +127,7 @@ def test_presence_tells_what_is_shown_and_confidence_where_there_is_none(brick: 
     true[CONFIDENCE][:, 0, 0] = torch.tensor([1.0, 1.0, 0.0, 0.0])
     found = {**true, CONFIDENCE: torch.tensor([0.1, 0.2, 0.3, 0.4])[:, None, None]}
     assert several_objects_scores(world, found, true)["present_auroc"] == 0
-    found[PRESENCE] = torch.tensor([0.9, 0.8, 0.3, 0.4])[:, None, None]
-    assert several_objects_scores(world, found, true)["present_auroc"] == 1
+    assert several_objects_scores(world, {**found, PRESENCE: 1 - found[CONFIDENCE]}, true)["present_auroc"] == 1
 
 
 K = [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1]
