@@ -4,9 +4,9 @@
 
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
-10c6bff; models/lmo/6 has seen them), and no label of a frame is opened in training. A call goes on with what is there.
+10c6bff; models/lmo/7 has seen them), and no label of a frame is opened in training. A call goes on with what is there.
 The last line, also in OUT/halves.json, is of both halves: by one read and by nine, of the runs and of what
-``curio-export --fast`` makes of them; as served, after render-and-compare, and with ``--plane objects``.
+``curio-export --fast --int8`` makes of them; as served, after render-and-compare, and with ``--plane objects``.
 """
 
 import argparse
@@ -87,10 +87,10 @@ def _learn(run: Path, data: Path, photographs: Path, arguments: argparse.Namespa
 
 
 def _fast(run: Path, models: Path) -> Path:
-    """The run as a model that looks at each object once, in one crop of half the resolution."""
+    """The run exported as models/lmo is: it looks at each object once, and its locator computes in int8."""
     model = models / "lmo"
     if not model.exists():
-        _call("curio-export", run, "--out", models, "--name", "lmo", "--half", "--fast")
+        _call("curio-export", run, "--out", models, "--name", "lmo", "--half", "--fast", "--int8")
     return model
 
 

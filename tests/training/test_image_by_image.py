@@ -5,6 +5,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+import torch.nn.functional as F
 from curio_train.export.image_by_image import image_by_image, inner_graph, of_one_image
 from curio_train.export.int8 import rounded_otherwise, to_int8
 from curio_train.export.onnx import Tracing, store_half, to_onnx
@@ -14,15 +15,18 @@ SIZE = 32
 
 
 class Small(nn.Module):
-    """Convolutions, a mean for each slot, and an answer of the scene."""
+    """Convolutions, one of them with a part of a weight, turned; a mean for each slot, and an answer of the scene."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.first, self.middle, self.last = nn.Conv2d(3, 8, 3), nn.Conv2d(8, 8, 3), nn.Conv2d(8, 4, 3)
+        self.first, self.middle, self.last = nn.Conv2d(3, 32, 3), nn.Conv2d(36, 8, 3), nn.Conv2d(8, 4, 3)
+        self.few = nn.Conv2d(8, 8, 3)
 
     def forward(self, image: torch.Tensor, slots: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         pixels = image.permute(0, 3, 1, 2).float() / 255
-        seen = self.last(self.middle(self.first(pixels).relu()).relu()).mean(dim=(2, 3))
+        weight = self.middle.weight.narrow(1, 4, 32).transpose(2, 3)
+        middle = F.conv2d(self.first(pixels).relu(), weight, self.middle.bias).relu()
+        seen = self.last(self.few(middle).relu()).mean(dim=(2, 3))
         return seen[:, slots], pixels.mean(dim=(1, 2, 3))
 
 
@@ -79,10 +83,20 @@ def test_weights_inside_are_stored_as_half(model: onnx.ModelProto) -> None:
         np.testing.assert_array_equal(one, other)
 
 
+def test_a_part_of_a_weight_is_stored_as_it_is_computed_with(model: onnx.ModelProto) -> None:
+    graph = inner_graph(model)
+    sizes = {tensor.name: list(tensor.dims) for tensor in graph.initializer}
+    weights = [sizes[node.input[1]] for node in graph.node if node.op_type == "Conv"]
+    assert weights == [[32, 3, 3, 3], [8, 32, 3, 3], [8, 8, 3, 3], [4, 8, 3, 3]]
+
+
 def test_convolutions_inside_are_quantised(model: onnx.ModelProto) -> None:
+    """That with 288 products a sum; not the first and the last, nor the one with 72."""
     quantised = to_int8(model, torch.from_numpy(IMAGES).permute(0, 3, 1, 2))
-    kinds = {node.op_type for node in inner_graph(quantised).node}
-    assert {"QuantizeLinear", "DequantizeLinear"} <= kinds
+    graph = inner_graph(quantised)
+    assert any(node.op_type == "QuantizeLinear" for node in graph.node)
+    of_int8 = {name for node in graph.node if node.op_type == "DequantizeLinear" for name in node.output}
+    assert [node.input[1] in of_int8 for node in graph.node if node.op_type == "Conv"] == [False, True, False, False]
     assert [node.op_type for node in quantised.graph.node] == ["Scan"]
     found, exact = run(quantised, IMAGES)[0], run(model, IMAGES)[0]
     assert 0 < np.abs(found - exact).max() < 0.05

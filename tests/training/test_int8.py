@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from curio_serve.errors import ModelError
 from curio_serve.models.model_folder import load_version
 from curio_train.commands import export as export_command
 from curio_train.errors import ExportError
@@ -17,7 +18,7 @@ from curio_train.evaluation import int8 as reduction
 from curio_train.evaluation.scores import accuracy
 from curio_train.export import int8, write_model
 from curio_train.export.graph import Graph
-from curio_train.export.onnx import to_onnx
+from curio_train.export.onnx import put_spec, to_onnx
 from curio_train.export.write_model import Exported, export
 from curio_train.exported_model import ExportedModel
 from curio_train.scene_code import TRANSLATION
@@ -77,6 +78,21 @@ def test_a_version_in_int8(reduced: tuple[Path, str]) -> None:
     assert 1e-6 < served.spec.parity_max_abs_error < 0.05
 
 
+def test_a_version_in_int8_that_computes_something_else_is_refused(reduced: tuple[Path, str], tmp_path: Path) -> None:
+    """By more than rounding, though by less than its answers differ from those in float32."""
+    folder = Path(shutil.copytree(reduced[0] / "circles", tmp_path / "circles"))
+    (folder / "SHA256SUMS").unlink()
+    spec, model = load_version(folder, 3).spec, onnx.load(folder / "3" / "model.onnx")
+    spec.parity_max_abs_error = 1.0
+    put_spec(model, spec)
+    onnx.save(model, folder / "3" / "model.onnx")
+    assert load_version(folder, 3).version == 3
+    golden = dict(np.load(folder / "3" / "golden.npz"))
+    np.savez(folder / "3" / "golden.npz", **golden | {TRANSLATION: golden[TRANSLATION] + 0.002})
+    with pytest.raises(ModelError, match=r"translation_m is 0\.002 off"):
+        load_version(folder, 3)
+
+
 def test_what_costs_more_than_a_point_is_refused_with_both_figures(
     circles_run: Path, models: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,7 +128,7 @@ class _Linear(torch.nn.Module):
 
 def test_a_network_without_anything_to_quantise_is_refused() -> None:
     model = to_onnx(Graph(_Linear(), Circles()), 128, 128, [TRANSLATION])
-    with pytest.raises(ExportError, match="no convolution before an activation"):
+    with pytest.raises(ExportError, match="no convolution of 256 or more products before an activation"):
         int8.to_int8(model, torch.zeros(2, 3, 128, 128, dtype=torch.uint8))
 
 

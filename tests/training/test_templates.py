@@ -188,7 +188,7 @@ def test_derivatives_by_a_pose_are_those_of_small_changes() -> None:
     rotation = random_rotations(3, random).double()
     position = torch.from_numpy(random.uniform([-0.3, -0.3, 1.2], [0.3, 0.3, 1.8], (3, 3)))
     points, focal = torch.from_numpy(random.uniform(-0.5, 0.5, (3, 7, 3))), torch.tensor([90.0, 130.0, 150.0]).double()
-    derivatives = torch.stack(InCrop.of(rotation, position, points).jacobians(focal), dim=1)  # [3, 2, 6, points]
+    derivatives = InCrop.of(rotation, position, points).jacobians(focal)  # [3, 2, 6, points]
     for number, change in enumerate(1e-5 * torch.eye(6).double()):
         turned = turn(change[None, :3]) @ rotation
         by_change = (

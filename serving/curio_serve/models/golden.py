@@ -18,7 +18,9 @@ from curio_serve.files import read_file
 from curio_serve.models.model import INPUT, Model
 
 GOLDEN_FILE = "golden.npz"
-_TOLERANCE = 1e-3  # metres, image widths, entries of matrices; float16 weights on another processor stay below
+LARGEST_DIFFERENCE = 1e-3
+"""Between stored and computed outputs: metres, image widths, entries of matrices. Float16 weights on another processor
+stay below, and what is stored of a model that computes in int8."""
 
 _MAX_BYTES = 1 << 28
 
@@ -86,15 +88,6 @@ def read_golden(path: Path, model: Model) -> Golden:
     return Golden(path, image, outputs)
 
 
-def golden_tolerance(model: Model) -> float:
-    """Largest difference that is accepted.
-
-    A model that computes in int8 rounds otherwise on another processor, by steps of its own; its specification says by
-    how much it differs from the network that was trained.
-    """
-    return max(_TOLERANCE, model.spec.parity_max_abs_error)
-
-
 def check_golden(path: Path, model: Model) -> None:
     """Refuse a model whose outputs for the golden image differ from the stored ones.
 
@@ -109,9 +102,9 @@ def check_golden(path: Path, model: Model) -> None:
     if not path.exists():
         return
     for name, off in read_golden(path, model).differences(model).items():
-        if not off <= golden_tolerance(model):
+        if not off <= LARGEST_DIFFERENCE:
             raise ModelError(
                 f"{path}: the network's {name} is {off:.3g} off for the golden image; at most "
-                f"{golden_tolerance(model):.3g} is accepted: this file, or this machine's runtime, does not compute "
+                f"{LARGEST_DIFFERENCE:.3g} is accepted: this file, or this machine's runtime, does not compute "
                 "what was exported; copy or export the model again"
             )

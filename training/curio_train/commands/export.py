@@ -32,8 +32,8 @@ class ExportCommand:
     half: FlagCreatePairsOff[bool] = False
     """Store weights as float16: half the size, computed with in float32."""
     int8: FlagCreatePairsOff[bool] = False
-    """Convolutions in int8: faster and smaller, with --half also what is left. Draws renderings; refused if accuracy
-    falls by a point."""
+    """Large convolutions in int8: faster and smaller, with --half also what is left. Draws renderings; refused if
+    accuracy falls by a point."""
     fast: FlagCreatePairsOff[bool] = False
     """Look at each of several objects once, in one crop of half the resolution: an eighth of the time. For runs that
     learned from --photos."""

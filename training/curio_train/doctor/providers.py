@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from curio_serve.errors import ModelError
-from curio_serve.models.golden import GOLDEN_FILE, Golden, golden_tolerance, read_golden
+from curio_serve.models.golden import GOLDEN_FILE, LARGEST_DIFFERENCE, Golden, read_golden
 from curio_serve.models.model import Model, load
 from curio_serve.models.runtime import CPU, Runtime, available_providers, short_name
 
@@ -39,9 +39,9 @@ def _tried(file: Path, golden: Path, provider: str) -> Finding:
     except (ModelError, OSError) as exc:
         return _unfit(provider, str(exc))
     text = f"{_milliseconds(model, image):.3g} ms for the golden image ({provider}), {off:.2g} off"
-    if off <= golden_tolerance(model):
+    if off <= LARGEST_DIFFERENCE:
         return Finding(subject, "good", text)
-    return _unfit(provider, f"{text}, where at most {golden_tolerance(model):.3g} is accepted")
+    return _unfit(provider, f"{text}, where at most {LARGEST_DIFFERENCE:.3g} is accepted")
 
 
 def _unfit(provider: str, text: str) -> Finding:

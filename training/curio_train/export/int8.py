@@ -2,8 +2,8 @@
 
 Weights have a scale a channel and seven bits, so that sums never saturate and processors with and without VNNI compute
 the same. Activations and sums of residual blocks stay in int8 between convolutions. Convolutions whose output is the
-input of no activation and no other convolution give the answer itself and stay in float32, as the first ones do, and
-all else.
+input of no activation and no other convolution give the answer itself and stay in float32, as the first ones do, those
+that add few products, and all else.
 """
 
 import tempfile
@@ -23,6 +23,7 @@ from curio_train.export.onnx import quiet
 
 _ACTIVATIONS = ("Relu", "Clip")
 _BETWEEN = (*_ACTIVATIONS, "Add")  # that stay in int8 after a convolution
+_LEAST_PRODUCTS = 256  # in each sum of a convolution; with fewer, eight bits save little, and rounding tells more
 _FACTOR = "rounding"
 _ROUNDING = (1e-7, -1e-7, 2e-7, -2e-7, 3e-7, -3e-7)  # relative: that of float32 in a few operations
 
@@ -43,7 +44,10 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
     single = of_one_image(model)
     kept = _kept(single.graph)
     if not any(node.op_type == "Conv" and node.name not in kept for node in single.graph.node):
-        raise ExportError("the network has no convolution before an activation to quantise; export without --int8")
+        raise ExportError(
+            f"the network has no convolution of {_LEAST_PRODUCTS} or more products before an activation to quantise; "
+            "export without --int8"
+        )
 
     class Reader(quantization.CalibrationDataReader):
         def __init__(self) -> None:
@@ -108,9 +112,10 @@ def _kept(graph: onnx.GraphProto) -> set[str]:
 
     Those are the first convolutions, because many pixels lie right between two steps of eight bits, where rounding
     decides; convolutions that no activation and no other convolution follows, at once or after the sum of a residual
-    block, or whose weights the graph computes; and activations and sums that follow no quantised convolution.
+    block, whose weights the graph computes, or whose sums have few products; and activations and sums that follow no
+    quantised convolution.
     """
-    constant = {tensor.name for tensor in graph.initializer}
+    products = {tensor.name: np.prod(tensor.dims[1:]) for tensor in graph.initializer}
     followed: set[str] = set()
     for node in reversed(graph.node):  # which are in the order of computation
         if node.op_type in _ACTIVATIONS or (node.op_type == "Add" and node.output[0] in followed):
@@ -120,7 +125,8 @@ def _kept(graph: onnx.GraphProto) -> set[str]:
     kept, quantised, convolved = set[str](), set[str](), set[str]()
     for node in graph.node:
         is_inner = node.input and node.input[0] in convolved and node.output[0] in followed
-        if node.op_type == "Conv" and is_inner and set(node.input[1:]) <= constant:
+        is_large = node.op_type == "Conv" and products.get(node.input[1], 0) >= _LEAST_PRODUCTS
+        if is_large and is_inner:
             quantised.add(node.output[0])
         elif node.op_type == "Conv" or (node.op_type in _BETWEEN and quantised.isdisjoint(node.input)):
             kept.add(node.name)

@@ -26,6 +26,7 @@ from curio_train.export.image_by_image import image_by_image, inner_graph
 OPSET = 18
 _TALKATIVE = "torch.onnx", "onnx_ir"  # loggers: of packages that are not needed and constants that stay
 _LARGEST_REPEATED = 1 << 20  # values; larger constants are weights, which are there once
+_MOVING = ("Reshape", "Slice", "Transpose")  # which make no more of a weight than there is
 _SMALLEST_HALF = 256  # values; below, a Cast costs more than it saves
 
 
@@ -125,7 +126,7 @@ def _simplify(model: ir.Model) -> None:
     the whole image.
     """
     optimizer.inline(model)
-    optimizer.fold_constants(model)
+    optimizer.fold_constants(model, should_fold=lambda node: node.op_type in _MOVING or None)
     rewriter.rewrite(model, pattern_rewrite_rules=[materialize_reshape_shape_rule])
     for simplify in (
         passes.RemoveUnusedNodesPass(),

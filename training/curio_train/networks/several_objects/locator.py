@@ -70,7 +70,8 @@ def _of_both(first: nn.Conv2d, fine: Tensor, coarse: Tensor) -> Tensor:
     The fine map's weights are laid out as its cells are, so that an exported graph does not move cells.
     """
     ratio = COARSE_STRIDE // FINE_STRIDE
-    of_fine, of_coarse = first.weight.split((ratio**2 * FINE_WIDTH, COARSE_WIDTH), dim=1)
+    width = ratio**2 * FINE_WIDTH
+    of_fine, of_coarse = first.weight.narrow(1, 0, width), first.weight.narrow(1, width, COARSE_WIDTH)
     cells = of_fine.unflatten(1, (FINE_WIDTH, ratio, ratio))  # [outputs, channels, down, across, rows, columns]
     of_fine = cells.permute(0, 1, 4, 2, 5, 3).flatten(4, 5).flatten(2, 3)
     return F.conv2d(fine, of_fine, None, ratio, ratio) + F.conv2d(coarse, of_coarse, first.bias, padding=1)

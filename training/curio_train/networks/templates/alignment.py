@@ -26,6 +26,10 @@ _BY_ARM = [  # what rotations and shifts move x, then y, then z by, from the arm
     *([0, 1, 0], [-1, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]),
 ]
 _BY_SHIFT = [[float(row in (3, 10, 17))] for row in range(18)]  # and without it
+_CORNERS = [
+    [[0], [1], [0], [1]],
+    [[0], [0], [1], [1]],
+]  # columns, then rows, of the cells around a point, from the first
 
 
 class FeatureMaps(NamedTuple):
@@ -57,14 +61,12 @@ class FeatureMaps(NamedTuple):
         """The cells around columns and rows; those at the border where a point lies outside."""
         place = place.clamp(0, self.side - 1)
         first = place.floor().clamp(max=self.side - 2)
-        column, row = first.split(1, dim=1)
-        number = (self.side * row + column).long() + (crop * self.side**2)[:, None, None]
-        right, below = (place - first).split(1, dim=1)
-        left, above = 1 - right, 1 - below
-        return Corners(
-            number + torch.tensor([[0], [1], [self.side], [self.side + 1]], device=number.device),
-            torch.cat([left * above, right * above, left * below, right * below], dim=1),
-        )
+        strides, corners = place.new_tensor([[1.0, self.side]]), place.new_tensor(_CORNERS)
+        begin = (crop * self.side**2)[:, None] + (strides[0] @ corners[..., 0]).long()
+        right, below = ((place - first).unsqueeze(2) * (2 * corners - 1) + (1 - corners)).unbind(1)
+        # A product of matrices repeats weights: onnxruntime takes twice as long to multiply by what it repeats itself.
+        weight = (right * below)[..., None] @ place.new_ones(1, self.here.shape[1])
+        return Corners((strides @ first).long() + begin[..., None], weight)
 
 
 class Corners(NamedTuple):
@@ -72,14 +74,14 @@ class Corners(NamedTuple):
 
     cell: Int[Tensor, "batch 4 points"]
     """Numbers of the cells in a map."""
-    weight: Float[Tensor, "batch 4 points"]
-    """Sum to 1 for each point."""
+    weight: Float[Tensor, "batch 4 points size"]
+    """The same in all channels; they sum to 1 for each point."""
 
     def of(self, values: Float[Tensor, "cells size"]) -> Float[Tensor, "batch points size"]:
         """Bilinear values of a map."""
         # index_select and a sum, not indexing and lerp, which take an exported graph several times as long.
         corners = values.index_select(0, self.cell.flatten()).unflatten(0, (-1, *self.cell.shape[1:]))
-        return (self.weight[..., None] * corners).sum(dim=1)
+        return (self.weight * corners).sum(dim=1)
 
 
 class Aligned(NamedTuple):
@@ -150,13 +152,12 @@ class InCrop(NamedTuple):
         middle = (side * FINE_STRIDE - 1) / 2
         return self.slope * (focal_px / FINE_STRIDE)[:, None, None] + middle / FINE_STRIDE
 
-    def jacobians(self, focal_px: Float[Tensor, " batch"]) -> list[Float[Tensor, "batch 6 points"]]:
+    def jacobians(self, focal_px: Float[Tensor, " batch"]) -> Float[Tensor, "batch 2 6 points"]:
         """Derivatives of columns, and of rows, in cells, by a rotation vector and by a shift."""
         by_arm, by_shift = (self.arm.new_tensor(values) for values in (_BY_ARM, _BY_SHIFT))
-        *of_across, of_along = (by_arm @ self.arm + by_shift).split(6, dim=1)
+        of_across, of_along = (by_arm @ self.arm + by_shift).unflatten(1, (3, 6)).split((2, 1), dim=1)
         scale = self.nearness * (focal_px / FINE_STRIDE)[:, None, None]
-        slopes = self.slope.split(1, dim=1)
-        return [(moved - slope * of_along) * scale for moved, slope in zip(of_across, slopes, strict=True)]
+        return (of_across - self.slope.unsqueeze(2) * of_along) * scale.unsqueeze(1)
 
 
 def _step(
@@ -174,13 +175,13 @@ def _step(
     here, across, down = (corners.of(values) for values in (maps.here, maps.across, maps.down))
     lacking = wanted - here
     weight = 1 / (1 + lacking.square().sum(dim=-1) / _OUTLIER).square()
-    uu, uv, vv, u, v = (
-        ((one * other).sum(dim=-1) * weight)[:, None]
-        for one, other in ((across, across), (across, down), (down, down), (across, lacking), (down, lacking))
-    )
-    by_u, by_v = seen.jacobians(focal_px / 2)  # the maps hold twice the derivatives
-    of_u, of_v = (torch.cat([a * by_u + b * by_v, right], dim=1) for a, b, right in ((uu, uv, u), (uv, vv, v)))
-    normal = torch.cat([by_u, by_v], dim=2) @ torch.cat([of_u, of_v], dim=2).transpose(1, 2)
+    pairs = (across, across), (across, down), (across, down), (down, down), (across, lacking), (down, lacking)
+    products = torch.stack([(one * other).sum(dim=-1) for one, other in pairs], dim=1)
+    of_places, right = products.split((4, 2), dim=1)
+    by_place = seen.jacobians(focal_px / 2)  # the maps hold twice the derivatives
+    left = (of_places.unflatten(1, (2, 2)).unsqueeze(3) * by_place.unsqueeze(1)).sum(dim=2)
+    equations = torch.cat([left, right.unsqueeze(2)], dim=2).transpose(2, 3)
+    normal = ((by_place * weight[:, None, None]) @ equations).sum(dim=1)
     step = solve_augmented(_damped(normal))
     length = step.square().sum(dim=1, keepdim=True).clamp(min=1e-12).sqrt()
     return step * (_LARGEST_STEP / length).clamp(max=1)

@@ -24,5 +24,5 @@ class Effort(NamedTuple):
     """Whether crops are cut at half of the resolution, and the trunk reads them as if they were doubled."""
 
 
-ONE_LOOK = Effort(closer=0, rolls_deg=(0.0,), margin_px=8, steps=(0, 3, 4), neighbours=3, halved=True)
+ONE_LOOK = Effort(hypotheses=4, closer=0, rolls_deg=(0.0,), margin_px=8, steps=(0, 3, 4), neighbours=3, halved=True)
 """One pass over one crop of half the resolution: an eighth of the time, one place an object."""
