@@ -183,6 +183,8 @@ def test_runs_are_neither_overwritten_nor_continued_as_something_else(tmp_path: 
     assert call(*common, "--out", run)[0] == 0
     status, _, errors = call(*common, "--out", run)
     assert (status, "holds a run already" in errors) == (2, True)
+    status, _, errors = call("circles", "--self-training", 0.5, "--out", run)  # which has no photographs to learn from
+    assert (status, "holds a run already" in errors) == (2, True)
     status, _, errors = call("circles", "--resume", run, "--seed", 9, "--preset", "paper")
     assert status == 2
     assert "preset (run: laptop, now: paper), seed (run: 0, now: 9)" in errors

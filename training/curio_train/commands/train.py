@@ -234,15 +234,15 @@ def _train(command: TrainCommand, interruption: Interruption) -> int:
     from curio_train.learning.runs.without_training import draw_templates
     from curio_train.learning.session import learn
 
-    session = command.session
-    config = command.config if session.resume else prepared(command.config, session.cache, warn, report)
+    session, config = command.session, command.config
     path = (
         session.resume
         or (session.out and direct(session.out))
         or Path("runs") / f"{world_name(config)}-{config.method}-{config.seed}"
     )
     if not session.resume:
-        config = with_kept_meshes(config, path)
+        RunFolder.refuse_used(path)  # before files are examined, which takes its time
+        config = with_kept_meshes(prepared(config, session.cache, warn, report), path)
     if config.terms.templates:
         if session.device == "cuda":
             raise UsageError("--device cuda: --method templates runs on the CPU; leave it out")

@@ -59,6 +59,18 @@ class RunFolder:
         """
         return RunFolder(path, load_config(path))
 
+    @staticmethod
+    def refuse_used(path: Path) -> None:
+        """Check that a folder is free for a new run.
+
+        Raises:
+            UsageError: It holds a run already.
+        """
+        if (path / CONFIG_FILE).exists():
+            raise UsageError(
+                f"{path} holds a run already; continue it with --resume {path}, or name another folder: --out"
+            )
+
     def write_config(self, *, new: bool) -> None:
         """Write the configuration, of a new run or with the budgets of a resumed one.
 
@@ -67,10 +79,8 @@ class RunFolder:
             CheckpointError: The folder cannot be written.
         """
         file = self.path / CONFIG_FILE
-        if new and file.exists():
-            raise UsageError(
-                f"{self.path} holds a run already; continue it with --resume {self.path}, or name another folder: --out"
-            )
+        if new:
+            self.refuse_used(self.path)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             draft = file.with_suffix(".tmp")
