@@ -26,10 +26,8 @@ _BY_ARM = [  # what rotations and shifts move x, then y, then z by, from the arm
     *([0, 1, 0], [-1, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]),
 ]
 _BY_SHIFT = [[float(row in (3, 10, 17))] for row in range(18)]  # and without it
-_CORNERS = [
-    [[0], [1], [0], [1]],
-    [[0], [0], [1], [1]],
-]  # columns, then rows, of the cells around a point, from the first
+_CORNERS = [[[0], [1], [0], [1]], [[0], [0], [1], [1]]]
+"""Columns, then rows, of the four cells around a point, counted from the first."""
 
 
 class FeatureMaps(NamedTuple):
@@ -63,9 +61,10 @@ class FeatureMaps(NamedTuple):
         first = place.floor().clamp(max=self.side - 2)
         strides, corners = place.new_tensor([[1.0, self.side]]), place.new_tensor(_CORNERS)
         begin = (crop * self.side**2)[:, None] + (strides[0] @ corners[..., 0]).long()
-        right, below = ((place - first).unsqueeze(2) * (2 * corners - 1) + (1 - corners)).unbind(1)
+        beyond = (place - first).unsqueeze(2)
+        across, down = (corners * beyond + (1 - corners) * (1 - beyond)).unbind(1)
         # A product of matrices repeats weights: onnxruntime takes twice as long to multiply by what it repeats itself.
-        weight = (right * below)[..., None] @ place.new_ones(1, self.here.shape[1])
+        weight = (across * down)[..., None] @ place.new_ones(1, self.here.shape[1])
         return Corners((strides @ first).long() + begin[..., None], weight)
 
 
@@ -175,13 +174,14 @@ def _step(
     here, across, down = (corners.of(values) for values in (maps.here, maps.across, maps.down))
     lacking = wanted - here
     weight = 1 / (1 + lacking.square().sum(dim=-1) / _OUTLIER).square()
+    # Normal equations of each point's place, two by two and a right side, then those of the pose that moves all places.
     pairs = (across, across), (across, down), (across, down), (down, down), (across, lacking), (down, lacking)
     products = torch.stack([(one * other).sum(dim=-1) for one, other in pairs], dim=1)
     of_places, right = products.split((4, 2), dim=1)
-    by_place = seen.jacobians(focal_px / 2)  # the maps hold twice the derivatives
-    left = (of_places.unflatten(1, (2, 2)).unsqueeze(3) * by_place.unsqueeze(1)).sum(dim=2)
+    by_pose = seen.jacobians(focal_px / 2)  # the maps hold twice the derivatives
+    left = (of_places.unflatten(1, (2, 2)).unsqueeze(3) * by_pose.unsqueeze(1)).sum(dim=2)
     equations = torch.cat([left, right.unsqueeze(2)], dim=2).transpose(2, 3)
-    normal = ((by_place * weight[:, None, None]) @ equations).sum(dim=1)
+    normal = ((by_pose * weight[:, None, None]) @ equations).sum(dim=1)
     step = solve_augmented(_damped(normal))
     length = step.square().sum(dim=1, keepdim=True).clamp(min=1e-12).sqrt()
     return step * (_LARGEST_STEP / length).clamp(max=1)
