@@ -17,6 +17,7 @@ class Outcome(Enum):
 
     CONVERGED = "converged: the image loss is below --stop-below"
     SPENT = "the budget is spent"
+    SPENT_BEFORE = "nothing to learn, the budget was spent (larger --images or --minutes go on)"
     INTERRUPTED = "interrupted"
 
 
@@ -45,6 +46,7 @@ def train(
     """
     config, progress, ranks = trainer.config, trainer.state.progress, trainer.ranks
     saved_at, clock = progress.seconds, time.monotonic()
+    ended_at = progress.finished_step
     with interruption.deferred(), trainer.synthetic.prefetching():
         while True:
             # All processes go by the slowest clock and by anyone's signal, so that they stop at the same step.
@@ -66,7 +68,9 @@ def train(
                 saved_at = seconds
             if outcome:  # a signal may have come while the confidence was calibrated
                 _, signalled = ranks.largest(0.0, interruption.signum or 0)
-                return Outcome.INTERRUPTED if signalled else outcome
+                if signalled:
+                    return Outcome.INTERRUPTED
+                return Outcome.SPENT_BEFORE if outcome is Outcome.SPENT and ended_at == progress.step else outcome
             trainer.synthetic.update_pseudo_labels(spent)
             losses = trainer.step(learning_rate_factor(config.recipe, progress.step, spent))
             progress.seconds, clock = progress.seconds + time.monotonic() - clock, time.monotonic()
