@@ -11,7 +11,7 @@ import numpy as np
 import onnx
 import torch
 from curio_proto.v1.model_spec_pb2 import ModelSpec
-from curio_serve.models.golden import GOLDEN_FILE
+from curio_serve.models.golden import GOLDEN_FILE, LARGEST_DIFFERENCE
 from curio_serve.models.model_folder import MODEL_FILE
 from jaxtyping import Bool
 from torch import Tensor, nn
@@ -43,7 +43,7 @@ _FAST = (
     "; looks at each object once, in one crop of half the resolution (--fast), which the confidence was not calibrated "
     "for"
 )
-_LARGEST_STEP = 5e-4  # that rounding may move an answer in int8 by: half of what servers let golden answers differ by
+_LARGEST_STEP = LARGEST_DIFFERENCE / 2  # that rounding may move an answer in int8 by
 
 
 @dataclass(frozen=True)
