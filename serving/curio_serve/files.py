@@ -4,13 +4,25 @@ import contextlib
 import errno
 import json
 import os
+import re
 import stat
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from curio_serve.systems import READ_FLAGS
 
+Place: TypeAlias = tuple[list[Any], str]
+"""Of a name among others, see :func:`by_number`."""
+
 _MAX_GIVEN_BYTES = 4 << 20
+_NUMBER = re.compile(r"(\d+)")
+
+
+def by_number(name: str) -> Place:
+    """What a name is sorted by: its texts, with the numbers between them as such, and then itself (01 is not 1)."""
+    parts: list[Any] = _NUMBER.split(name)
+    parts[1::2] = map(int, parts[1::2])
+    return parts, name
 
 
 def read_file(path: str | Path, max_bytes: int) -> bytes:

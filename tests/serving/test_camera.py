@@ -244,6 +244,16 @@ def test_opencv_yaml(tmp_path: Path) -> None:
     assert camera.distortion == pytest.approx((0.1, -0.2, 0.001, 0.002, 0.05))
 
 
+@pytest.mark.parametrize("head", ["---\n", "\ufeff", "\ufeff---\n"])
+def test_yaml_with_a_head_of_its_own(tmp_path: Path, head: str) -> None:
+    matrix = "{rows: 3, cols: 3, data: [500, 0, 320, 0, 510, 240, 0, 0, 1]}"
+    path = tmp_path / "c.yaml"
+    path.write_text(f"{head}image_width: 640\nimage_height: 480\ncamera_matrix: {matrix}\n", encoding="utf-8")
+    camera = read_camera_file(path).camera_for("x.png")
+    assert camera.matrix[1, 1] == 510
+    assert camera.size == (640, 480)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [

@@ -289,6 +289,14 @@ def test_parts_of_something_else_and_parts_that_are_missing_are_refused(models_d
     assert joined(bucket, "out/poses.jsonl") == b"mine{}\n"
 
 
+def test_parts_are_replaced_only_once_there_are_images(models_dir: Path, bucket: Any) -> None:
+    there = "s3://pictures/out/poses.jsonl"
+    bucket.put_object(Key="out/poses.jsonl/part-00000.jsonl", Body=b"{}\n")
+    done = detect(models_dir / "flat", "s3://pictures/night/", "--out", there, "--overwrite")
+    assert done.returncode == 2
+    assert joined(bucket, "out/poses.jsonl") == b"{}\n"
+
+
 def workers_below(root: int) -> list[int]:
     """Ray's actors that hold the model, among the processes below one."""
     parents, workers = {}, []

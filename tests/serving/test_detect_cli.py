@@ -131,9 +131,14 @@ def test_nothing_is_written_over_the_images(models_dir: Path, frames: Path, tmp_
     before = {path: path.read_bytes() for folder in (frames, other) for path in folder.iterdir()}
     with pytest.raises(UsageError, match="drawings would replace"):
         detect(models_dir / "flat", frames, other, out=tmp_path / "out.jsonl", overlays=tmp_path)
+    (tmp_path / "link").symlink_to(frames)
+    with pytest.raises(UsageError, match="drawings would replace"):
+        detect(models_dir / "flat", frames, out=tmp_path / "out.jsonl", overlays=tmp_path / "link")
+    with pytest.raises(UsageError, match="lies within the images' own folder"):
+        detect(models_dir / "flat", frames, other, out=tmp_path / "out.jsonl", overlays=tmp_path / "link" / "drawn")
     with pytest.raises(UsageError, match="is one of the images"):
         detect(models_dir / "flat", other / "a.png", out=other / "a.png", overwrite=True)
-    with pytest.raises(UsageError, match="is an image or a video"):
+    with pytest.raises(UsageError, match="is an image, a video or a model"):
         detect(models_dir / "flat", other, out=other / "a.png", overwrite=True)
     with pytest.raises(UsageError, match="is one of the images"):
         detect(models_dir / "flat", other / "*.png", out=other / "a.png", overwrite=True)
@@ -154,6 +159,15 @@ def test_nothing_is_written_over_what_a_call_reads(models_dir: Path, frames: Pat
     with pytest.raises(UsageError, match=r"--out .* is the file of --camera"):
         detect(models_dir / "pinhole", frames, camera=camera, out=camera, overwrite=True)
     assert camera.read_bytes() == before
+
+
+def test_nothing_is_written_over_a_model(models_dir: Path, frames: Path, tmp_path: Path) -> None:
+    model = tmp_path / "model.onnx"
+    model.write_bytes(next((models_dir / "flat").glob("*/model.onnx")).read_bytes())
+    before = model.read_bytes()
+    with pytest.raises(UsageError, match=r"--out .*model\.onnx is an image, a video or a model"):
+        detect(model, frames, out=model, overwrite=True)
+    assert model.read_bytes() == before
 
 
 def test_models_whose_results_look_the_same_are_refused(models_dir: Path, frames: Path, tmp_path: Path) -> None:

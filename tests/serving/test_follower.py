@@ -15,7 +15,7 @@ from curio_proto.v1 import detector_pb2 as messages
 from curio_proto.v1.model_spec_pb2 import CanonicalCamera, Field, ModelSpec, ObjectModel
 from curio_serve.client import PoseClient
 from curio_serve.client.request import detect_request
-from curio_serve.errors import CameraMissing
+from curio_serve.errors import CameraMissing, InternalError
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.models.detector import Detector
 from curio_serve.models.model import from_bytes
@@ -74,6 +74,40 @@ def test_how_long_a_hidden_object_is_answered_does_not_change_the_filter() -> No
         found.append([list(result.detections[0].track.velocity_m_s) for result in results])
     np.testing.assert_allclose(found[0], found[1])
     assert abs(found[0][-1][0]) > 0.05
+
+
+def test_a_frame_on_which_a_network_fails_changes_nothing() -> None:
+    """It comes a tenth of a second late; the next one is in time, and the track goes on as it would have without."""
+    detector, camera, pixels = _photograph("03.jpg")
+
+    def fail() -> None:
+        raise InternalError("the network failed")
+
+    found = []
+    for failing in (False, True):
+        stream, results = FollowingStream(), messages.DetectResponse().results
+        for number in range(6):
+            frame = np.roll(pixels, -3 * number, axis=1)
+            if failing and number == 4:
+                late = messages.Tracking(time_s=0.1 * number + 0.09)
+                with pytest.raises(InternalError):
+                    stream.follow(
+                        late,
+                        [detector],
+                        frame,
+                        camera,
+                        min_confidence=0.0,
+                        reduction=1,
+                        results=messages.DetectResponse().results,
+                        before_run=fail,
+                    )
+            track = messages.Tracking(time_s=0.1 * number)
+            stream.follow(track, [detector], frame, camera, min_confidence=0.0, reduction=1, results=results)
+        found.append([detection.track for result in results for detection in result.detections])
+    assert len(found[0]) == 6
+    assert [track.track_id for track in found[0]] == [track.track_id for track in found[1]]
+    for with_it, without in zip(*found, strict=True):
+        np.testing.assert_allclose(with_it.velocity_m_s, without.velocity_m_s, atol=1e-9)
 
 
 def test_a_refused_frame_changes_nothing_not_even_with_restart() -> None:

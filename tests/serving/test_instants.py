@@ -1,6 +1,7 @@
 """Which images of several cameras go together, and when: by their times, their numbers, or the order of their names."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -62,17 +63,37 @@ def test_frames_of_videos_with_other_rates_go_together_by_their_times() -> None:
     pairs, told = paired(frames("left", [0, 0.04, 0.08, 0.12, 0.16]), frames("right", [0, 0.08, 0.16, 0.24]))
     assert pairs == [("0", "0"), ("2", "1"), ("4", "2")]
     assert told[-1] == "--rig: left ends before the others"
+    for left, right in (([0, 0.04, 0.08], [0, 0.04]), ([0, 0.04], [0, 0.04, 0.08])):
+        pairs, told = paired(frames("left", left), frames("right", right))
+        assert len(pairs) == 2
+        assert told == [f"--rig: {'right' if len(left) > 2 else 'left'} ends before the others"]
 
 
 def test_a_damaged_frame_is_of_one_instant_alone() -> None:
     pairs, _ = paired(frames("left", [0, None, 0.08, 0.12]), frames("right", [0, 0.04, 0.08, 0.12]))
     assert pairs[-2:] == [("2", "2"), ("3", "3")]
+    beginning = [replace(image, error="damaged") for image in frames("left", [None])]
+    pairs, _ = paired(
+        [*beginning, *frames("left", [None, 0.04, 0.08])[1:]], frames("right", [0, 0.02, 0.04, 0.06, 0.08])
+    )
+    assert pairs[-2:] == [("1", "2"), ("2", "4")]
 
 
 def test_stamps_that_nobody_set_leave_the_order() -> None:
     pairs, told = paired(frames("left", [0, 0, 0]), frames("right", [0, 0, 0]))
     assert pairs == [("0", "0"), ("1", "1"), ("2", "2")]
     assert told == []
+
+
+def test_without_stamps_the_times_of_recording_tell() -> None:
+    """The second camera lost its third frame."""
+    left, right = (
+        [SourceImage(f"{label}@{at}", label, recorded=RecordedAt(label, 0, 10**18 + at * 10**6, "")) for at in times]
+        for label, times in (("left", [0, 40, 80, 120]), ("right", [1, 41, 121]))
+    )
+    pairs, told = paired(left, right)
+    assert pairs == [("0", "1"), ("40", "41"), ("120", "121")]
+    assert len(told) == 1
 
 
 def test_files_that_are_numbered_alike_stay_so() -> None:

@@ -1,5 +1,7 @@
 """URLs without a store: a web server that is overloaded at first, schemes that are refused, the extra missing."""
 
+import json
+import re
 import subprocess
 import sys
 import threading
@@ -10,6 +12,7 @@ from pathlib import Path
 import pytest
 from curio_serve.batch.images import sources
 from curio_serve.batch.images.remote_files import Patience, RemoteFiles, path_of
+from curio_serve.batch.images.source_image import SourceImage
 from curio_serve.errors import ImageError, UsageError
 
 pytest.importorskip("aiohttp", reason="aiohttp is not installed: extra `cloud`")
@@ -127,3 +130,25 @@ def test_paths_of_urls_are_their_own() -> None:
     assert len(set(paths)) == len(urls)
     assert paths[2:4] == ["https/h/img", "s3/h/img"]
     assert paths[4].endswith(".jpg"), "drawings keep the kind of image"
+
+
+def test_the_number_of_an_image_is_not_in_its_query() -> None:
+    """``scene_camera.json`` has K by that number."""
+    for query in range(20):
+        image = SourceImage("a", f"https://h/000001/rgb/000003.png?token={query}#{query}")
+        assert re.findall(r"\d+", Path(image.numbered_name).stem) == ["000003"]
+        assert path_of(image.path) == image.relative_name != image.numbered_name
+    assert SourceImage("a", "s3://b/rgb/7?8.png").numbered_name.endswith("7?8.png")
+    assert SourceImage("a", "clip.mp4", 5).numbered_name == SourceImage("a", "clip.mp4", 5).relative_name
+
+
+def test_a_url_of_another_kind_is_an_error_of_that_image(models_dir: Path, tmp_path: Path) -> None:
+    listed = tmp_path / "list.txt"
+    listed.write_text(f"ftp://h/a.png\n{tmp_path / 'missing.png'}\n")
+    with listed.open() as names:
+        command = [sys.executable, "-c", DETECT, str(models_dir / "flat"), "-"]
+        done = subprocess.run(command, stdin=names, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert "ftp://: not supported" in lines[0]["error"]
+    assert "missing.png" in lines[1]["image"]

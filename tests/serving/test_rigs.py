@@ -1,6 +1,7 @@
 """Several cameras: poses in the rig's frame, rig files, requests that are none of a rig, and curio-detect --rig."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -223,9 +224,12 @@ def test_curio_detect_takes_a_folder_of_each_camera(
     assert str(folders[1] / "1.png") in broken["error"]
     photograph = folders[0] / "0.png"
     before = photograph.read_bytes()
-    with pytest.raises(UsageError, match="is an image or a video"):
+    with pytest.raises(UsageError, match="is an image, a video or a model"):
         run(DetectArguments(call.model, call.images, rig=rig, out=str(photograph), overwrite=True))
     assert photograph.read_bytes() == before
+    again = shutil.copytree(models_dir / "pinhole", tmp_path / "again" / "pinhole")
+    with pytest.raises(UsageError, match="two models are pinhole/"):
+        run(DetectArguments(call.model, (str(again), *call.images), rig=rig, out=str(tmp_path / "twice.jsonl")))
     (folders[1] / "2.png").unlink()
     with pytest.raises(UsageError, match=r"as many images of each camera; .*cam1 has 2"):
         run(DetectArguments(call.model, call.images, rig=rig, out=str(tmp_path / "other.jsonl")))

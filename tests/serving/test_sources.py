@@ -182,6 +182,16 @@ def test_after_a_damaged_frame_a_video_goes_on(clip: Path) -> None:
     assert [frame.time_s for frame in frames] == [0, None, *map(pytest.approx, (0.2, 0.3, 0.4))]
 
 
+def test_times_of_a_video_whose_beginning_is_damaged_go_forward(clip: Path) -> None:
+    content = bytearray(clip.read_bytes())
+    _, first, second, third, *_ = (found.start() for found in re.finditer(rb"00dc", content))
+    for start, end in ((first, second), (second, third)):
+        content[start + 8 : end] = bytes(end - start - 8)
+    clip.write_bytes(content)
+    times = [frame.time_s for frame in images([str(clip)], PassedOver())]
+    assert times == [None, None, *map(pytest.approx, (0.2, 0.3, 0.4))]
+
+
 def test_a_video_that_is_cut_off_ends_with_an_error(clip: Path) -> None:
     content = clip.read_bytes()
     _, _, _, third, *_ = (found.start() for found in re.finditer(rb"00dc", content))  # after one in the header

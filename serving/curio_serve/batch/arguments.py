@@ -1,5 +1,7 @@
 """The arguments of ``curio-detect``."""
 
+import hashlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -122,4 +124,7 @@ class DetectArguments:
     def changed_options(self) -> dict[str, object]:
         """The options that change answers, where they are not the default: each line of a result file has them."""
         given = {name: getattr(self, name) for name in _OF_ANSWERS}
-        return {name: value for name, value in given.items() if value != getattr(DetectArguments, name)}
+        changed = {name: value for name, value in given.items() if value != getattr(DetectArguments, name)}
+        if self.plane is not None and os.path.isfile(self.plane):  # whose content may be another one the next time
+            changed["plane_sha256"] = hashlib.sha256(Path(self.plane).read_bytes()).hexdigest()[:16]
+        return changed

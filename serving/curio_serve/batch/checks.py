@@ -67,15 +67,15 @@ def check_overlays(folder: Path, images: Sequence[str]) -> None:
     Raises:
         UsageError: They would, or the folder cannot be made.
     """
-    target = Path(os.path.abspath(folder))
-    if target == common_folder(images):  # below which drawings have the images' own names
+    target = Path(os.path.realpath(folder))
+    if target == Path(os.path.realpath(common_folder(images))):  # below which drawings have the images' own names
         raise UsageError(
             f"--overlays {folder} is the folder of all images, which drawings would replace; choose another"
         )
     for argument in images:
         if is_url(argument):
             continue
-        source = common_folder([argument])
+        source = Path(os.path.realpath(common_folder([argument])))
         if target == source or (not os.path.isfile(argument) and argument != "-" and target.is_relative_to(source)):
             raise UsageError(f"--overlays {folder} lies within the images' own folder {source}; choose one outside it")
     try:
@@ -151,6 +151,22 @@ def check_plane(arguments: DetectArguments, estimator: Estimator) -> None:
         )
 
 
+def check_distinct(models: Sequence[tuple[str, int]]) -> None:
+    """Refuse models whose results could not be told apart.
+
+    Args:
+        models: Name and version of each.
+
+    Raises:
+        UsageError: Two are the same.
+    """
+    if twice := next((one for number, one in enumerate(models) if one in models[:number]), None):
+        name, version = twice
+        raise UsageError(
+            f"two models are {name}/{version}, and their results could not be told apart; give one another name"
+        )
+
+
 def refuse_server_flags(arguments: DetectArguments, models: Sequence[str]) -> None:
     """Refuse flags that are for a server where all models are on this machine.
 
@@ -164,7 +180,7 @@ def refuse_server_flags(arguments: DetectArguments, models: Sequence[str]) -> No
 
 
 def refuse_images(arguments: DetectArguments) -> None:
-    """Refuse to write results over an image, a video, a recording, or another file that the call reads.
+    """Refuse to write results over an image, a video, a recording, a model, or another file that the call reads.
 
     Raises:
         UsageError: ``--out`` is one.
@@ -179,5 +195,5 @@ def refuse_images(arguments: DetectArguments) -> None:
     for flag, path in [*read.items(), *(("--mesh", mesh) for mesh in arguments.mesh)]:
         if path is not None and os.path.exists(path) and os.path.samefile(path, out):
             raise UsageError(f"--out {out} is the file of {flag}; choose another file")
-    if os.path.isfile(out) and Path(out).suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES:
-        raise UsageError(f"--out {out} is an image or a video; choose another file")
+    if os.path.isfile(out) and Path(out).suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES | {".onnx"}:
+        raise UsageError(f"--out {out} is an image, a video or a model; choose another file")

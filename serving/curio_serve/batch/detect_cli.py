@@ -196,7 +196,7 @@ def _plane(arguments: DetectArguments) -> "GivenPlane":
 
 def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "Settings") -> "list[Estimator]":
     """An estimator for each model, on this machine or behind a server."""
-    from curio_serve.batch.checks import refuse_server_flags
+    from curio_serve.batch.checks import check_distinct, refuse_server_flags
     from curio_serve.batch.estimators import LocalEstimator, RemoteEstimator
     from curio_serve.batch.named_models import SERVED_MODEL
     from curio_serve.models.model_folder import open_model
@@ -229,9 +229,7 @@ def _estimators(arguments: DetectArguments, models: "Sequence[str]", settings: "
         found.append(RemoteEstimator(_client(arguments, served["address"]), served["model"], settings))
         specs.append(found[-1].spec)
         _check_objects(found[-1].spec, model, settings)
-    versions = [f"{estimator.name}/{estimator.version}" for estimator in found]
-    if twice := next((one for number, one in enumerate(versions) if one in versions[:number]), None):
-        raise UsageError(f"two models are {twice}, and their results could not be told apart; give one another name")
+    check_distinct([(estimator.name, estimator.version) for estimator in found])
     try:
         check_known(specs, settings.objects)
     except ArgumentError as exc:

@@ -166,7 +166,7 @@ class Estimator(ABC):
             if image.no_camera and not self.canonical.is_default:
                 raise CameraError(image.no_camera)
             return image.camera
-        return self.settings.cameras.camera_for(image.relative_name)
+        return self.settings.cameras.camera_for(image.numbered_name)
 
     def _frame(
         self, image: SourceImage, data: bytes, header: Header | None = None, max_reduction: int = 1

@@ -74,7 +74,7 @@ class Instants:
             UsageError: Images without times are not as many of each camera, or numbered otherwise.
         """
         first = [next(camera, None) for camera in self.cameras]
-        if any(image is not None and _time_s(image) is None for image in first) or None in first:
+        if None in first or any(image is not None and _has_no_time(image) for image in first):
             return self._by_order(first)
         return self._by_time([image for image in first if image is not None])
 
@@ -109,9 +109,10 @@ class Instants:
                 self.unpaired.count(heads[number])
             if not early:
                 yield RigImage(tuple(heads))
+            is_more_to_come = bool(early) or any(following)
             for number in early or range(len(heads)):
                 if (then := following[number]) is None:
-                    self.unpaired.ended = self.labels[number] if early or any(following) else ""
+                    self.unpaired.ended = self.labels[number] if is_more_to_come else ""
                     return
                 heads[number], following[number] = then, next(self.cameras[number], None)
 
@@ -145,7 +146,15 @@ def refuse_other_images(arguments: Sequence[str], cameras: Sequence[RigCamera]) 
 
 
 def _time_s(image: SourceImage) -> float | None:
-    return image.time_s if image.recorded is None else image.recorded.stamp_ns * 1e-9
+    if image.recorded is None:
+        return image.time_s
+    return (image.recorded.stamp_ns or image.recorded.log_time_ns) * 1e-9  # 0: nobody set the stamp
+
+
+def _has_no_time(image: SourceImage) -> bool:
+    """Whether no image of this camera has a time; a damaged frame of a video has none where others do."""
+    is_damaged_frame = image.video_frame is not None and image.error != ""
+    return _time_s(image) is None and not is_damaged_frame
 
 
 def _is_nearer(then: SourceImage, now: SourceImage, latest: float) -> bool:

@@ -40,7 +40,8 @@ class LatestFrame:
         self._capture = open_video(source)
         if not self._capture.isOpened():
             raise UsageError(f"--video {source}: cannot be opened; expected a camera's number, a video file or a URL")
-        self._period_s = 1 / (self._capture.get(cv2.CAP_PROP_FPS) or 30.0)
+        is_recorded = self._capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0  # what comes live does not say how long it is
+        self._period_s = 1 / (self._capture.get(cv2.CAP_PROP_FPS) or 30.0) if is_recorded else 0.0
         self.num_read = self.num_taken = 0
         self._frame: np.ndarray | None = None
         self._news, self._ended = threading.Condition(), False
@@ -64,7 +65,7 @@ class LatestFrame:
         return frame
 
     def _read(self) -> None:
-        """Read frame after frame, a file no faster than it was recorded."""
+        """Read frame after frame: as they come, or of a recorded video no faster than it was recorded."""
         due = time.monotonic()
         while not self._ended:
             is_read, pixels = self._capture.read()

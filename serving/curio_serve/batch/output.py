@@ -78,14 +78,14 @@ def open_output(
 
 
 def _camera_of(estimators: Sequence[Estimator]) -> Callable[[SourceImage], Sequence[float]]:
-    """K and distortion of an image in the camera file of a call; none where it has none, or there is no file."""
+    """K and distortion of an image in the camera file of a call, or in its recording; none where neither has any."""
     cameras = next((estimator.settings.cameras for estimator in estimators), None)
 
     def camera(image: SourceImage) -> Sequence[float]:
         if cameras is None:
-            return ()
+            return () if image.camera is None else values_of(image.camera)
         with suppress(CameraError):  # answering the image reports that
-            return values_of(cameras.camera_for(image.relative_name))
+            return values_of(cameras.camera_for(image.numbered_name))
         return ()
 
     return camera

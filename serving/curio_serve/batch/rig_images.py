@@ -11,7 +11,7 @@ from pathlib import Path
 from curio_proto.v1.detector_pb2 import DetectResponse
 
 from curio_serve.batch.arguments import DetectArguments
-from curio_serve.batch.checks import named_recordings, refuse_images
+from curio_serve.batch.checks import check_distinct, named_recordings, refuse_images
 from curio_serve.batch.images.parallel import in_order
 from curio_serve.batch.images.remote_files import is_url
 from curio_serve.batch.images.source_image import SourceImage, Topics
@@ -47,8 +47,9 @@ class RigEstimator:
         begun = time.perf_counter()
         names = tuple(image.name for image in instant.images)
         try:
-            views = [self._view(*pair) for pair in zip(instant.images, self._cameras, strict=True)]
-            decoded, results = time.perf_counter(), DetectResponse().results
+            decoded = [self._view(*pair) for pair in zip(instant.images, self._cameras, strict=True)]
+            views = [view for view, _ in decoded]
+            decoded_s, results = time.perf_counter(), DetectResponse().results
             detect_views(
                 self._detector,
                 views,
@@ -65,18 +66,20 @@ class RigEstimator:
             *views[0].size,
             views[0].camera.matrix.ravel().tolist(),
             results,
-            1e3 * (decoded - begun),
-            1e3 * (time.perf_counter() - decoded),
+            1e3 * (decoded_s - begun),
+            1e3 * (time.perf_counter() - decoded_s),
+            is_turned=any(is_turned for _, is_turned in decoded),
             views=names,
             cam_from_rig=views[0].cam_from_rig.ravel().tolist(),
             distortion=views[0].camera.distortion,
             searched=min(searched_fraction(view.camera, self._canonical, *view.size) for view in views),
         )
 
-    def _view(self, image: SourceImage, of: RigCamera) -> RigView:
+    def _view(self, image: SourceImage, of: RigCamera) -> tuple[RigView, bool]:
+        """What a camera sees, and whether EXIF asks for a rotation, which is not applied."""
         if image.pixels is not None:
             of.camera.check_frame(image.pixels.shape[1], image.pixels.shape[0])
-            return RigView(image.pixels, of.camera, of.cam_from_rig)
+            return RigView(image.pixels, of.camera, of.cam_from_rig), False
         try:
             data = image.read()
             header = decoding.open_header(data)
@@ -85,7 +88,7 @@ class RigEstimator:
         except ImageError as exc:
             raise ImageError(f"{image.name}: {exc}") from exc
         of.camera.check_frame(frame.width, frame.height)
-        return RigView(frame.pixels, of.camera, of.cam_from_rig, frame.reduction)
+        return RigView(frame.pixels, of.camera, of.cam_from_rig, frame.reduction), header.orientation > 1
 
 
 def read_rig(arguments: DetectArguments, models: Sequence[str]) -> list[RigCamera]:
@@ -153,9 +156,10 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
     except ArgumentError as exc:
         raise UsageError(f"--objects: {exc}") from exc
     estimators = [RigEstimator(model, cameras, arguments.min_confidence, arguments.max_detections) for model in opened]
+    names = [(model.name, model.version) for model in opened]
+    check_distinct(names)
     form = JsonLines(arguments.changed_options)
     passed_over, topics = PassedOver(), Topics(arguments.topic, arguments.info_topic)
-    names = [(model.name, model.version) for model in opened]
     path = None if arguments.out is None else Path(arguments.out)
     first = values_of(cameras[0].camera)
     with ResultFile(path, form, names, overwrite=arguments.overwrite, camera_of=lambda _: first) as output:

@@ -73,7 +73,7 @@ def read_camera_file(path: str | Path) -> CameraFile:
     """
     path = Path(path)
     try:
-        text = read_file(path, MAX_BYTES).decode("utf-8")
+        text = read_file(path, MAX_BYTES).decode("utf-8-sig")
     except OSError as exc:
         raise CameraError(f"camera file {path} cannot be read: {exc.strerror}") from exc
     except ValueError as exc:
@@ -201,7 +201,8 @@ def _refuse_other_lens(model: object, distortion: Iterable[float]) -> None:
 
 def _from_yaml(text: str) -> PinholeCamera:
     if not text.startswith("%YAML"):  # OpenCV's reader wants its head, one document, and lists that are indented
-        text = "%YAML:1.0\n---\n" + re.sub("^- ", "  - ", text.split("\n---")[0], flags=re.MULTILINE)
+        document = text.removeprefix("---").split("\n---")[0]
+        text = "%YAML:1.0\n---\n" + re.sub("^- ", "  - ", document, flags=re.MULTILINE)
     storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     try:
         for name in ("k", "K"):

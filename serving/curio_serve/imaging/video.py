@@ -33,7 +33,7 @@ def decoded_frames(path: str) -> Iterator[tuple[np.ndarray | None, float | None]
     """
     capture = open_video(os.path.abspath(path))  # never the number of a camera
     rate, announced = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
-    number, damaged, first_ms, at_ms = 0, 0, None, 0.0
+    number, damaged, first_ms, at_ms, before_s = 0, 0, None, 0.0, 0.0
     try:
         while damaged <= _MOST_DAMAGED:
             is_read, pixels = capture.read()
@@ -43,9 +43,11 @@ def decoded_frames(path: str) -> Iterator[tuple[np.ndarray | None, float | None]
             yield from [(None, None)] * damaged
             number, damaged = number + damaged, 0
             at_ms = capture.get(cv2.CAP_PROP_POS_MSEC)  # 0 of every frame where the video says nothing
-            first_ms = at_ms if first_ms is None else first_ms
             by_rate_s = number / rate if rate > 0 else None
-            yield cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), (at_ms - first_ms) / 1000 if at_ms > first_ms else by_rate_s
+            if first_ms is None:
+                first_ms, before_s = at_ms, by_rate_s or 0.0  # of damaged frames at the very beginning
+            by_video_s = before_s + (at_ms - first_ms) / 1000
+            yield cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), by_video_s if at_ms > first_ms else by_rate_s
             number += 1
         is_short = rate > 0 and (at_ms - (first_ms or 0.0)) / 1000 < _WHOLE * announced / rate
         if is_short and 0 < number < _WHOLE * announced:

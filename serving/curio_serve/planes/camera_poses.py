@@ -139,8 +139,9 @@ class CameraPoseFile:
             CameraError: As :meth:`pose_above_plane`, of a pose that is there.
         """
         for name in ["every image"] if self.of_all is not None else self.entries:
-            if self.is_known(self.file.parent / name):
-                self.pose_above_plane(self.file.parent / name, _MOST_UPWARD)
+            photograph = self.file.parent / str(self.entries.get(name, {}).get("folder", "")) / name
+            if self.is_known(photograph):
+                self.pose_above_plane(photograph, _MOST_UPWARD)
 
     def is_known(self, photograph: Path) -> bool:
         """Whether the file has a pose of this photograph."""
@@ -160,10 +161,8 @@ class CameraPoseFile:
         if self.of_all is not None:
             return self.of_all
         relative = os.path.relpath(photograph, self.file.parent)
-        named: Mapping[str, Any] = self.entries.get(photograph.name, {})
-        if relative in self.entries:
-            named = self.entries[relative]
-        elif "folder" in named and _is_elsewhere(photograph, self.file.parent / str(named["folder"])):
+        named: Mapping[str, Any] = self.entries.get(relative, self.entries.get(photograph.name, {}))
+        if "folder" in named and _is_elsewhere(photograph, self.file.parent / str(named["folder"])):
             return {}
         return named
 

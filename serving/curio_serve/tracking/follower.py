@@ -7,8 +7,9 @@ object that is not seen for a while keeps its track and is answered as predicted
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from curio_proto.v1.detector_pb2 import DETECTION_STATUS_SURE, DETECTION_STATUS_UNSURE
@@ -74,6 +75,10 @@ class Follower:
         self._numbers = numbers
         self._looked_s = self._searched_s = self._time_s = -math.inf
         self._step_s = 0.0
+
+    def copy(self) -> Self:
+        """One that follows the same from here on: numbers of new tracks are those of both."""
+        return deepcopy(self, {id(self._numbers): self._numbers})
 
     def follow(
         self,

@@ -105,7 +105,9 @@ class FollowingStream:
         followers = {} if request.restart else dict(self._followers)
         numbers = count(1) if request.restart else self._numbers
         for detector in detectors:
-            followers.setdefault(detector.model.label, Follower(numbers)).follow(
+            before = followers.get(detector.model.label)
+            follower = followers[detector.model.label] = Follower(numbers) if before is None else before.copy()
+            follower.follow(
                 detector,
                 pixels,
                 camera,

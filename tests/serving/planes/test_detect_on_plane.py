@@ -199,6 +199,18 @@ def test_the_command_line(
     assert all("plane" in json.loads(line) for line in out.read_text().splitlines())
 
 
+def test_a_file_that_changed_is_another_option(tmp_path: Path) -> None:
+    """Its name alone would let a result file go on with poses over another plane."""
+    plane = tmp_path / "plane.json"
+    found = []
+    for height in (1.0, 1.3, 1.0):
+        plane.write_text(json.dumps({"height_m": height}))
+        found.append(DetectArguments("m", ("a.png",), plane=str(plane)).changed_options)
+    assert found[0] == found[2] != found[1]
+    assert found[0]["plane"] == str(plane)
+    assert DetectArguments("m", ("a.png",), plane="objects").changed_options == {"plane": "objects"}
+
+
 def _pose_over(plane: Plane) -> np.ndarray:
     """The cam_from_world of a plane at y = 0."""
     across = np.cross(plane.normal, [0.0, 0.0, 1.0])

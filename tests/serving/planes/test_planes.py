@@ -187,6 +187,10 @@ def test_a_photograph_of_the_same_name_in_another_folder_is_not_taken_for_it(tmp
     (tmp_path / "views.json").write_text(json.dumps({"a.png": {"cam_from_world": [], "folder": "left"}}))
     with pytest.raises(CameraError, match=r"has no pose of a\.png, but of one of that name in left"):
         CameraPoseFile.read(tmp_path / "views.json").plane(tmp_path / "right" / "a.png")
+    with pytest.raises(CameraError, match=r"has no pose of a\.png, but of one of that name in left"):
+        CameraPoseFile.read(tmp_path / "views.json").plane(tmp_path / "a.png")
+    with pytest.raises(CameraError, match="expected 4x4"):
+        CameraPoseFile.read(tmp_path / "views.json").refuse_impossible_planes()
 
 
 OF_BRICK = {"object": "brick", "hull_m": CORNERS_M.ravel().tolist(), "up": SIDES.ravel().tolist()}

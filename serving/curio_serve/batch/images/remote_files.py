@@ -50,11 +50,28 @@ def is_store(url: str) -> bool:
     return url.partition("://")[0] in _STORES
 
 
+def check_scheme(url: str) -> None:
+    """Refuse URLs of a kind that is not read.
+
+    Raises:
+        UsageError: It is none of those that are.
+    """
+    scheme = url.partition("://")[0]
+    if scheme not in _STORES + _WEB:
+        raise UsageError(f"{scheme}://: not supported; expected s3://, gs://, http:// or https://")
+
+
+def place_and_query(url: str) -> tuple[str, str]:
+    """A URL without its query, and that."""
+    if is_store(url):  # whose keys may hold these characters
+        return url, ""
+    place, _, query = url.partition("#")[0].partition("?")
+    return place, query
+
+
 def path_of(url: str) -> str:
     """A relative path made of a URL, unique to it, for files such as drawings."""
-    place, query = url, ""
-    if not is_store(url):  # whose keys may hold these characters
-        place, _, query = url.partition("#")[0].partition("?")
+    place, query = place_and_query(url)
     path, suffix = posixpath.splitext(posixpath.normpath(place.replace("://", "/")).lstrip("./"))
     return path + (f"-{hashlib.sha256(query.encode()).hexdigest()[:8]}" if query else "") + suffix
 
@@ -71,8 +88,7 @@ class RemoteFiles:
     """
 
     def __init__(self, scheme: str, patience: Patience = Patience()) -> None:
-        if scheme not in _STORES + _WEB:
-            raise UsageError(f"{scheme}://: not supported; expected s3://, gs://, http:// or https://")
+        check_scheme(f"{scheme}://")
         try:
             import fsspec
 

@@ -6,8 +6,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from curio_serve.batch.images.remote_files import files_of, is_url, path_of
-from curio_serve.errors import ImageError
+from curio_serve.batch.images.remote_files import check_scheme, files_of, is_url, path_of, place_and_query
+from curio_serve.errors import ImageError, UsageError
 from curio_serve.files import read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.image import MAX_FILE_BYTES
@@ -76,17 +76,29 @@ class SourceImage:
         if self.data is not None:
             return self.data
         if is_url(self.path):
-            return files_of(self.path).read(self.path, MAX_FILE_BYTES)
+            return self._read_url()
         try:
             return read_file(self.path, MAX_FILE_BYTES)
         except (OSError, ValueError) as exc:  # ValueError: a null byte in the name
             reason = exc.strerror if isinstance(exc, OSError) else str(exc)
             raise ImageError(f"cannot be read: {reason}") from exc
 
+    def _read_url(self) -> bytes:
+        try:
+            check_scheme(self.path)
+        except UsageError as exc:  # of one URL in a list, which says nothing of the others
+            raise ImageError(f"cannot be read: {exc}") from exc
+        return files_of(self.path).read(self.path, MAX_FILE_BYTES)
+
     @property
     def stream(self) -> str:
         """The video or recording, or the folder whose images are frames of one camera in order."""
         return os.path.dirname(self.path) if self.video_frame is None and self.recorded is None else self.path
+
+    @property
+    def numbered_name(self) -> str:
+        """A path whose last number is that of the image; the query of a URL has numbers of its own."""
+        return place_and_query(self.path)[0] if is_url(self.path) else self.relative_name
 
     @property
     def relative_name(self) -> str:

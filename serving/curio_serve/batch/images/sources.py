@@ -8,16 +8,15 @@ images: a folder of a million is listed in batches, and a video is read as it is
 import glob
 import heapq
 import os
-import re
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from curio_serve.batch.images.remote_files import files_of, is_store, is_url, path_of
 from curio_serve.batch.images.source_image import SourceImage, Topics
 from curio_serve.errors import UsageError
-from curio_serve.files import check_regular
+from curio_serve.files import Place, by_number, check_regular
 from curio_serve.imaging.video import decoded_frames
 from curio_serve.models.model_folder import CONFIG_FILE
 
@@ -30,8 +29,6 @@ STANDARD_INPUT = "-"
 _NAMED = 20  # files passed over that are named; the others are counted
 _HEIC = (".heic", ".heif")
 _NAMES_A_PASS = 1 << 16
-_NUMBER = re.compile(r"(\d+)")
-_Place = tuple[list[Any], str]
 _STDIN_BYTES = 1 << 16
 _BOP_SCENE_FILES = ("scene_camera.json", "scene_gt.json")
 _BOP_IMAGE_FOLDERS = ("rgb", "gray")
@@ -146,7 +143,7 @@ def matching_paths(argument: str) -> list[str]:
     Args:
         argument: As on the command line.
     """
-    return [argument] if os.path.exists(argument) else sorted(glob.iglob(argument, recursive=True), key=_place)
+    return [argument] if os.path.exists(argument) else sorted(glob.iglob(argument, recursive=True), key=by_number)
 
 
 def names_recordings(argument: str) -> bool:
@@ -242,20 +239,13 @@ def _sorted_entries(folder: str, passed_over: PassedOver) -> Iterator[tuple[str,
 
     Each pass over the folder keeps the next names alone, so that memory does not depend on how many there are.
     """
-    last: _Place | None = None
+    last: Place | None = None
     while batch := heapq.nsmallest(_NAMES_A_PASS, _entries_after(folder, last, passed_over)):
         yield from ((place[-1], is_folder) for place, is_folder in batch)
         last = batch[-1][0]
 
 
-def _place(name: str) -> _Place:
-    """What a name is sorted by: its texts, with the numbers between them as such, and then itself (01 is not 1)."""
-    parts: list[Any] = _NUMBER.split(name)
-    parts[1::2] = map(int, parts[1::2])
-    return parts, name
-
-
-def _entries_after(folder: str, last: _Place | None, passed_over: PassedOver) -> Iterator[tuple[_Place, bool]]:
+def _entries_after(folder: str, last: Place | None, passed_over: PassedOver) -> Iterator[tuple[Place, bool]]:
     with os.scandir(folder) as entries:
         for entry in entries:
             is_hidden, is_folder = entry.name.startswith("."), entry.is_dir(follow_symlinks=False)
@@ -266,7 +256,7 @@ def _entries_after(folder: str, last: _Place | None, passed_over: PassedOver) ->
             elif last is None and not is_image and not leads_to_folder:
                 passed_over.file(entry.name)
             if (is_folder and not is_hidden) or (is_image and not leads_to_folder):
-                place = _place(entry.name)
+                place = by_number(entry.name)
                 if last is None or place > last:
                     yield place, is_folder
 

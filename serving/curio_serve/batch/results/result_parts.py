@@ -10,6 +10,7 @@ import posixpath
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -32,7 +33,7 @@ class ResultParts:
         url: Of the folder of parts, in an object store.
         form: Format of the lines.
         models: As of :class:`ResultFile`.
-        overwrite: Remove the parts that are there.
+        overwrite: Remove the parts that are there, once there is an image to be answered.
         every_s: Seconds from one part to the next.
         camera_of: As of :class:`ResultFile`.
 
@@ -58,10 +59,7 @@ class ResultParts:
         self._suffix = posixpath.splitext(self.label)[1] or ".jsonl"
         self._files = RemoteFiles(url.partition("://")[0])
         names = self._names()
-        if overwrite:
-            for name in reversed(names):  # the first ones stay a valid beginning should this be stopped
-                self._remove(name)
-            names = []
+        self._replaced, names = (names, []) if overwrite else ([], names)
         self._folder = TemporaryDirectory(prefix="curio-detect-")
         path = Path(self._folder.name) / "results"
         self._starts = [0]
@@ -69,7 +67,7 @@ class ResultParts:
             for name in names:
                 joined.write(self._read(name))
                 self._starts.append(joined.tell())
-        self._path = path
+        self._path, self._form = path, form
         self._file = ResultFile(path, form, models, camera_of=camera_of)
         self._every_s, self._last_put = every_s, time.monotonic()
 
@@ -94,7 +92,20 @@ class ResultParts:
             self._folder.cleanup()
 
     def unanswered(self, images: Iterator[NamedT]) -> Iterator[NamedT]:
-        """The images that no part answers yet; see :meth:`ResultFile.unanswered`."""
+        """The images that no part answers yet; see :meth:`ResultFile.unanswered`.
+
+        Raises:
+            UsageError: As there.
+            OutputError: A part that is to be replaced cannot be removed.
+        """
+        first = next(images, None)
+        if first is None and self._replaced:
+            return images  # earlier results are worth more than none
+        if first is not None:
+            self._form.key(first.name)  # which may be no name in this format
+            images = chain((first,), images)
+        for name in reversed(self._replaced):  # the first ones stay a valid beginning should this be stopped
+            self._remove(name)
         remaining = self._file.unanswered(images)
         while len(self._starts) > 1 and self._starts[-1] > self._path.stat().st_size:
             self._starts.pop()  # the last image of this part is answered anew, and the part then replaced
