@@ -157,13 +157,31 @@ def test_the_last_photograph_says_where_the_camera_stands_over_the_board(tmp_pat
     assert found.normal @ normal > np.cos(np.radians(0.5))
     assert found.offset_m == pytest.approx(normal @ middle_m, abs=0.003)
     assert f"stands {-found.offset_m:.3f} m above the board and looks" in told
+    assert "in the last photograph, table.png," in told
     assert "right if squares are 30 mm (--square-mm)" in told
     same = CalibrateCommand(images=folder, board=(9, 6), plane_out=Path("camera.json"))
-    with pytest.raises(UsageError, match="is the camera file, too"):
+    with pytest.raises(UsageError, match=r"--plane-out .* is the file of --camera-out, too"):
         run(same, lambda *_: pytest.fail("no structure"))
     cv2.imwrite(str(folder / "zebra.png"), np.full((HEIGHT, WIDTH), 90, np.uint8))
     with pytest.raises(CameraError, match=r"zebra\.png, the last photograph, does not show the whole board"):
         run(CalibrateCommand(images=folder, board=(9, 6), **outputs), lambda *_: pytest.fail("no structure"))
+
+
+def test_no_file_is_written_over_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The camera that is read among them, by whatever path."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    camera, views = Path("camera.json"), Path("folder/../camera.json")
+    camera.write_text("{}")
+    for given, told in (
+        ({"camera": camera, "views_out": views}, r"--views-out .* is the file of --camera, too"),
+        ({"views_out": views}, r"--views-out .* is the file of --camera-out, too"),
+        ({"camera_out": Path("a"), "views_out": Path("a")}, "--views-out a is the file of --camera-out, too"),
+        ({"camera_out": Path("a"), "plane_out": Path("a"), "board": (9, 6)}, "--plane-out a is the file of"),
+    ):
+        with pytest.raises(UsageError, match=told):
+            run(CalibrateCommand(images=tmp_path, **given), lambda *_: pytest.fail("no structure"))
+    assert camera.read_text() == "{}"
 
 
 def test_the_camera_file_is_read_as_written(tmp_path: Path) -> None:

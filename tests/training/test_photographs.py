@@ -19,6 +19,12 @@ def save(path: Path, pixels: np.ndarray, mode: str | None = None, **options: obj
     return path
 
 
+def test_photographs_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for name in ("a10.png", "a9.png", "a1.png"):
+        save(tmp_path / name, PIXELS)
+    assert [path.name for path in Photographs(tmp_path).paths] == ["a1.png", "a9.png", "a10.png"]
+
+
 @pytest.mark.parametrize(("suffix", "is_read"), [(".png", True), (".jpg", True), (".tiff", False)])
 def test_a_rotation_that_cannot_be_ignored_is_refused(tmp_path: Path, suffix: str, is_read: bool) -> None:
     file, stored, exif = tmp_path / f"a{suffix}", np.zeros((48, 64, 3), np.uint8), Image.Exif()

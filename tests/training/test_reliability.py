@@ -135,6 +135,9 @@ def test_the_file_beside_a_model(circles_models: tuple[Exported, Exported], tmp_
     path.write_text(path.read_text().replace("0.05", "0.06"))
     with pytest.raises(ModelError, match=r"reliability\.json has SHA-256"):
         open_model(folder.path)
+    (folder.path / "SHA256SUMS").unlink()  # a list of this file alone would refuse the model
+    folder.put_beside(version, "reliability.json", json_format.MessageToJson(found))
+    assert open_model(folder.path).spec.reliability == found
 
 
 def test_flat_worlds_have_no_intervals(circles_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

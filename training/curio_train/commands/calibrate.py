@@ -21,6 +21,7 @@ from curio_train.errors import CameraError, DataError, UsageError
 
 _CAMERA_FILE = Path("camera.json")
 _NAMED = 3
+_OUTPUTS = ("--camera-out", "--views-out", "--rig-out", "--plane-out")
 _NEEDED = {
     "--square-mm": "--board",
     "--marker-mm": "--board",
@@ -56,9 +57,10 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
     board = _board(command, command.board)
     found = calibrate(command.images, board)
     camera_out = command.camera_out or _CAMERA_FILE
-    over_board = None if command.plane_out is None else pose_over_board(found, Photographs(command.images).paths[-1])
+    last = Photographs(command.images).paths[-1]
+    over_board = None if command.plane_out is None else pose_over_board(found, last)
     save_intrinsics(camera_out, found.camera)
-    plane = "" if command.plane_out is None or over_board is None else _plane(command, command.plane_out, over_board)
+    plane = "" if over_board is None else _plane(command, last, over_board)
     unused = f", not found in {', '.join(path.name for path in found.unused[:5])}" if found.unused else ""
     return (
         f"{camera_out}: focal length {found.camera.matrix[0, 0]:.1f} pixels ± {found.focal_uncertainty:.2%}, "
@@ -69,13 +71,16 @@ def run(command: CalibrateCommand, by_objects: ByObjects) -> str:
     )
 
 
-def _plane(command: CalibrateCommand, path: Path, over_board: np.ndarray) -> str:
-    """Write where the camera stands over the board, and say it."""
+def _plane(command: CalibrateCommand, photograph: Path, over_board: np.ndarray) -> str:
+    """Write where the camera of a photograph stands over the board, and say it."""
+    path = command.plane_out
+    assert path is not None
     save_plane(path, over_board)
     height_m, steepness = -float(over_board[:3, 1] @ over_board[:3, 3]), -float(over_board[2, 1])
-    return f"\n{path}: in the last photograph the camera stands {height_m:.3f} m above the board and looks " + (
-        f"{math.degrees(math.asin(np.clip(steepness, -1, 1))):.0f} degrees down on it; that is right if squares are "
-        f"{command.square_mm:g} mm (--square-mm)"
+    down_deg = math.degrees(math.asin(np.clip(steepness, -1, 1)))
+    return (
+        f"\n{path}: in the last photograph, {photograph.name}, the camera stands {height_m:.3f} m above the board and "
+        f"looks {down_deg:.0f} degrees down on it; that is right if squares are {command.square_mm:g} mm (--square-mm)"
     )
 
 
@@ -196,10 +201,20 @@ def _check(command: CalibrateCommand) -> None:
             raise UsageError(f"--camera-out {command.camera_out} is not written with {flag}; leave out one of them")
     if command.rig_out is not None and command.plane_out is not None:
         raise UsageError(f"--plane-out {command.plane_out} is of one camera; leave it out, or leave out --rig-out")
-    if command.plane_out is not None and command.plane_out == (command.camera_out or _CAMERA_FILE):
-        raise UsageError(f"--plane-out {command.plane_out} is the camera file, too (--camera-out); name another one")
-    for flag in ("--camera-out", "--views-out", "--rig-out", "--plane-out"):
+    _check_distinct(command)
+    for flag in _OUTPUTS:
         _check_output(flag, getattr(command, _field(flag)))
+
+
+def _check_distinct(command: CalibrateCommand) -> None:
+    """Refuse to write two files into one, or over the camera that is read."""
+    files = {flag: getattr(command, _field(flag)) for flag in ("--camera", *_OUTPUTS)}
+    if command.camera is None and command.camera_out is None and command.rig_out is None:
+        files["--camera-out"] = _CAMERA_FILE
+    seen: dict[str, str] = {}
+    for flag, path in files.items():
+        if path is not None and (other := seen.setdefault(os.path.realpath(path), flag)) != flag:
+            raise UsageError(f"{flag} {path} is the file of {other}, too; name another one")
 
 
 def _field(flag: str) -> str:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from curio_serve.files import read_file
+from curio_serve.files import by_number, read_file
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.image import MAX_FILE_BYTES
 from curio_serve.imaging.view import undistort
@@ -189,7 +189,9 @@ def _read_shrunk(path: Path) -> np.ndarray:
 
 
 def image_files(folder: Path, without: Sequence[Path] = ()) -> tuple[list[Path], list[Path]]:
-    """The images in a folder, and those left out, by name; hidden files and sub-folders are passed over.
+    """The images in a folder, and those left out, by name, where numbers count by their value.
+
+    Hidden files and sub-folders are passed over.
 
     Args:
         folder: Where they lie.
@@ -200,7 +202,7 @@ def image_files(folder: Path, without: Sequence[Path] = ()) -> tuple[list[Path],
     """
     # macOS leaves a file ._IMG.jpg beside each IMG.jpg, which is no image.
     visible = (path for path in folder.iterdir() if not path.name.startswith("."))
-    found = sorted(path for path in visible if path.suffix.lower() in SUFFIXES)
+    found = sorted((path for path in visible if path.suffix.lower() in SUFFIXES), key=lambda path: by_number(path.name))
     others = {os.path.realpath(path) for path in without}
     left_out = [path for path in found if os.path.realpath(path) in others]
     return [path for path in found if path not in left_out], left_out

@@ -155,7 +155,8 @@ class ModelFolder:
         lines.append(f"{hashlib.sha256(text.encode()).hexdigest()}  {listed}")
         try:
             write_whole(path, text)
-            write_whole(self.path / SUMS_FILE, "".join(f"{line}\n" for line in lines))
+            if (self.path / SUMS_FILE).exists():  # else one that lists this file alone would say that others are none
+                write_whole(self.path / SUMS_FILE, "".join(f"{line}\n" for line in lines))
         except OSError as exc:
             raise ExportError(f"cannot write {path}: {exc.strerror}") from exc
         return path
@@ -171,11 +172,14 @@ class ModelFolder:
             write_whole(self.path / CONFIG_FILE, config)
         if target.exists():
             raise ExportError(f"cannot write {target}: another export has just written it; export again")
-        write_whole(self.path / SUMS_FILE, sums)
+        has_sums = (self.path / SUMS_FILE).exists()  # without them, those of one version would exclude the others
+        if has_sums:
+            write_whole(self.path / SUMS_FILE, sums)
         try:
             draft.rename(target)
         except OSError:
-            write_whole(self.path / SUMS_FILE, "".join(f"{line}\n" for line in before))
+            if has_sums:
+                write_whole(self.path / SUMS_FILE, "".join(f"{line}\n" for line in before))
             raise
         write_whole(self.path / _CARD, f"{title or _title(self.path.name)}\n\n{card}\n{earlier}")
 

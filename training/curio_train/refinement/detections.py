@@ -50,7 +50,9 @@ class DetectionRefiner:
         matrix = np.reshape(spec.camera.camera_matrix, (3, 3))
         self._canonical = CanonicalCamera(spec.camera.width, spec.camera.height, matrix)
         camera = Camera(spec.camera.width, spec.camera.height, matrix)
-        from_templates = uses_templates(_recipe(spec), len(spec.objects))
+        recipe = _recipe(spec)  # of all objects, of which the specification may have a part
+        num_objects = max(len(spec.objects), len(recipe.get("world", {}).get("mesh_sha256", ())))
+        from_templates = uses_templates(recipe, num_objects)
         excess_m = SCAN_EXCESS_M if from_templates and spec.world == "linemod" else 0.0
         self._corners, self._centers_m, self._refiners = {}, {}, {}
         for kind in spec.objects:
