@@ -17,6 +17,7 @@ from curio_serve.imaging.view import CanonicalCamera, PinholeCrop, PinholeFrame
 from curio_serve.planes.camera_poses import GivenPlane, plane_of
 from curio_serve.planes.stable_poses import StandingShape
 
+from curio_train.counting import counted
 from curio_train.data.bop import Annotation, BopDataset, Frame
 from curio_train.data.bop_split import SPLIT, scored_frames
 from curio_train.data.photographs import read_photograph
@@ -140,7 +141,8 @@ def _read_frames(
         if _key(frame) in wanted
     ]
     batches = (frames[start : start + _BATCH] for start in range(0, len(frames), _BATCH))
-    found = {_key(one[0].frame): one for batch in batches for one in _estimates(subject, batch)}
+    told = counted(batches, -(-len(frames) // _BATCH), "reading real frames, batches")
+    found = {_key(one[0].frame): one for batch in told for one in _estimates(subject, batch)}
     if missing := wanted - found.keys():
         scene, image = min(missing)
         raise DataError(

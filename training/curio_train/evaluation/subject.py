@@ -12,6 +12,7 @@ from curio_proto.v1.model_spec_pb2 import ModelSpec
 from torch import Tensor, nn
 
 from curio_train.config import RunConfig
+from curio_train.counting import counted
 from curio_train.errors import ExportError, UsageError
 from curio_train.exported_model import ExportedModel, find_model
 from curio_train.learning.runs.checkpoint import RunFolder
@@ -127,7 +128,8 @@ def _in_parts(predict: Predict) -> Predict:
 
     def of_all(images: Tensor) -> dict[str, Tensor]:
         num = max(1, _PIXELS_AT_ONCE // (images.shape[2] * images.shape[3]))
-        return joined([predict(part) for part in images.split(num)])
+        parts = images.split(num)
+        return joined([predict(part) for part in counted(parts, len(parts), "reading images, batches")])
 
     return of_all
 

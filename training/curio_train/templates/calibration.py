@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from curio_train.counting import counted
 from curio_train.geometry import Pose
 from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import are_right
@@ -46,7 +47,8 @@ def calibrate(network: TemplateNetwork, world: SingleObjectWorld, cache: Path, n
             yield world.augment(batch.images, (0, step)).clamp(0, 1)
             yield world.augment(behind, (1, step)).clamp(0, 1)
 
-    answers = list(in_threads(network.read, frames(), num_threads))
+    read = in_threads(network.read, frames(), num_threads)
+    answers = list(counted(read, 2 * steps, "calibrating the confidence, batches"))
     found = [pose for code, _ in answers[::2] for pose in poses(code)]
     full, empty = ([features for _, features in some] for some in (answers[::2], answers[1::2]))
     right = are_right(found, true, points, kind.info)

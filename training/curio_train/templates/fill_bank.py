@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from curio_train.camera import square_matrix
+from curio_train.counting import counted
 from curio_train.meshes.meshes import Mesh
 from curio_train.networks.templates.bank import COARSE_SIZE, NUM_POINTS, RANK, Bank
 from curio_train.networks.templates.descriptors import Descriptors
@@ -56,7 +57,8 @@ def filled_bank(trunk: Trunk, geometry: Geometry, mesh: Mesh, crops: Tensor, num
     def read(drawn: tuple[Tensor, list[Tensor]]) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
         return drawn[0], [trunk(picture) for picture in drawn[1]]
 
-    for alpha, seen in in_threads(read, pictures(), num_threads):
+    num_batches = -(-len(views) // _BATCH)
+    for alpha, seen in counted(in_threads(read, pictures(), num_threads), num_batches, "drawing templates, batches"):
         inside = _inside(alpha)
         chosen.append(choice(inside))
         of_object.append(seen[0][0].movedim(1, 0)[:, inside])

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from curio_train.counting import counted
 from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import are_right
 from curio_train.networks.several_objects.network import ObjectsNetwork
@@ -43,7 +44,8 @@ def calibrate(network: ObjectsNetwork, world: ObjectScenes, cache: Path, *, by_h
     features: list[CalibrationFeatures] = []
     present: list[Tensor] = []
     correct: list[np.ndarray] = []
-    for step in range(NUM_FRAMES // _BATCH_SIZE):
+    num = NUM_FRAMES // _BATCH_SIZE
+    for step in counted(range(num), num, "calibrating the confidence, batches"):
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
         code, found = network.read(batch.images.clamp(0, 1))

@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from curio_train.counting import counted
 from curio_train.metrics.calibration import fit_calibration
 from curio_train.metrics.poses import are_right
 from curio_train.networks.two_stage.network import CalibrationFeatures, TwoStageNetwork
@@ -37,7 +38,7 @@ def calibrate(network: TwoStageNetwork, world: SingleObjectWorld, cache: Path) -
     with_object: list[CalibrationFeatures] = []
     without: list[CalibrationFeatures] = []
     correct: list[bool] = []
-    for step in range(steps):
+    for step in counted(range(steps), steps, "calibrating the confidence, batches"):
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
         code, features = network.uncalibrated(batch.images.clamp(0, 1))
