@@ -235,6 +235,12 @@ def test_unreadable_photographs(files: Files) -> None:
     (finding,) = alarms(files.subjects())
     assert (finding.fault, finding.state) == ("photographs unreadable", "bad")
     assert "005.png" in finding.text
+    for path in files.photos[6:12]:
+        path.write_bytes(b"\x89PNG")
+    (finding,) = alarms(files.subjects())
+    assert finding.text.startswith("7 of ")
+    assert all(f"{number:03}.png" in finding.text for number in range(5, 10))
+    assert finding.text.endswith("; and 2 more")
 
 
 def test_hidden_files_are_no_photographs(files: Files) -> None:

@@ -95,3 +95,10 @@ def test_a_camera_that_sees_little_more_is_no_alarm(subjects: Subjects) -> None:
     assert subjects.camera is not None
     write_camera(subjects.camera, [[174, 0, 81], [0, 174, 58], [0, 0, 1]])
     assert alarms(subjects) == []
+
+
+def test_a_run_without_a_model_is_told_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text("{}")
+    (finding,) = examine_files(Subjects(model=tmp_path))
+    assert finding.state == "bad"
+    assert f"curio-export {tmp_path}" in finding.text

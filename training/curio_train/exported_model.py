@@ -15,6 +15,8 @@ from curio_train.errors import ExportError, UsageError
 WEIGHTS_FILE = "weights.safetensors"
 """File beside a version's ONNX file with the network as it was trained, to train it further."""
 
+_OF_RUN = "config.json"
+
 
 class ExportedModel:
     """An exported model, run as serving runs it."""
@@ -83,9 +85,11 @@ def find_model(path: Path) -> Path:
         raise UsageError(str(exc)) from exc
     if not found and (where := in_run(path)):
         raise UsageError(f"{path}: no model{where}")
+    if not found and (path / _OF_RUN).is_file():
+        raise UsageError(f"{path}: a run whose model is not written yet; do that first: curio-export {path}")
     if not found:
         raise UsageError(
-            f"{path}: neither a run folder (config.json) nor a model (<version>/{MODEL_FILE}); expected what "
+            f"{path}: neither a run folder ({_OF_RUN}) nor a model (<version>/{MODEL_FILE}); expected what "
             "curio-train or curio-export wrote"
         )
     return path / str(found[-1]) / MODEL_FILE

@@ -18,6 +18,7 @@ TOO_FEW = "too few"
 _NOT_SERVED = (".bmp", ".tif", ".tiff")
 _SAME_FOCAL = 0.15  # focal lengths in EXIF are nominal, and rounded to whole millimetres
 _FULL_FRAME_WIDTH_MM = 36.0
+_NAMED = 5  # files that cannot be read, and sizes
 
 
 def examine_photographs(
@@ -61,13 +62,17 @@ def named(photographs: Sequence[Photograph]) -> str:
 
 def _unreadable(broken: list[str], count: int) -> Iterator[Finding]:
     if broken:
-        text = f"{len(broken)} of {count} cannot be read, the first: {broken[0]}"
+        more = f"; and {len(broken) - _NAMED} more" if len(broken) > _NAMED else ""
+        text = f"{len(broken)} of {count} cannot be read: {'; '.join(broken[:_NAMED])}{more}"
         yield Finding("photographs", "bad", text, "Copy them again or remove them", fault="photographs unreadable")
 
 
 def _sizes(folder: Path, photographs: Sequence[Photograph], note: str) -> Finding:
     sizes = Counter((photo.width, photo.height) for photo in photographs)
-    found = ", ".join(f"{count} of {width}x{height}" for (width, height), count in sizes.most_common(3))
+    named = sizes.most_common(_NAMED)
+    found = ", ".join(f"{count} of {width}x{height}" for (width, height), count in named)
+    if others := len(photographs) - sum(count for _, count in named):
+        found += f", {others} of others"
     if len(sizes) == 1:
         return Finding("photographs", "good", f"{folder}: {found}{note}")
     text = f"{folder}: they differ in size: {found}{note}"
