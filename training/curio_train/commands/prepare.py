@@ -14,6 +14,8 @@ from curio_train.errors import DataError, UsageError
 from curio_train.learning.runs.configuration import CONFIG_FILE, load_config
 from curio_train.worlds.options import CaptureOptions, LinemodOptions
 
+_IN_ANY_COLOR = "it is learned in any colour, which takes longer"
+
 
 def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report: Callable[[str], None]) -> RunConfig:
     """The configuration of a new run, ready to be trained.
@@ -61,7 +63,7 @@ def prepared(config: RunConfig, cache: Path, warn: Callable[[str], None], report
         learns = config.recipe.self_training > 0 and (config.terms.sleep or config.terms.renders_predictions)
         for doubt in refuse_unfit(options, self_training=learns):
             warn(doubt)
-        options = _with_sha256(_with_judged(_with_paint(options, report), config.init))
+        options = _with_sha256(_with_judged(_with_paint(options, config, report), config.init))
         return replace(config, world=options, network=_usual_network(config, options))
     return config
 
@@ -196,7 +198,7 @@ def _judged_before(options: CaptureOptions, init: Path | None) -> tuple[str, ...
     return before.judged if isinstance(before, CaptureOptions) and before.photos == options.photos else ()
 
 
-def _with_paint(options: CaptureOptions, report: Callable[[str], None]) -> CaptureOptions:
+def _with_paint(options: CaptureOptions, config: RunConfig, report: Callable[[str], None]) -> CaptureOptions:
     """In free space, find an unpainted part's colour in photographs over a background image, and set it."""
     from curio_train.camera import load_intrinsics
     from curio_train.data.part_color import find_color, is_unpainted
@@ -207,7 +209,8 @@ def _with_paint(options: CaptureOptions, report: Callable[[str], None]) -> Captu
     are_unpainted = [is_unpainted(load_mesh(file, options.mesh_unit, options.body)) for file in options.mesh]
     if not any(are_unpainted):
         return options
-    drawn = "it is drawn in grey" if options.names_several else "it is learned in any colour, which takes longer"
+    by_templates = options.names_several or config.terms.templates
+    drawn = "it is drawn in grey, and hardly found if it has another one" if by_templates else _IN_ANY_COLOR
     anyway = f"{drawn}; --paint '#8a6f4c' says which it has"
     if options.background is None:
         report(f"the part's colour is not known without --background, a photograph of the empty scene: {anyway}")

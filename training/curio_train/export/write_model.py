@@ -20,7 +20,7 @@ from curio_train.config import RunConfig
 from curio_train.errors import ExportError, UsageError
 from curio_train.export.card import Provenance, card
 from curio_train.export.folder import ModelFolder, triton_config
-from curio_train.export.graph import Graph, check_images, deployable, numerically_stable, pixels_of
+from curio_train.export.graph import TRAIN_ON, Graph, decided_images, deployable, pixels_of
 from curio_train.export.int8 import rounded_otherwise
 from curio_train.export.onnx import put_spec, store_half
 from curio_train.export.parity import largest_difference, refuse_disparity
@@ -42,6 +42,10 @@ from curio_train.worlds.single_object.two_stage import TwoStageWorld
 _FAST = (
     "; looks at each object once, in one crop of half the resolution (--fast), which the confidence was not calibrated "
     "for"
+)
+_OF_TEMPLATES = (
+    "Its templates hardly match renderings of it: say more of what it looks like (--background or --paint, "
+    "--upright, narrower --near-m and --far-m), or train it by another --method"
 )
 _LARGEST_STEP = LARGEST_DIFFERENCE / 2  # that rounding may move an answer in int8 by
 
@@ -114,14 +118,13 @@ def export(
         _look_less(state.pose.network, run, folder.config)
     trained = Graph(state.pose.network, world)
     deployed = Graph(deployable(state.pose.network, half), world)
-    images = check_images(world)
+    images, stable = _decided_images(deployed.network if half else trained.network, world, folder.config)
     with torch.no_grad():
         learned = trained.in_parts(pixels_of(images))
         expected = deployed.in_parts(pixels_of(images)) if half else learned
     shapes = {name: tuple(values.shape[1:]) for name, values in expected.items()}
     config = triton_config(target.path.name, tuple(images.shape[1:]), shapes)
     target.refuse_other_tensors(config)
-    stable = _stable(deployed.network if half else trained.network, world, images)
     rounding_error = largest_difference(deployed.where(stable, learned), deployed.where(stable, expected))
     model = ahead(deployed) or traced(deployed, deployed.network, world.camera, list(expected))
     if half and reduce is None:
@@ -139,7 +142,7 @@ def export(
         model, weights = reduced.model, reduced.weights
         put_spec(model, spec)
         found = ExportedModel(model.SerializeToString(), "the reduced graph")(images)
-        stable &= _unmoved_by_rounding(deployed, model, images, found)
+        stable = _unmoved_by_rounding(deployed, model, images, found, stable)
         rounding_error = largest_difference(deployed.where(stable, learned), deployed.where(stable, found))
     spec.parity_max_abs_error = parity_error if reduce is None else rounding_error
     put_spec(model, spec)
@@ -159,17 +162,19 @@ def export(
     return Exported(target.add(version, files, config, text), parity_error, rounding_error, model.ByteSize(), weights)
 
 
-def _stable(network: nn.Module, world: World, images: Tensor) -> Bool[Tensor, "batch slots"]:
-    """Which answers of a network are stable; its copy reads quickly, and the network itself can still be traced."""
+def _decided_images(network: nn.Module, world: World, config: RunConfig) -> tuple[Tensor, Bool[Tensor, "batch slots"]]:
+    """Check images and the stable answers; a copy of the network reads quickly, and itself can still be traced."""
     network = copy.deepcopy(network)
     quicken(network)
-    return numerically_stable(Graph(network, world), images)
+    return decided_images(Graph(network, world), world, _OF_TEMPLATES if config.terms.templates else TRAIN_ON)
 
 
-def _unmoved_by_rounding(graph: Graph, model: onnx.ModelProto, images: Tensor, found: Mapping[str, Tensor]) -> Tensor:
-    """Which answers of a reduced graph stay where processors round in another way, [batch, slots]."""
+def _unmoved_by_rounding(
+    graph: Graph, model: onnx.ModelProto, images: Tensor, found: Mapping[str, Tensor], stable: Tensor
+) -> Tensor:
+    """Which of a reduced graph's stable answers stay where processors round in another way, [batch, slots]."""
     others = [ExportedModel(other.SerializeToString(), "its check")(images) for other in rounded_otherwise(model)]
-    unmoved = torch.stack([graph.unmoved(found, other, _LARGEST_STEP) for other in others]).all(dim=0)
+    unmoved = torch.stack([stable, *(graph.unmoved(found, other, _LARGEST_STEP) for other in others)]).all(dim=0)
     if not unmoved.any():
         raise ExportError("in int8 every answer to check images hangs on rounding; export without --int8")
     return unmoved

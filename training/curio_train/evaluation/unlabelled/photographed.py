@@ -265,7 +265,7 @@ def _verdict_in_space(fraction: float, num: int, has_background_image: bool, num
         limits += "; --background tells right from wrong better"
     advice = (
         "train longer (--images), with --method sleep if it was another, or tell the network more where that was not "
-        "done (--upright, narrower --near-m and --far-m)"
+        "done (its colour by --background or --paint, --upright, narrower --near-m and --far-m)"
     )
     if fraction >= _TRUSTED:
         text = f"Trust it: {found}; {limits}."
