@@ -17,8 +17,8 @@ from curio_train.data.part_color import find_color
 from curio_train.errors import UsageError
 from curio_train.scene_code import COLOR, CONFIDENCE
 from curio_train.worlds import build
-from curio_train.worlds.options import CaptureOptions
-from curio_train.worlds.single_object.base_colors import any_base_color, base_colors_near, srgb_of
+from curio_train.worlds.options import CaptureOptions, srgb_of
+from curio_train.worlds.single_object.base_colors import any_base_color, base_colors_near
 
 WIDTH, HEIGHT = 160, 120
 SRGB = {"red": (0.78, 0.2, 0.16), "pale": (0.8, 0.78, 0.7), "black": (0.08, 0.08, 0.1), "teal": (0.1, 0.5, 0.5)}
@@ -148,3 +148,5 @@ def test_paint_is_drawn_about_its_colour_and_now_and_then_anywhere() -> None:
     for wrong in ("red", "#12345", "#1122334"):
         with pytest.raises(UsageError, match="#8a6f4c"):
             srgb_of(wrong)
+        with pytest.raises(UsageError, match=f"--paint {wrong}"):  # before files are looked at
+            CaptureOptions((Path("none.ply"),), Path("none.json"), Path("none"), paint=wrong)

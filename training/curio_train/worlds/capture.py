@@ -44,9 +44,9 @@ from curio_train.meshes.meshes import Mesh, load_mesh
 from curio_train.meshes.of_model import refuse_changed_mesh
 from curio_train.meshes.symmetries import find_symmetries
 from curio_train.worlds.base import Camera, ObjectKind, World
-from curio_train.worlds.options import CaptureOptions
+from curio_train.worlds.options import CaptureOptions, srgb_of
 from curio_train.worlds.several_objects.world import SeveralObjectsWorld
-from curio_train.worlds.single_object.base_colors import MIDDLE_GREY, any_base_color, base_colors_near, srgb_of
+from curio_train.worlds.single_object.base_colors import MIDDLE_GREY, any_base_color, base_colors_near
 from curio_train.worlds.single_object.crop_pose_stage import MAX_LOG_SCALE
 from curio_train.worlds.single_object.two_stage import LONGEST_SIDE_PX, TwoStageWorld, frame_camera
 from curio_train.worlds.single_object.viewpoints import upper_hemisphere_rotations

@@ -24,6 +24,23 @@ LOCATOR_RECIPE: Mapping[str, Any] = {"batch_size": 16, "micro_batch_size": 16, "
 """Hyperparameters of worlds where a locator is trained: its trunk is frozen, so it learns from few images."""
 
 
+def srgb_of(color: str) -> tuple[float, float, float]:
+    """A colour given as #rrggbb, in [0, 1].
+
+    Raises:
+        UsageError: It is not written so.
+    """
+    digits = color.removeprefix("#")
+    try:
+        channels = bytes.fromhex(digits)
+    except ValueError:
+        channels = b""
+    if len(channels) != 3 or len(digits) != 6:
+        raise UsageError(f"--paint {color}: expected a colour in sRGB such as '#8a6f4c'")
+    red, green, blue = (channel / 255 for channel in channels)
+    return red, green, blue
+
+
 def _make_absolute(options: WorldOptions, *names: str) -> None:
     """Because a run may be evaluated and exported from other folders than it was started in."""
     for name in names:
@@ -218,6 +235,8 @@ class CaptureOptions(WorldOptions):
             raise UsageError(
                 f"found --near-m {self.near_m:g} and --far-m {self.far_m:g}, expected 0 < near < far, in metres"
             )
+        if self.paint is not None:
+            srgb_of(self.paint)
         if self.body is not None and isinstance(self.mesh, tuple) and len(self.mesh) != 1:
             raise UsageError(f"--body {self.body}: expected one --mesh with it, found {len(self.mesh)}")
         if self.plane is None:

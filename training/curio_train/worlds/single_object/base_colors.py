@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from curio_train.errors import UsageError
 from curio_train.worlds.placement import random_colors
 
 BaseColorPrior = Callable[[int, np.random.Generator], Float[Tensor, "count 1 3"]]
@@ -31,23 +30,6 @@ _TINT = 0.06  # standard deviation of each channel, relative to the largest: col
 def any_base_color(count: int, random: np.random.Generator) -> Float[Tensor, "count 1 3"]:
     """Base colours of an object of which nothing is known."""
     return random_colors(count, 1, random, 0.0, MIN_BASE_VALUE)
-
-
-def srgb_of(color: str) -> tuple[float, float, float]:
-    """A colour given as #rrggbb, in [0, 1].
-
-    Raises:
-        UsageError: It is not written so.
-    """
-    digits = color.removeprefix("#")
-    try:
-        channels = bytes.fromhex(digits)
-    except ValueError:
-        channels = b""
-    if len(channels) != 3 or len(digits) != 6:
-        raise UsageError(f"--paint {color}: expected a colour in sRGB such as '#8a6f4c'")
-    red, green, blue = (channel / 255 for channel in channels)
-    return red, green, blue
 
 
 def base_colors_near(srgb: tuple[float, float, float]) -> BaseColorPrior:
