@@ -5,7 +5,7 @@
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
 10c6bff; models/lmo/7 has seen them), and no label of a frame is opened in training. A call goes on with what is there.
-The last line, also in OUT/halves.json, is of both halves: by one read and by nine, of the runs and of what
+The last line, also in OUT/halves.json, is the mean of both halves: by one read and by nine, of the runs and of what
 ``curio-export --fast --int8`` makes of them; as served, after render-and-compare, and with ``--plane objects``.
 """
 
@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from curio_train.metrics.calibration import calibration_error
+from curio_train.metrics.poses import ADD_THRESHOLD
 
 _COMMANDS = Path(sys.executable).parent
 _RENDERINGS = 2  # are scored, too, and not looked at here
@@ -119,6 +121,7 @@ def _mean(halves: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         kind: {name: _of_both([half[kind]["metrics"] for half in halves], name) for name in _KEPT}
         | {"num_targets": sum(half[kind]["num_targets"] for half in halves)}
+        | {"confidence_ece_together": _error_together([half[kind] for half in halves])}
         | {
             "objects": {
                 name: {
@@ -130,6 +133,13 @@ def _mean(halves: list[dict[str, Any]]) -> dict[str, Any]:
         }
         for kind in halves[0]
     }
+
+
+def _error_together(halves: list[dict[str, Any]]) -> float:
+    """Calibration error of both halves' answers in one diagram: fewer in a bin let chance make it larger."""
+    rows = [row for half in halves for one in half["objects"].values() for row in one["targets"]]
+    right = [row["add_diameters"] < ADD_THRESHOLD for row in rows]
+    return round(calibration_error([row["confidence"] for row in rows], right), 4)
 
 
 def _of_both(metrics: list[dict[str, float]], name: str) -> float | None:

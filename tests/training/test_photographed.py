@@ -209,13 +209,14 @@ def test_confidence_is_calibrated_by_photographs_that_agree_and_templates_stay(w
     calibrate_by(network, evidence)
     assert torch.equal(network.reader.pose_correct, before["reader.pose_correct"]), "too few to tell"
     random = np.random.default_rng(0)
-    right = random.random((60, 2)) < 0.4
-    features = random.normal(size=(60, 2, 3))
+    right, shown = random.random((90, 2)) < 0.4, random.random((90, 2)) < 0.7
+    features = random.normal(size=(90, 2, 3))
     features[right, 0] += 3
-    calibrate_by(network, Evidence(features, right))
+    calibrate_by(network, Evidence(features, right & shown, shown))
     weights = network.reader.pose_correct.numpy()
     logits = (features * weights[:, :3]).sum(axis=2) + weights[:, 3]
     assert ((logits > 0) == right).mean() > 0.85
+    assert abs((1 / (1 + np.exp(-logits))).mean() - right.mean()) < 0.05, "what is not known is not taken as wrong"
 
 
 @pytest.mark.parametrize("by_heat_map", [False, True])

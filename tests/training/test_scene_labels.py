@@ -140,6 +140,27 @@ def test_nothing_is_made_up(
     assert all(np.isnan(pose.translation_m[5:]).all() for pose in some)
 
 
+@pytest.mark.parametrize(("num_agreeing", "is_found"), [(1, False), (2, True)])
+def test_what_one_of_three_reads_takes_for_an_object_labels_none(
+    world: SeveralObjectsWorld,
+    cam_from_world: Pose[np.ndarray],
+    truth: list[Pose[np.ndarray]],
+    num_agreeing: int,
+    is_found: bool,
+) -> None:
+    """Of each photograph; the first chair's other reads are somewhere else each time."""
+    twice, once = reads(truth), np.repeat(np.arange(NUM), 3)
+    rows = np.stack([2 * np.arange(NUM), 2 * np.arange(NUM) + 1, 2 * np.arange(NUM)], axis=1).ravel()
+    read = Reads({name: values[rows].clone() for name, values in twice.code.items()}, once)
+    wrong = torch.arange(3).repeat(NUM) >= num_agreeing
+    random = torch.Generator().manual_seed(0)
+    read.code[TRANSLATION][wrong, 0] += torch.rand(int(wrong.sum()), 3, generator=random) - 0.5
+    found = scene_poses(read, cameras(cam_from_world), world.objects)
+    assert np.isfinite(found[0].translation_m).all() == is_found
+    assert np.isfinite(found[0].translation_m).any() == is_found
+    assert np.isfinite(found[1].translation_m).all()
+
+
 class OnePhotographEach:
     """Photographs that are files of one grey."""
 
@@ -179,6 +200,14 @@ def test_drawn_frames_show_the_objects_where_their_labels_say(
             row, column = divmod(int(image.mean(dim=0).argmax()), image.shape[2])
             shown += abs(column - x) < 5 and abs(row - y) < 5
     assert shown >= 9, "something may be drawn in front of a few"
+
+
+def test_what_continues_a_photograph_beyond_its_border_shows_no_object(world: SeveralObjectsWorld) -> None:
+    beside = Pose(np.tile(np.eye(3), (NUM, 1, 1)), np.tile([-0.54, 0.0, 0.9], (NUM, 1)))  # at column -18
+    ahead = Pose(beside.rotation, np.tile([0.0, 0.0, 0.9], (NUM, 1)))
+    code, _ = SceneLabels(world, torch.zeros(NUM, 3, 480, 640, dtype=torch.uint8), [beside, ahead]).draw(32, (4,))
+    assert (code[CONFIDENCE][:, 0] == 0).all()
+    assert (code[CONFIDENCE][:, 1] == 1).all()
 
 
 def test_an_object_whose_place_nobody_knows_teaches_nothing(

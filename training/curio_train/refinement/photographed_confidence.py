@@ -8,6 +8,7 @@ from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from curio_train.counting import counted
 from curio_train.data.photographs import read_frames, spread
 from curio_train.geometry import Pose
 from curio_train.metrics.calibration import fit_calibration
@@ -35,8 +36,9 @@ class Evidence(NamedTuple):
     features: Float[np.ndarray, "photographs objects 3"]
     """Features of the pose-correct logit."""
     correct: Bool[np.ndarray, "photographs objects"]
-    """Whether a pose agrees with its pseudo-label. Where there is none it is wrong: what was read agreed with nothing.
-    """
+    """Whether a pose agrees with its pseudo-label."""
+    shown: Bool[np.ndarray, "photographs objects"]
+    """Whether photographs agree that the object is there. Elsewhere it may be there all the same, and read right."""
 
 
 @torch.no_grad()
@@ -53,12 +55,12 @@ def read_by_others(network: ObjectsNetwork, world: SeveralObjectsWorld, labels: 
     network.eval()
     rendered = {name: value.clone() for name, value in network.reader.banks.state_dict().items()}
     num, objects = len(labels.frames), len(labels.poses)
-    evidence = Evidence(np.zeros((num, objects, 3)), np.zeros((num, objects), dtype=bool))
+    evidence = Evidence(np.zeros((num, objects, 3)), np.zeros((num, objects), dtype=bool), labels.shown)
     for half in range(2):
         own, others = np.arange(half, num, 2), slice(1 - half, None, 2)
-        known = [pose.rows(others) for pose in labels.poses]
-        learn_appearance(network, labels.frames[others], known)
-        for rows in np.split(own, range(_READ_AT_ONCE, len(own), _READ_AT_ONCE)):
+        learn_appearance(network, labels.frames[others], [pose.rows(others) for pose in labels.poses])
+        batches = np.split(own, range(_READ_AT_ONCE, len(own), _READ_AT_ONCE))
+        for rows in counted(batches, len(batches), f"half {half + 1} of the photographs, read by the other, batches"):
             code, found = network.read(labels.frames[torch.from_numpy(rows)].float() / 255)
             evidence.features[rows] = found.right.numpy()
             for slot in range(objects):
@@ -71,15 +73,16 @@ def calibrate_by(network: ObjectsNetwork, evidence: Evidence) -> None:
     """Make confidences the probabilities of correct poses in such photographs, where enough were read to tell.
 
     All objects are calibrated together: some dozens of reads of each, some of whose labels are wrong, tell less about
-    an object than the others do (docs/experiments/real_photographs.md).
+    an object than the others do (docs/experiments/real_photographs.md). Objects that are not known to be
+    there are left out: that is what presence tells.
 
     Args:
         network: Calibrated on renderings.
         evidence: Of its objects.
     """
-    hits = evidence.correct.ravel()
+    hits = evidence.correct[evidence.shown]
     if min(hits.sum(), (~hits).sum()) >= _FEWEST:
-        weights = fit_calibration(evidence.features.reshape(-1, evidence.features.shape[2]), hits.tolist())
+        weights = fit_calibration(evidence.features[evidence.shown], hits.tolist())
         network.reader.pose_correct[:] = torch.tensor(weights).float()
 
 

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS, VirtualCamera
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from curio_train.counting import counted
 from curio_train.data.photographs import read_frames
 from curio_train.geometry import Pose, matrix_from_rotation_6d, rotation_6d_from_matrix
 from curio_train.metrics.poses import in_view
@@ -37,6 +38,9 @@ Predict = Callable[[Tensor], SceneCode]
 class SceneLabels:
     """Photographs with the poses of several objects, as labelled frames for the locator stage."""
 
+    shown: Bool[np.ndarray, "photographs objects"]
+    """Whether an object's place is known and in the photograph. Turned cameras see border pixels beyond it, too."""
+
     def __init__(
         self,
         world: SeveralObjectsWorld,
@@ -54,6 +58,7 @@ class SceneLabels:
         self.frames, self.poses = frames, tuple(poses)
         self._stage, self._matrix = world.stages[0], world.camera.matrix
         self._position_m = np.stack([pose.translation_m for pose in poses], axis=1)
+        self.shown = self._in_view(self._position_m)
 
     @classmethod
     @torch.no_grad()
@@ -115,13 +120,15 @@ class SceneLabels:
             for number in chosen
         ]
         position_m = np.stack([positions for _, positions in seen])
-        height, width = self.frames.shape[2:]
-        known, inside = np.isfinite(position_m).all(axis=2), in_view(position_m, self._matrix, width, height)
+        known, inside = np.isfinite(position_m).all(axis=2), self.shown[chosen] & self._in_view(position_m)
         confidence = np.where(known, inside, np.nan)[..., None]
         position_m[~(known & inside)] = _ELSEWHERE_M
         code = {TRANSLATION: torch.from_numpy(position_m).float(), CONFIDENCE: torch.from_numpy(confidence).float()}
         small = F.avg_pool2d(torch.stack([image for image, _ in seen]), FRAME_STRIDE)
         return code, self._stage.augment(small, seed).clamp(0, 1)
+
+    def _in_view(self, position_m: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
+        return in_view(position_m, self._matrix, self.frames.shape[3], self.frames.shape[2])
 
 
 def read_often(
@@ -136,7 +143,7 @@ def read_often(
         through: The turned cameras; each photograph is read once through each.
     """
     codes, photograph = [], []
-    for number, frame in enumerate(frames):
+    for number, frame in enumerate(counted(frames, len(frames), "reading photographs")):
         for camera in through:
             pixels = camera.image(frame.permute(1, 2, 0).numpy(), matrix)
             seen = predict(torch.from_numpy(pixels).permute(2, 0, 1)[None].float() / 255)

@@ -24,6 +24,8 @@ from curio_train.worlds.base import ObjectKind
 _LEAST_CONFIDENCE = 0.1  # of reads that count
 _IN_DEPTH, _MOVED = 0.03, 0.02  # standard deviations: of distances, relative, and of what lies still, diameters
 _OUTLYING = 0.2  # of the objects' scales that are left out, at either end
+_LEAST_SHARE = 0.5  # of a photograph's reads that must agree on a place, in some photographs
+_FEWEST_PHOTOGRAPHS = 3  # of these
 _LARGEST_GAP = 5  # photographs without a member between two that show an object at one place
 
 
@@ -88,22 +90,33 @@ def _of_object(
     found = consensus_in_scene(
         cam_from_world, photograph, Pose(rotation, position_m), kind.info, in_depth=_IN_DEPTH, moved=_MOVED
     )
-    number = _where(found, photograph, len(cam_from_world.rotation))
+    number = _where(found, photograph, np.bincount(reads.photograph, minlength=len(cam_from_world.rotation)))
     there = Pose(np.full((len(number), 3, 3), np.nan), np.full((len(number), 3), np.nan))
     for which, one in enumerate(found):
         there.rotation[number == which], there.translation_m[number == which] = one.rotation, one.translation_m
     return cam_from_world @ there
 
 
-def _where(found: Sequence[Consensus], photograph: np.ndarray, num: int) -> Int[np.ndarray, " photographs"]:
+def _where(
+    found: Sequence[Consensus], photograph: Int[np.ndarray, " reads"], num_reads: Int[np.ndarray, " photographs"]
+) -> Int[np.ndarray, " photographs"]:
     """Which consensus each photograph shows, -1 for none: of its reads' the one of most photographs.
 
-    Between photographs that show the same one the object was not moved.
+    What a network takes for an object that is not there, it takes for it in one read and not in the next. So there must
+    be photographs of which half of the reads agree. Between photographs that show the same one the object was not
+    moved.
+
+    Args:
+        found: Poses on which some reads agree.
+        photograph: Of each of these reads.
+        num_reads: Of each photograph, in all.
     """
-    shown_in = [np.unique(photograph[one.members]) for one in found]
-    number = np.full(num, -1)
-    for which in sorted(range(len(found)), key=lambda which: len(shown_in[which])):
-        number[shown_in[which]] = which
+    agreeing = [np.bincount(photograph[one.members], minlength=len(num_reads)) for one in found]
+    number = np.full(len(num_reads), -1)
+    for which in sorted(range(len(found)), key=lambda which: np.count_nonzero(agreeing[which])):
+        shown = agreeing[which] > 0
+        if (shown & (agreeing[which] >= _LEAST_SHARE * num_reads)).sum() >= _FEWEST_PHOTOGRAPHS:
+            number[shown] = which
     told = np.flatnonzero(number >= 0)
     for first, second in pairwise(told):
         if number[first] == number[second] and second - first <= _LARGEST_GAP + 1:
