@@ -14,7 +14,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -118,33 +118,24 @@ def _call(command: str, *words: Any) -> str:
 
 def _mean(halves: list[dict[str, Any]]) -> dict[str, Any]:
     """Means over both halves, of all objects together and of each."""
-    return {
-        kind: {name: _of_both([half[kind]["metrics"] for half in halves], name) for name in _KEPT}
-        | {"num_targets": sum(half[kind]["num_targets"] for half in halves)}
-        | {"confidence_ece_together": _error_together([half[kind] for half in halves])}
-        | {
-            "objects": {
-                name: {
-                    metric: _of_both([half[kind]["objects"][name]["metrics"] for half in halves], metric)
-                    for metric in _KEPT[:2]
-                }
-                for name in halves[0][kind]["objects"]
-            }
-        }
-        for kind in halves[0]
+    return {kind: _of_both([half[kind] for half in halves]) for kind in halves[0]}
+
+
+def _of_both(halves: list[dict[str, Any]]) -> dict[str, Any]:
+    rows = [row for half in halves for one in half["objects"].values() for row in one["targets"]]
+    right = [row["add_diameters"] < ADD_THRESHOLD for row in rows]
+    of_each = {name: [half["objects"][name]["metrics"] for half in halves] for name in halves[0]["objects"]}
+    return _means([half["metrics"] for half in halves], _KEPT) | {
+        "num_targets": len(rows),
+        # of both halves' answers in one diagram: fewer in a bin let chance make it larger
+        "confidence_ece_together": round(calibration_error([row["confidence"] for row in rows], right), 4),
+        "objects": {name: _means(metrics, _KEPT[:2]) for name, metrics in of_each.items()},
     }
 
 
-def _error_together(halves: list[dict[str, Any]]) -> float:
-    """Calibration error of both halves' answers in one diagram: fewer in a bin let chance make it larger."""
-    rows = [row for half in halves for one in half["objects"].values() for row in one["targets"]]
-    right = [row["add_diameters"] < ADD_THRESHOLD for row in rows]
-    return round(calibration_error([row["confidence"] for row in rows], right), 4)
-
-
-def _of_both(metrics: list[dict[str, float]], name: str) -> float | None:
-    found = [one[name] for one in metrics if name in one]
-    return round(float(np.mean(found)), 4) if found else None
+def _means(metrics: list[dict[str, float]], names: Sequence[str]) -> dict[str, float | None]:
+    found = {name: [one[name] for one in metrics if name in one] for name in names}
+    return {name: round(float(np.mean(values)), 4) if values else None for name, values in found.items()}
 
 
 if __name__ == "__main__":
