@@ -237,7 +237,7 @@ def test_unreadable_photographs(files: Files) -> None:
     assert "005.png" in finding.text
     for path in files.photos[6:12]:
         path.write_bytes(b"\x89PNG")
-    (finding,) = alarms(files.subjects())
+    finding, *_ = alarms(files.subjects())  # of so few there are others
     assert finding.text.startswith("7 of ")
     assert all(f"{number:03}.png" in finding.text for number in range(5, 10))
     assert finding.text.endswith("; and 2 more")
