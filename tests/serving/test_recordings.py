@@ -176,6 +176,22 @@ def test_results_are_gone_on_with(models_dir: Path, spots: list[np.ndarray], tmp
     assert [line["image"] for line in lines(out)] == [json.loads(line)["image"] for line in whole]
 
 
+def test_results_by_a_camera_file_are_not_gone_on_with_by_the_recordings_own(
+    models_dir: Path, spots: list[np.ndarray], tmp_path: Path
+) -> None:
+    path, model, out = tmp_path / "run.mcap", models_dir / "pinhole", tmp_path / "out.jsonl"
+    with recording(path) as write:
+        for number in range(3):
+            write("/camera/image_raw", IMAGE, number, raw(spots[number]))
+            write("/camera/camera_info", INFO, number, info())
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps({"camera_matrix": [[900, 0, 160], [0, 900, 120], [0, 0, 1]]}))
+    detect(model, path, camera=other, out=out)
+    out.write_text("".join(out.read_text().splitlines(keepends=True)[:2]))
+    with pytest.raises(UsageError, match="poses by another camera"):
+        detect(model, path, out=out)
+
+
 def test_rectified_images_have_the_matrix_of_p(models_dir: Path, spots: list[np.ndarray], tmp_path: Path) -> None:
     rectified = [250.0, 0.0, 155.0, 0.0, 0.0, 250.0, 121.0, 0.0, 0.0, 0.0, 1.0, 0.0]
     with recording(tmp_path / "run.mcap") as write:
