@@ -232,6 +232,14 @@ def test_the_latest_version_wins(folder: Path, spot_onnx: MakeOnnx, write_folder
     assert open_model(folder).version == 10
 
 
+def test_a_broken_latest_version_says_which_is_before(folder: Path) -> None:
+    shutil.copytree(folder / "1", folder / "2")
+    (folder / "2" / "model.onnx").write_bytes(b"torn")
+    with pytest.raises(ModelError, match=f"the version before can be named: {folder / '1'}"):
+        open_model(folder)
+    assert open_model(folder / "1").version == 1
+
+
 def test_sums_are_compared(folder: Path) -> None:
     sums = folder / "SHA256SUMS"
     good = sums.read_text()

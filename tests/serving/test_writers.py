@@ -6,7 +6,10 @@ import json
 
 import pytest
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
+from curio_proto.v1.model_spec_pb2 import ObjectModel
+from curio_serve.batch.images.source_image import RecordedAt
 from curio_serve.batch.results.formats import Bop, Csv, ImageResult, JsonLines
+from curio_serve.batch.results.recorded_poses import Detection3DArrays
 from curio_serve.bop import bop_object_ids
 from curio_serve.errors import UsageError
 
@@ -182,3 +185,14 @@ def test_a_line_says_its_model_and_whether_it_failed(form: JsonLines | Csv) -> N
 def test_a_foreign_line_is_refused(form: JsonLines | Csv | Bop, line: bytes) -> None:
     with pytest.raises((ValueError, StopIteration)):
         form.parse(line)
+
+
+def test_a_recording_keeps_what_one_model_found_where_another_fails() -> None:
+    at = RecordedAt("/arm/image_raw", 10**9, 10**9, "arm_optical")
+    failed = answer(recorded=at, results=(), error="out of memory")
+    arrays = Detection3DArrays([ObjectModel(name="ape")])
+    lines = arrays.lines([failed, answer("test/000002/rgb/000017.png", detection(), recorded=at)])
+    assert lines.error == "out of memory"
+    (found,) = json.loads(lines.data)["message"]["detections"]
+    assert found["results"][0]["hypothesis"]["class_id"] == "ape"
+    assert arrays.lines([failed]).data == b""

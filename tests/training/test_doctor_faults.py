@@ -198,6 +198,14 @@ def test_exposure(files: Files) -> None:
     assert "exposure" in {finding.fault for finding in alarms(files.subjects())}
 
 
+def test_twelve_bits_in_files_of_sixteen(files: Files) -> None:
+    for path in files.photos[:20]:
+        save(path, photo(int(path.stem)).astype(np.uint16) * 16)
+    (finding,) = alarms(files.subjects())
+    assert finding.fault == "dark"
+    assert "20 of 84" in finding.text
+
+
 def test_too_few_to_learn_from(files: Files) -> None:
     """The number at which the doctor warns is the one at which training stops learning from photographs."""
     for path in files.photos[FEWEST_TO_LEARN_FROM - 1 :]:

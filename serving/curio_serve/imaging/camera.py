@@ -188,14 +188,15 @@ def _check_distortion(camera: PinholeCamera, width: int, height: int) -> None:
     if not moved_px <= math.hypot(width, height) / 2:
         raise CameraError(
             f"the distortion {list(camera.distortion)} moves pixels of a frame of {width}x{height} by up to "
-            f"{moved_px:.3g} px; expected the coefficients k1, k2, p1, p2, k3 of this camera, in OpenCV's order"
+            f"{moved_px:.3g} px; expected the coefficients k1, k2, p1, p2, k3 of this camera, in OpenCV's order, and K "
+            "of frames of this size"
         )
     reached = _reached(camera, border[:, [0, 2, 6, 8]])
     if reached < _LEAST_REACHED:
         raise CameraError(
             f"the distortion {list(camera.distortion)} turns back at {reached:.0%} of the way to a corner of a "
             f"frame of {width}x{height}, beyond which places are seen twice; calibrate again with boards in the "
-            "corners, or without k3"
+            "corners, or without k3, unless K is of frames of another size"
         )
 
 

@@ -116,7 +116,12 @@ def open_model(path: str | Path, runtime: Runtime = DEFAULT_RUNTIME) -> Model:
         raise ModelError(
             f"no model in {path}; expected {path}/<version>/{MODEL_FILE}, as curio-export writes it{in_run(path)}"
         )
-    return load_version(resolved, found[-1], runtime)
+    try:
+        return load_version(resolved, found[-1], runtime)
+    except ModelError as exc:
+        if len(found) == 1:
+            raise
+        raise ModelError(f"{exc}; the version before can be named: {path / str(found[-2])}") from exc
 
 
 def listed_sums(folder: Path) -> dict[str, str]:

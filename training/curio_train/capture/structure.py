@@ -78,7 +78,7 @@ def recover(photographs: Sequence[Path], camera: Intrinsics | None = None) -> St
     if camera is not None:
         check_sizes(photographs, camera)
     with tempfile.TemporaryDirectory() as scratch:
-        found = _map(folders.pop(), [path.name for path in photographs], camera, Path(scratch))
+        found = _map(photographs, camera, Path(scratch))
     return _checked(photographs, found, camera)
 
 
@@ -91,9 +91,18 @@ def _pycolmap() -> Any:
     return pycolmap
 
 
-def _map(folder: Path, names: list[str], camera: Intrinsics | None, scratch: Path) -> Any:
+def _names(photographs: Sequence[Path]) -> dict[Path, str]:
+    """What COLMAP calls the photographs: it takes the order of their names, as text, for that of the sequence."""
+    return {path: f"{number:06d}{path.suffix}" for number, path in enumerate(photographs)}
+
+
+def _map(photographs: Sequence[Path], camera: Intrinsics | None, scratch: Path) -> Any:
     """The largest reconstruction."""
     pycolmap = _pycolmap()
+    folder, names = scratch / "photographs", list(_names(photographs).values())
+    folder.mkdir()
+    for path, name in _names(photographs).items():
+        (folder / name).symlink_to(path.absolute())
     pycolmap.set_random_seed(0)
     database = scratch / "database.db"
     reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
@@ -117,12 +126,12 @@ def _map(folder: Path, names: list[str], camera: Intrinsics | None, scratch: Pat
             pycolmap.match_sequential(database, pairing_options=pairing)
         models = pycolmap.incremental_mapping(database, folder, scratch, options)
     except (ValueError, RuntimeError) as exc:
-        raise CameraError(f"{folder}: pycolmap failed ({exc})") from exc
+        raise CameraError(f"{photographs[0].parent}: pycolmap failed ({exc})") from exc
     if not models:
         raise CameraError(
-            f"{folder}: no two of the {len(names)} photographs could be matched. The scene needs texture (lay "
-            "printed paper or a cloth with a pattern around the object), and neighbouring views more overlap (at most "
-            "20 degrees apart)"
+            f"{photographs[0].parent}: no two of the {len(names)} photographs could be matched. The scene needs "
+            "texture (lay printed paper or a cloth with a pattern around the object), and neighbouring views more "
+            "overlap (at most 20 degrees apart)"
         )
     return max(models.values(), key=lambda model: model.num_reg_images())
 
@@ -130,8 +139,9 @@ def _map(folder: Path, names: list[str], camera: Intrinsics | None, scratch: Pat
 def _checked(photographs: Sequence[Path], found: Any, known: Intrinsics | None) -> Structure:
     """The reconstruction in our conventions, or why it is not to be trusted."""
     poses = {image.name: image.cam_from_world().matrix() for image in found.images.values() if image.has_pose}
-    placed = tuple(path for path in photographs if path.name in poses)
-    missing = [path.name for path in photographs if path.name not in poses]
+    names = _names(photographs)
+    placed = tuple(path for path in photographs if names[path] in poses)
+    missing = [path.name for path in photographs if names[path] not in poses]
     points = np.array([point.xyz for point in found.points3D.values()]).reshape(-1, 3)
     if len(placed) < _FEWEST_PLACED * len(photographs) or len(points) < _FEWEST_POINTS:
         raise CameraError(
@@ -146,7 +156,7 @@ def _checked(photographs: Sequence[Path], found: Any, known: Intrinsics | None) 
             f"{_LARGEST_ERROR_PX:g}; did the scene move, or the zoom change?"
         )
     matrices = np.tile(np.eye(4), (len(placed), 1, 1))
-    matrices[:, :3] = [poses[path.name] for path in placed]
+    matrices[:, :3] = [poses[names[path]] for path in placed]
     camera = known or _intrinsics(next(iter(found.cameras.values())), str(photographs[0].parent))
     return Structure(placed, matrices, camera, points, error)
 

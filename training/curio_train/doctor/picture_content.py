@@ -42,6 +42,8 @@ class Photograph:
     """0 sharp to 1 blurred (Crété-Roffet et al. 2007), at no more than 640 pixels a side."""
     lost: float
     """Fraction of the pixels that are black or white, and say nothing."""
+    brightest: int
+    """The largest value of a pixel and channel, 0 to 255."""
 
 
 def measure(path: Path) -> Photograph:
@@ -63,6 +65,7 @@ def measure(path: Path) -> Photograph:
         thumbnail=thumbnail(pixels),
         blur=blur,
         lost=lost,
+        brightest=int(pixels.max()),
     )
 
 
@@ -100,6 +103,7 @@ _TOLERATED = 0.1  # fraction of photographs
 _EQUAL_LEVELS = 4.0  # two frames of one static scene differ by more somewhere, if anything moved
 _COMPARED = 60  # neighbours in brightness that each is compared with
 MOSTLY_LOST = 0.6
+_TWELVE_OF_SIXTEEN_BITS = 15  # of 255: the brightest that 12 bits can be where 16 are read
 _BETTER_SWAPPED = 0.6
 
 
@@ -140,6 +144,15 @@ def _duplicates(photographs: Sequence[Photograph]) -> Iterator[Finding]:
 
 
 def _exposure(photographs: Sequence[Photograph]) -> Iterator[Finding]:
+    dark = [photo for photo in photographs if photo.brightest <= _TWELVE_OF_SIXTEEN_BITS]
+    if len(dark) > _TOLERATED * len(photographs):
+        text = (
+            f"{len(dark)} of {len(photographs)} are nearly black, for instance {dark[0].path.name}, whose brightest "
+            f"pixel is read as {dark[0].brightest} of 255"
+        )
+        remedy = "Where a camera's 10 or 12 bits lie in files of 16, scale them to 16 first (12 bits: times 16)"
+        yield Finding("photograph exposure", "warning", text, remedy, "likely", fault="dark")
+        return
     lost = [photo for photo in photographs if photo.lost > MOSTLY_LOST]
     if len(lost) > _TOLERATED * len(photographs):
         text = f"{len(lost)} of {len(photographs)} are mostly black or white, for instance {lost[0].path.name}"

@@ -8,7 +8,9 @@ that add few products, and all else.
 
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import onnx
@@ -25,6 +27,7 @@ _ACTIVATIONS = ("Relu", "Clip")
 _BETWEEN = (*_ACTIVATIONS, "Add")  # that stay in int8 after a convolution
 _LEAST_PRODUCTS = 256  # in each sum of a convolution; with fewer, eight bits save little, and rounding tells more
 _FACTOR = "rounding"
+_WARNINGS, _ERRORS = 2, 3  # severities of onnxruntime
 _ROUNDING = (1e-7, -1e-7, 2e-7, -2e-7, 3e-7, -3e-7)  # relative: that of float32 in a few operations
 
 
@@ -38,7 +41,7 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
     Raises:
         ExportError: There is no convolution to quantise.
     """
-    load_onnxruntime()  # first, because it turns telemetry off
+    runtime = load_onnxruntime()  # first, because it turns telemetry off
     from onnxruntime import quantization
 
     single = of_one_image(model)
@@ -58,8 +61,8 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
             batch = next(self._feeds, None)
             return None if batch is None else {INPUT: batch}
 
-    # The quantiser advises to preprocess, which folded graphs do not need.
-    with tempfile.TemporaryDirectory() as folder, quiet(""):
+    # The quantiser advises to preprocess, which folded graphs do not need, and its sessions to fold wanted slots away.
+    with tempfile.TemporaryDirectory() as folder, quiet(""), _errors_alone(runtime):
         source, target = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
         onnx.save(single, source)  # of a model in memory the quantiser takes the weights away
         quantization.quantize_static(
@@ -79,6 +82,15 @@ def to_int8(model: onnx.ModelProto, images: Tensor) -> onnx.ModelProto:
         quantised = image_by_image(quantised)
     onnx.checker.check_model(quantised)
     return quantised
+
+
+@contextmanager
+def _errors_alone(runtime: ModuleType) -> Iterator[None]:
+    runtime.set_default_logger_severity(_ERRORS)
+    try:
+        yield
+    finally:
+        runtime.set_default_logger_severity(_WARNINGS)  # which is onnxruntime's default
 
 
 def rounded_otherwise(model: onnx.ModelProto) -> Iterator[onnx.ModelProto]:

@@ -52,18 +52,18 @@ class Detection3DArrays:
         self._boxes = {kind.name: np.array(kind.box_corners_m).reshape(-1, 3) for kind in objects}
 
     def lines(self, results: Sequence[ImageResult]) -> ImageLines:
-        """The message of an image, with what all models found; nothing for an image without an answer."""
-        errors = dict.fromkeys(result.error for result in results if result.error)
+        """The message of an image, with what all models found that answered; none where none did."""
+        error = "; ".join(dict.fromkeys(result.error for result in results if result.error))
         image, at = results[0].image, results[0].recorded
-        if errors or at is None:
-            return ImageLines(image, "; ".join(errors), b"")
+        if at is None or all(result.error for result in results):
+            return ImageLines(image, error, b"")
         seconds, nanoseconds = divmod(at.stamp_ns, 10**9)
         header: dict[str, object] = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": at.frame_id}
         found = [self._detection(detection, header) for result in results for detection in result.detections]
         topic = f"{at.topic.removesuffix('/compressed').rpartition('/')[0]}/{TOPIC}"
         message = {"header": header, "detections": found}
         data = json.dumps({"topic": topic, "log_time_ns": at.log_time_ns, "message": message}).encode()
-        return ImageLines(image, "", data)
+        return ImageLines(image, error, data)
 
     def _detection(self, detection: Detection, header: dict[str, object]) -> dict[str, object]:
         position = np.array(detection.translation_m)
@@ -96,7 +96,7 @@ class PoseRecording:
     num_images: int
     """Images that were read so far, failed ones among them."""
     num_errors: int
-    """Images that failed. The recording has no message for them."""
+    """Images that a model or more gave no answer for. The recording has no message where none did."""
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         from mcap_ros2.writer import Writer
