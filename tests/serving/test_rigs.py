@@ -245,6 +245,24 @@ def test_curio_detect_takes_a_folder_of_each_camera(
         run(DetectArguments("127.0.0.1:1/pinhole", call.images, rig=rig))
 
 
+@pytest.mark.parametrize("is_right", [True, False])
+def test_cameras_that_never_agree_are_told(
+    is_right: bool, models_dir: Path, tmp_path: Path, spot_image: Spot, capsys: pytest.CaptureFixture[str]
+) -> None:
+    side, folders = np.eye(4), [tmp_path / "cam0", tmp_path / "cam1"]
+    side[0, 3] = -0.2
+    for folder, pose in zip(folders, (side, np.eye(4)), strict=True):
+        folder.mkdir()
+        for frame in range(10):
+            cv2.imwrite(str(folder / f"{frame}.png"), _image(spot_image, pose)[..., ::-1])
+    rig = _write_rig(tmp_path / "rig.json", [side if is_right else np.linalg.inv(side), np.eye(4)])
+    run(
+        DetectArguments(str(models_dir / "pinhole"), tuple(map(str, folders)), rig=rig, out=str(tmp_path / "out.jsonl"))
+    )
+    told = "in none of 10 instants do two cameras agree on a pose: are their cam_from_rig"
+    assert (told in capsys.readouterr().err) is not is_right
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [

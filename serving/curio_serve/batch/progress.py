@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
 _NUM_PROBLEMS_SHOWN = 20
+_FEWEST_INSTANTS = 10  # in which cameras of a rig contradict each other, before that is told
 
 
 @dataclass
@@ -41,6 +42,7 @@ class Progress:
         self._num_new = 0
         self._num_errors = self._num_errors_before = num_errors_before
         self._turned, self._wide, self._least_searched = _Some(), _Some(), 1.0
+        self._num_agreeing = self._num_contradicting = 0
         self._problems: list[str] = []
         self._start_s = time.perf_counter()
 
@@ -59,6 +61,9 @@ class Progress:
         if lines.searched < MOSTLY_SEARCHED:
             self._wide.add(lines.image)
             self._least_searched = min(self._least_searched, lines.searched)
+        if lines.do_views_agree is not None:
+            self._num_agreeing += lines.do_views_agree
+            self._num_contradicting += not lines.do_views_agree
         if lines.error:
             self._num_errors += 1
             if len(self._problems) < _NUM_PROBLEMS_SHOWN:
@@ -89,6 +94,12 @@ class Progress:
                 f"{_counted(self._wide.num, 'shows', 'show')} more than the model's camera saw in training (first: "
                 f"{self._wide.first}): the middle alone was searched, {self._least_searched:.0%} of the frame. Train "
                 "with this camera, or ask curio-serve about regions of the frames"
+            )
+        if self._num_contradicting >= _FEWEST_INSTANTS and not self._num_agreeing:
+            _say(
+                f"in none of {self._num_contradicting} instants do two cameras agree on a pose: are their "
+                "cam_from_rig in the rig's file right (from the rig to the camera, metres), and do images of one line "
+                "show one instant?"
             )
         if self._num_errors:
             _say(f"{_counted(self._num_errors, 'has', 'have')} no answer{':' if self._problems else ''}")

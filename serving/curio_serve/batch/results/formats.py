@@ -20,6 +20,8 @@ from curio_serve.batch.images.source_image import RecordedAt
 from curio_serve.batch.results.detection_json import STATUS, detection_json, finite, rows
 from curio_serve.errors import UsageError
 
+_LIKELY = 0.5  # confidence of poses that cameras of a rig should agree on
+
 
 @dataclass(frozen=True)
 class ImageResult:
@@ -90,6 +92,8 @@ class ImageLines:
     """EXIF asks for a rotation that was not applied."""
     searched: float = 1.0
     """Fraction of the frame that models were shown, the smallest one."""
+    do_views_agree: bool | None = None
+    """Whether two cameras of a rig agree on a pose; None where none says a likely one."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +133,7 @@ class ResultFormat(ABC):
         errors = dict.fromkeys(result.error for result in results if result.error)
         is_turned, searched = any(result.is_turned for result in results), min(result.searched for result in results)
         data = b"".join(map(self.encode, results))
-        return ImageLines(results[0].image, "; ".join(errors), data, is_turned, searched)
+        return ImageLines(results[0].image, "; ".join(errors), data, is_turned, searched, _do_views_agree(results))
 
     @abstractmethod
     def encode(self, result: ImageResult) -> bytes:
@@ -146,6 +150,12 @@ class ResultFormat(ABC):
         Raises:
             ValueError: The line is not of this format.
         """
+
+
+def _do_views_agree(results: Sequence[ImageResult]) -> bool | None:
+    of_rigs = (detection for result in results if result.views for detection in result.detections)
+    likely = [detection for detection in of_rigs if detection.confidence >= _LIKELY]
+    return any(len(detection.views) > 1 for detection in likely) if likely else None
 
 
 class JsonLines(ResultFormat):
