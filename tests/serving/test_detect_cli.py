@@ -147,11 +147,13 @@ def test_nothing_is_written_over_the_images(models_dir: Path, frames: Path, tmp_
 
 def test_a_files_name_forges_no_line(models_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a\ncurio-detect: all is well\x1b[31m.png").write_bytes(b"no picture")
+    (tmp_path / "b\ncurio-detect: all is well\x1b[31m.txt").touch()
     assert detect(models_dir / "flat", tmp_path, out=tmp_path / "out.jsonl") == 1
     told = capsys.readouterr().err
     assert "\x1b" not in told
     assert "\ncurio-detect: all is well" not in told
-    assert r"a\x0acurio-detect: all is well\x1b[31m.png" in told
+    for name in (r"a\x0acurio-detect: all is well\x1b[31m.png", r"b\x0acurio-detect: all is well\x1b[31m.txt"):
+        assert name in told
 
 
 def test_nothing_is_written_over_what_a_call_reads(models_dir: Path, frames: Path, camera: Path) -> None:

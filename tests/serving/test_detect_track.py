@@ -35,6 +35,9 @@ def test_each_folder_is_a_stream_of_its_own(models_dir: Path, frames: Path, came
     assert tracks[5]["velocity_m_s"][0] == pytest.approx(0.83, rel=0.05)  # type: ignore[index]
     with pytest.raises(UsageError, match="holds 8 images"):
         run(arguments)
+    out.write_text(out.read_text().splitlines(keepends=True)[0])
+    with pytest.raises(UsageError, match=r'answers with other options: .*"track": true'):
+        run(replace(arguments, track=False, frame_rate=DetectArguments.frame_rate))
     plain = tmp_path / "plain.jsonl"
     run(DetectArguments(str(models_dir / "pinhole"), (str(frames),), camera=camera, out=str(plain)))
     assert "track" not in plain.read_text()

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from curio_proto.v1.detector_pb2 import DetectResponse, Tracking
 from curio_serve.batch.results.detection_json import detection_json
 from curio_serve.imaging.camera import PinholeCamera
 from curio_serve.imaging.virtual_cameras import VIRTUAL_CAMERAS
@@ -13,6 +14,7 @@ from curio_serve.models.detector import Detector
 from curio_serve.models.model import Model
 from curio_serve.models.model_folder import open_model
 from curio_serve.models.repeated import RepeatedReader
+from curio_serve.tracking.stream import FollowingStream
 
 ROOT = Path(__file__).parents[2]
 CAMERA = PinholeCamera(np.array(json.loads((ROOT / "samples" / "camera.json").read_text())["camera_matrix"]))
@@ -43,6 +45,18 @@ def test_several_reads_answer_their_mean(several: Model, pixels: np.ndarray) -> 
     each = [several.run(camera.image(pixels, matrix)[None])["presence"] for camera in VIRTUAL_CAMERAS[:2]]
     found = RepeatedReader(several.spec, several.run, 2)(pixels[None])["presence"]
     np.testing.assert_allclose(found, np.mean(each, axis=0), atol=1e-6)
+
+
+def test_followed_objects_have_it(several: Model, pixels: np.ndarray) -> None:
+    stream, followed = FollowingStream(), DetectResponse()
+    stream.follow(
+        Tracking(time_s=0), [Detector(several)], pixels, CAMERA, min_confidence=0, reduction=1, results=followed.results
+    )
+    (alone,) = Detector(several).detect(pixels, CAMERA)
+    expected = {detection.object: detection.presence for detection in alone.detections}
+    found = {detection.object: detection.presence for detection in followed.results[0].detections}
+    assert found
+    assert found == {name: expected[name] for name in found}
 
 
 def test_models_that_do_not_tell_it_answer_none(pixels: np.ndarray) -> None:

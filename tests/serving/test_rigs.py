@@ -255,12 +255,18 @@ def test_cameras_that_never_agree_are_told(
         folder.mkdir()
         for frame in range(10):
             cv2.imwrite(str(folder / f"{frame}.png"), _image(spot_image, pose)[..., ::-1])
-    rig = _write_rig(tmp_path / "rig.json", [side if is_right else np.linalg.inv(side), np.eye(4)])
-    run(
-        DetectArguments(str(models_dir / "pinhole"), tuple(map(str, folders)), rig=rig, out=str(tmp_path / "out.jsonl"))
+    rig, out = (
+        _write_rig(tmp_path / "rig.json", [side if is_right else np.linalg.inv(side), np.eye(4)]),
+        tmp_path / "out",
     )
+    call = DetectArguments(str(models_dir / "pinhole"), tuple(map(str, folders)), rig=rig, out=str(out))
+    run(call)
     told = "in none of 10 instants do two cameras agree on a pose: are their cam_from_rig"
     assert (told in capsys.readouterr().err) is not is_right
+    out.write_text(out.read_text().splitlines(keepends=True)[0])
+    _write_rig(rig, [side, np.eye(4)], name="right")
+    with pytest.raises(UsageError, match=r'answers with other options: .*"rig_sha256"'):
+        run(call)
 
 
 @pytest.mark.parametrize(

@@ -3,15 +3,16 @@
 import csv
 import io
 import json
+from pathlib import Path
 
 import pytest
 from curio_proto.v1.detector_pb2 import Detection, RegionResult
 from curio_proto.v1.model_spec_pb2 import ObjectModel
-from curio_serve.batch.images.source_image import RecordedAt
+from curio_serve.batch.images.source_image import RecordedAt, SourceImage
 from curio_serve.batch.results.formats import Bop, Csv, ImageResult, JsonLines
-from curio_serve.batch.results.recorded_poses import Detection3DArrays
+from curio_serve.batch.results.recorded_poses import Detection3DArrays, PoseRecording
 from curio_serve.bop import bop_object_ids
-from curio_serve.errors import UsageError
+from curio_serve.errors import OutputError, UsageError
 
 QUARTER_TURN = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 
@@ -196,3 +197,19 @@ def test_a_recording_keeps_what_one_model_found_where_another_fails() -> None:
     (found,) = json.loads(lines.data)["message"]["detections"]
     assert found["results"][0]["hypothesis"]["class_id"] == "ape"
     assert arrays.lines([failed]).data == b""
+
+
+def test_an_earlier_recording_stays_until_there_is_an_image(tmp_path: Path) -> None:
+    earlier, new = tmp_path / "earlier.mcap", tmp_path / "new.mcap"
+    earlier.write_bytes(b"of an earlier run")
+    for path in (earlier, new):
+        with PoseRecording(path, overwrite=True) as first:
+            with pytest.raises(OutputError, match="another process is writing it"):
+                PoseRecording(path, overwrite=True)
+            assert list(first.unanswered(iter(()))) == []
+    assert earlier.read_bytes() == b"of an earlier run"
+    assert not new.exists()
+    with PoseRecording(earlier, overwrite=True) as second:
+        (image,) = second.unanswered(iter([SourceImage("a", "a")]))
+    assert image.name == "a"
+    assert earlier.read_bytes().startswith(b"\x89MCAP")

@@ -200,7 +200,9 @@ def test_exposure(files: Files) -> None:
 
 def test_twelve_bits_in_files_of_sixteen(files: Files) -> None:
     for path in files.photos[:20]:
-        save(path, photo(int(path.stem)).astype(np.uint16) * 16)
+        twelve_bits = photo(int(path.stem)).astype(np.uint16) * 16
+        twelve_bits[0, 0] = 4095  # saturated
+        save(path, twelve_bits)
     (finding,) = alarms(files.subjects())
     assert finding.fault == "dark"
     assert "20 of 84" in finding.text

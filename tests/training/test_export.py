@@ -283,6 +283,16 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert files(tmp_path) == ["models"]
+    folder.add(1, {"model.onnx": b"small"}, "config", "card\n" * 300_000)
+    before = {path: path.read_bytes() for path in folder.files()}
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, limits[1]))
+    try:
+        with pytest.raises(ExportError, match="File too large; name another folder: --out"):
+            folder.add(2, {"model.onnx": b"small"}, "config", "card")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert folder.versions() == [1]
+    assert {path: path.read_bytes() for path in folder.files()} == before
 
 
 class _Everything(Circles):

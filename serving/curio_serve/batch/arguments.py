@@ -14,7 +14,9 @@ from curio_serve.errors import UsageError
 _OF_ANSWERS = (
     *("objects", "min_confidence", "max_detections", "max_instances"),
     *("reads", "plane", "refine", "exif_rotation"),
+    *("track", "track_objects", "frame_rate"),
 )
+_FILES_OF_ANSWERS = ("plane", "rig")  # whose content may be another one the next time
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,8 @@ class DetectArguments:
         """The options that change answers, where they are not the default: each line of a result file has them."""
         given = {name: getattr(self, name) for name in _OF_ANSWERS}
         changed = {name: value for name, value in given.items() if value != getattr(DetectArguments, name)}
-        if self.plane is not None and os.path.isfile(self.plane):  # whose content may be another one the next time
-            changed["plane_sha256"] = hashlib.sha256(Path(self.plane).read_bytes()).hexdigest()[:16]
+        for name in _FILES_OF_ANSWERS:
+            file = getattr(self, name)
+            if file is not None and os.path.isfile(file):
+                changed[f"{name}_sha256"] = hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16]
         return changed

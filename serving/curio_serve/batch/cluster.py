@@ -94,7 +94,7 @@ def _check_reachable(address: str) -> None:
 
 def _answers(ray: Any, open_answering: Opening, portion: list[SourceImage]) -> Iterator[ImageLines]:
     num_blocks = max(1, len(portion) // _IMAGES_A_BLOCK)
-    rows = [{"image": pickle.dumps(_for_other_nodes(image))} for image in portion]
+    rows = [{"image": pickle.dumps(for_other_nodes(image))} for image in portion]
     num_actors = max(1, int(ray.cluster_resources().get("CPU", 1)))
     answered = ray.data.from_items(rows, override_num_blocks=num_blocks).map(
         _Worker,
@@ -108,6 +108,6 @@ def _answers(ray: Any, open_answering: Opening, portion: list[SourceImage]) -> I
         yield answer
 
 
-def _for_other_nodes(image: SourceImage) -> SourceImage:
+def for_other_nodes(image: SourceImage) -> SourceImage:
     """The image with an absolute path: other nodes have other working folders."""
     return image if is_url(image.path) else replace(image, path=os.path.abspath(image.path))

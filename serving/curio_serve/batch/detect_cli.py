@@ -69,6 +69,7 @@ def run(arguments: DetectArguments) -> int:
     from curio_serve.batch.images.source_image import Topics
     from curio_serve.batch.images.sources import STANDARD_INPUT, PassedOver, check_arguments, images
     from curio_serve.batch.output import open_output, result_format
+    from curio_serve.batch.progress import say
     from curio_serve.batch.refinement import outlining, refining
     from curio_serve.batch.rig_images import run_rig
     from curio_serve.batch.tracked import check_tracking, from_the_first, timed
@@ -107,7 +108,7 @@ def run(arguments: DetectArguments) -> int:
         else:  # other nodes have another working folder
             there = [os.path.abspath(model) if os.path.exists(model) else model for model in models]
             placed = replace(arguments, mesh=tuple(mesh.absolute() for mesh in arguments.mesh))
-            results = over_cluster(arguments.ray, partial(_answering, placed, there, settings), remaining)
+            results = over_cluster(arguments.ray, partial(_answering, placed, there, settings, form), remaining)
         with (
             closing(results),
             _progress(arguments, output) as progress,
@@ -116,10 +117,9 @@ def run(arguments: DetectArguments) -> int:
                 output.write(result)
                 progress.count(result)
         for line in passed_over.lines():
-            print(f"curio-detect: {line}", file=sys.stderr)
+            say(line)
         if refiner is not None:
-            text = f"refined {refiner.num_refined} of {refiner.num_detections} poses; the others stay as detected"
-            print(f"curio-detect: {text}", file=sys.stderr)
+            say(f"refined {refiner.num_refined} of {refiner.num_detections} poses; the others stay as detected")
         if output.num_images == 0:
             raise UsageError(
                 f"no images in {' '.join(arguments.images)}; looked for .jpg, .jpeg, .png and .webp in folders, "
@@ -247,15 +247,17 @@ def _check_objects(spec: "ModelSpec", model: str, settings: "Settings") -> None:
 
 
 def _answering(
-    arguments: DetectArguments, models: "Sequence[str]", settings: "Settings"
+    arguments: DetectArguments,
+    models: "Sequence[str]",
+    settings: "Settings",
+    form: "ResultFormat | Detection3DArrays",
 ) -> "Callable[[SourceImage], ImageLines]":
     """Build the function that answers images in another process."""
-    from curio_serve.batch.output import result_format
     from curio_serve.batch.refinement import outlining
 
     estimators = _estimators(arguments, models, settings)
     outlining(arguments, models, estimators)
-    return partial(_answer, estimators, result_format(arguments, estimators))
+    return partial(_answer, estimators, form)
 
 
 def _answer(

@@ -262,7 +262,7 @@ class LocalEstimator(Estimator):
                 min_confidence=self.settings.min_confidence,
                 max_detections=self.settings.max_detections,
                 max_instances=self.settings.max_instances,
-                plane=plane_of(self.settings.plane, image.name),
+                plane=plane_of(self.settings.plane, image.place),
                 reduction=frame.reduction,
             )
         else:
@@ -290,7 +290,7 @@ class LocalEstimator(Estimator):
             frame.pixels,
             camera,
             min_confidence=self.settings.min_confidence,
-            plane=plane_of(self.settings.plane, image.name),
+            plane=plane_of(self.settings.plane, image.place),
             reduction=frame.reduction,
             results=results,
         )
@@ -323,7 +323,7 @@ class RemoteEstimator(Estimator):
             max_detections=self.settings.max_detections,
             max_instances=self.settings.max_instances,
             reads=self.settings.num_reads if self.settings.num_reads > 1 else None,
-            plane=plane_of(self.settings.plane, image.name),
+            plane=plane_of(self.settings.plane, image.place),
             objects=self._wanted,
             apply_exif_rotation=is_turned,
         )

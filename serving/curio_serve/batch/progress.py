@@ -75,34 +75,32 @@ class Progress:
         """Sums up, with the first problems of this run."""
         seconds = time.perf_counter() - self._start_s
         before = f" after {self._num_before} of earlier runs" if self._num_before else ""
-        _say(
-            f"{_counted(self._num_new)}{before} in {seconds:.1f} s ({self._num_new / seconds:.1f} images/s) to {label}"
-        )
+        say(f"{_counted(self._num_new)}{before} in {seconds:.1f} s ({self._num_new / seconds:.1f} images/s) to {label}")
         if self._num_before and not self._are_compared:
-            _say("answers of earlier runs stay as they are, whatever flags they had; --overwrite answers all again")
+            say("answers of earlier runs stay as they are, whatever flags they had; --overwrite answers all again")
         elif self._num_errors_before:
             before = _counted(self._num_errors_before, "has", "have")
-            _say(f"{before} no answer in earlier runs and was not tried again; --overwrite answers all again")
+            say(f"{before} no answer in earlier runs and was not tried again; --overwrite answers all again")
         if self._turned.num:
-            _say(
+            say(
                 f"{_counted(self._turned.num, 'has', 'have')} an EXIF rotation that was not applied (first: "
                 f"{self._turned.first}); viewers turn pictures by it, K is taken to be of the stored pixels. With "
                 "--exif-rotation pixels are turned, and K with them"
             )
         if self._wide.num:
-            _say(
+            say(
                 f"{_counted(self._wide.num, 'shows', 'show')} more than the model's camera saw in training (first: "
                 f"{self._wide.first}): the middle alone was searched, {self._least_searched:.0%} of the frame. Train "
                 "with this camera, or ask curio-serve about regions of the frames"
             )
         if self._num_contradicting >= _FEWEST_INSTANTS and not self._num_agreeing:
-            _say(
+            say(
                 f"in none of {self._num_contradicting} instants do two cameras agree on a pose: are their "
                 "cam_from_rig in the rig's file right (from the rig to the camera, metres), and do images of one line "
                 "show one instant?"
             )
         if self._num_errors:
-            _say(f"{_counted(self._num_errors, 'has', 'have')} no answer{':' if self._problems else ''}")
+            say(f"{_counted(self._num_errors, 'has', 'have')} no answer{':' if self._problems else ''}")
         for problem in self._problems:
             print(f"  {problem}", file=sys.stderr)
         if len(self._problems) < self._num_errors and self._problems:
@@ -125,5 +123,6 @@ def _printable(text: str) -> str:
     return "".join(sign if sign.isprintable() else f"\\x{ord(sign):02x}" for sign in text)
 
 
-def _say(text: str) -> None:
-    print(f"curio-detect: {text}", file=sys.stderr)
+def say(text: str) -> None:
+    """A line on standard error."""
+    print(f"curio-detect: {_printable(text)}", file=sys.stderr)

@@ -1,7 +1,6 @@
 """``curio-detect --rig``: detects in the images that several cameras took at the same instant."""
 
 import os
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
@@ -17,7 +16,7 @@ from curio_serve.batch.images.remote_files import is_url
 from curio_serve.batch.images.source_image import SourceImage, Topics
 from curio_serve.batch.images.sources import PassedOver, images
 from curio_serve.batch.instants import Instants, RigImage, refuse_other_images
-from curio_serve.batch.progress import Progress
+from curio_serve.batch.progress import Progress, say
 from curio_serve.batch.results.formats import ImageLines, ImageResult, JsonLines
 from curio_serve.batch.results.result_file import ResultFile, values_of
 from curio_serve.errors import ArgumentError, CameraError, ImageError, InternalError, UsageError
@@ -174,7 +173,7 @@ def run_rig(arguments: DetectArguments, models: Sequence[str]) -> int:
                 output.write(result)
                 progress.count(result)
         for line in (*passed_over.lines(), *taken.unpaired.lines()):
-            print(f"curio-detect: {line}", file=sys.stderr)
+            say(line)
         if output.num_images == 0:
             raise UsageError(f"--rig: no images in {' '.join(arguments.images)}")
         progress.report(output.label)

@@ -34,7 +34,9 @@ class CameraPoseFile:
     """
 
     file: Path
-    """Path of the file."""
+    """Path of the file, as it was given."""
+    folder: Path
+    """The file's folder, absolute: another process may have another working folder."""
     entries: Mapping[str, Any]
     """What the file says of each photograph, by its name."""
     flag: str = "--plane"
@@ -59,10 +61,10 @@ class CameraPoseFile:
         except ValueError as exc:
             raise cls.error(f"{flag} {file}: not JSON ({exc})") from exc
         if isinstance(entries, dict) and _POSE in entries:
-            return cls(file, {}, flag, entries)
+            return cls(file, file.parent.absolute(), {}, flag, entries)
         if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
             raise cls.error(f"{flag} {file}: expected an object of photographs, each with its cam_from_world")
-        return cls(file, entries, flag)
+        return cls(file, file.parent.absolute(), entries, flag)
 
     @classmethod
     def named(cls, given: str | None) -> "GivenPlane":
@@ -139,7 +141,7 @@ class CameraPoseFile:
             CameraError: As :meth:`pose_above_plane`, of a pose that is there.
         """
         for name in ["every image"] if self.of_all is not None else self.entries:
-            photograph = self.file.parent / str(self.entries.get(name, {}).get("folder", "")) / name
+            photograph = self.folder / str(self.entries.get(name, {}).get("folder", "")) / name
             if self.is_known(photograph):
                 self.pose_above_plane(photograph, _MOST_UPWARD)
 
@@ -160,9 +162,9 @@ class CameraPoseFile:
     def _entry(self, photograph: Path) -> Mapping[str, Any]:
         if self.of_all is not None:
             return self.of_all
-        relative = os.path.relpath(photograph, self.file.parent)
+        relative = os.path.relpath(photograph, self.folder)
         named: Mapping[str, Any] = self.entries.get(relative, self.entries.get(photograph.name, {}))
-        if "folder" in named and _is_elsewhere(photograph, self.file.parent / str(named["folder"])):
+        if "folder" in named and _is_elsewhere(photograph, self.folder / str(named["folder"])):
             return {}
         return named
 

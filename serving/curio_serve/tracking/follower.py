@@ -259,7 +259,11 @@ class Follower:
                 pose.rotation if raw is None else raw.rotation,
                 track.confidence(now_s, keep_s),
             )
-            detection.on_plane = raw is not None and raw.on_plane
+            if raw is not None:
+                detection.on_plane = raw.on_plane
+                detection.color.extend(raw.color)
+                if raw.presence is not None:
+                    detection.presence = raw.presence
             frame.describe(detection.track, track)
             if raw is None and detection.status == DETECTION_STATUS_SURE:  # this frame does not show it
                 detection.status = DETECTION_STATUS_UNSURE

@@ -1,7 +1,7 @@
 """One frame of a stream: runs the model on it, whole or with objects covered, and fills its answer."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -73,7 +73,9 @@ class StreamFrame:
             kind = kinds[detection.object]
             rotation = np.reshape(detection.rotation, (3, 3)) if detection.rotation else np.eye(3)
             middle_m = middle_from_origin(np.array(detection.translation_m), rotation, center_of(kind))
-            found.append(Measurement.of_whole_frame(kind, middle_m, rotation, detection.confidence))
+            measured = Measurement.of_whole_frame(kind, middle_m, rotation, detection.confidence)
+            presence = detection.presence if detection.HasField("presence") else None
+            found.append(replace(measured, presence=presence, color=tuple(detection.color)))
         return found, result.light
 
     def read(self, position_m: Array) -> CropPose | None:

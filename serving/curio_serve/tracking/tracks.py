@@ -39,6 +39,10 @@ class Measurement:
     """About each axis, rad²."""
     on_plane: bool = False
     """Whether the object was moved to stand on a plane."""
+    presence: float | None = None
+    """Probability that the object is in the frame, where the whole model says it."""
+    color: tuple[float, ...] = ()
+    """sRGB albedo in [0, 1], where the whole model says it."""
 
     @staticmethod
     def of_whole_frame(kind: ObjectModel, translation_m: Array, rotation: Array, confidence: float) -> "Measurement":

@@ -1,6 +1,7 @@
 """Planes on which objects stand: what is given, what is found, and how far away an object is that stands on one."""
 
 import json
+import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from curio_serve.batch.cluster import for_other_nodes
+from curio_serve.batch.images.source_image import SourceImage
 from curio_serve.errors import ArgumentError, CameraError, ModelError
 from curio_serve.planes.camera_poses import CameraPoseFile, plane_of
 from curio_serve.planes.plane import FIND_PLANE, Plane
@@ -191,6 +194,21 @@ def test_a_photograph_of_the_same_name_in_another_folder_is_not_taken_for_it(tmp
         CameraPoseFile.read(tmp_path / "views.json").plane(tmp_path / "a.png")
     with pytest.raises(CameraError, match="expected 4x4"):
         CameraPoseFile.read(tmp_path / "views.json").refuse_impossible_planes()
+
+
+def test_photographs_are_found_from_another_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on another node of a cluster."""
+    for folder in ("left", "right"):
+        (tmp_path / folder).mkdir()
+    pose = {"cam_from_world": np.eye(4).tolist()}
+    (tmp_path / "views.json").write_text(json.dumps({"a.png": {**pose, "folder": "left"}, "right/b.png": pose}))
+    monkeypatch.chdir(tmp_path)
+    images = [for_other_nodes(SourceImage(name, name)) for name in ("left/a.png", "right/a.png", "right/b.png")]
+    sent = pickle.dumps(CameraPoseFile.read(Path("views.json")))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    there = pickle.loads(sent)
+    assert [there.is_known(Path(image.place)) for image in images] == [True, False, True]
 
 
 OF_BRICK = {"object": "brick", "hull_m": CORNERS_M.ravel().tolist(), "up": SIDES.ravel().tolist()}

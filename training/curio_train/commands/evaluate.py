@@ -27,7 +27,8 @@ class EvaluateCommand:
     split: Literal["train", "validation", "test"] = "test"
     """Which images of the world."""
     num_images: int | None = None
-    """How many images; unless given, 100 of linemod and of capture, which are rendered for it, and 500 of others."""
+    """How many images; unless given, 100 of linemod and of capture without --plane, which are rendered for it,
+    and 500 of others."""
     data: Path | None = None
     """BOP data set whose real frames are scored as well; needed for an exported LineMOD model."""
     download: FlagCreatePairsOff[bool] = False

@@ -130,10 +130,8 @@ def _measure(command: ExportCommand, folder: Path, views: "UnlabelledPhotographs
 
     world = load_subject(command.run, command.data).world
     predict = model_reader(ExportedModel.open(find_model(folder)), world)
-    with Console(stderr=True).status("reading photographs") as status:
-        pairs = None if views is None else photographed_pairs(world, predict, views)
-        cache = command.cache.expanduser()
-        answers = held_out_answers(world, predict, "validation", NUM_IMAGES, cache, status.update)
+    pairs = None if views is None else photographed_pairs(world, predict, views)
+    answers = held_out_answers(world, predict, "validation", NUM_IMAGES, command.cache.expanduser())
     on_renderings, target = fit_reliability(answers), ModelFolder(folder)
     found = on_renderings if views is None else adjusted(on_renderings, answers, pairs or (), len(views.paths))
     text = json_format.MessageToJson(found, preserving_proto_field_name=True) + "\n"

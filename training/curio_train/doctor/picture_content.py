@@ -103,7 +103,7 @@ _TOLERATED = 0.1  # fraction of photographs
 _EQUAL_LEVELS = 4.0  # two frames of one static scene differ by more somewhere, if anything moved
 _COMPARED = 60  # neighbours in brightness that each is compared with
 MOSTLY_LOST = 0.6
-_TWELVE_OF_SIXTEEN_BITS = 15  # of 255: the brightest that 12 bits can be where 16 are read
+_TWELVE_OF_SIXTEEN_BITS = 16  # of 255: the brightest that 12 bits can be where 16 are read
 _BETTER_SWAPPED = 0.6
 
 

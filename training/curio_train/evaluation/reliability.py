@@ -1,6 +1,6 @@
 """Measures how far a model's answers may be trusted, on renderings: when they are sure, and how far off they are."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import torch
 from curio_proto.v1.model_spec_pb2 import ObjectReliability, Reliability
 from curio_serve.models.reliability import bounds_of
 
+from curio_train.counting import counted
 from curio_train.errors import ExportError, UsageError
 from curio_train.evaluation.scores import rotation_errors_deg
 from curio_train.evaluation.subject import Predict
@@ -61,7 +62,6 @@ def held_out_answers(
     split: Split,
     num_images: int,
     cache: Path,
-    progress: Callable[[str], None] = lambda text: None,
 ) -> list[Answers]:
     """A model's answers on renderings as cameras see them, and without the object, one for each object.
 
@@ -71,7 +71,6 @@ def held_out_answers(
         split: Which renderings; none of those that the confidence was calibrated with.
         num_images: How many, and as many backgrounds where renderings always show the objects.
         cache: Of backgrounds.
-        progress: Told what is being done.
 
     Raises:
         UsageError: The world is flat, has several slots an object, no confidence, or no backgrounds.
@@ -85,8 +84,7 @@ def held_out_answers(
     steps = -(-num_images // _BATCH_SIZE)
     seen: list[list[tuple[float, Pose, Pose]]] = [[] for _ in world.objects]
     without: list[list[float]] = [[] for _ in world.objects]
-    for step in range(steps):
-        progress(f"{step * _BATCH_SIZE} of {num_images} renderings of the {split} split")
+    for step in counted(range(steps), steps, "measuring on renderings, batches"):
         batch = source.batch(step, _BATCH_SIZE)
         assert batch.code is not None
         if bool((batch.code[CONFIDENCE] > 0).all()):  # else the renderings themselves are frames without

@@ -167,21 +167,23 @@ class ModelFolder:
         before = _text(self.path / SUMS_FILE).splitlines()
         others = [line for line in before if f"  {target.name}/" not in line]
         sums = "".join(f"{line}\n" for line in others) + _sums(target.name, files)
-        title, _, earlier = _text(self.path / _CARD).partition("\n\n")
+        card_before = _text(self.path / _CARD)
+        title, _, earlier = card_before.partition("\n\n")
         if not (self.path / CONFIG_FILE).exists():
             write_whole(self.path / CONFIG_FILE, config)
         if target.exists():
             raise ExportError(f"cannot write {target}: another export has just written it; export again")
         has_sums = (self.path / SUMS_FILE).exists()  # without them, those of one version would exclude the others
-        if has_sums:
-            write_whole(self.path / SUMS_FILE, sums)
         try:
+            if has_sums:
+                write_whole(self.path / SUMS_FILE, sums)
+            write_whole(self.path / _CARD, f"{title or _title(self.path.name)}\n\n{card}\n{earlier}")
             draft.rename(target)
         except OSError:
             if has_sums:
                 write_whole(self.path / SUMS_FILE, "".join(f"{line}\n" for line in before))
+            write_whole(self.path / _CARD, card_before)
             raise
-        write_whole(self.path / _CARD, f"{title or _title(self.path.name)}\n\n{card}\n{earlier}")
 
 
 def triton_config(name: str, image: Sequence[int], outputs: Mapping[str, Sequence[int]]) -> str:

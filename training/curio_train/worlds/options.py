@@ -186,7 +186,8 @@ class CaptureOptions(WorldOptions):
     """Folder of photographs for backgrounds, if the scene changes; without it and --background clutter is rendered."""
     paint: str | None = None
     """Colour of a part whose mesh has none, sRGB, such as '#8a6f4c'. Unless given, it is estimated where the
-    photographs differ from --background; if it cannot be, the part is learned in any colour."""
+    photographs differ from --background; if it cannot be, the part is learned in any colour, and several parts and
+    --method templates in grey."""
     near_m: float = 0.3
     """Smallest distance of the part's middle along the optical axis, metres."""
     far_m: float = 1.0

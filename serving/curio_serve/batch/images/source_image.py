@@ -96,6 +96,11 @@ class SourceImage:
         return os.path.dirname(self.path) if self.video_frame is None and self.recorded is None else self.path
 
     @property
+    def place(self) -> str:
+        """Where an image file lies, whatever the working folder is; of a video's or recording's image its name."""
+        return self.path if self.video_frame is None and self.recorded is None else self.name
+
+    @property
     def numbered_name(self) -> str:
         """A path whose last number is that of the image; the query of a URL has numbers of its own."""
         return place_and_query(self.path)[0] if is_url(self.path) else self.relative_name

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
@@ -12,7 +13,7 @@ from curio_proto.v1.detector_pb2 import Detection
 from curio_proto.v1.model_spec_pb2 import ObjectModel
 
 from curio_serve.batch.results.formats import ImageLines, ImageResult
-from curio_serve.batch.results.result_file import NamedT
+from curio_serve.batch.results.result_file import NamedT, open_locked
 from curio_serve.errors import OutputError, UsageError
 from curio_serve.files import direct
 
@@ -90,7 +91,7 @@ class PoseRecording:
 
     Raises:
         UsageError: There is one.
-        OutputError: It cannot be opened for writing.
+        OutputError: It cannot be opened for writing, or another process writes it.
     """
 
     num_images: int
@@ -99,20 +100,15 @@ class PoseRecording:
     """Images that a model or more gave no answer for. The recording has no message where none did."""
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
-        from mcap_ros2.writer import Writer
-
         self.num_images = self.num_errors = 0
         self.label = str(path)
-        path = direct(path)
-        if path.exists() and not overwrite:
+        self._path = direct(path)
+        self._is_new = not self._path.exists()
+        if not self._is_new and not overwrite:
             raise UsageError(f"--out {path} exists, and a recording cannot be gone on with; --overwrite replaces it")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file: IO[bytes] = path.open("wb")
-        except OSError as exc:
-            raise OutputError(f"--out {path}: cannot be opened for writing: {exc.strerror}") from exc
-        self._writer = Writer(self._file)
-        self._schema: Any = self._writer.register_msgdef(_TYPE, SCHEMA)
+        self._file: IO[bytes] = os.fdopen(open_locked(path), "ab")
+        self._writer: Any = None  # until there is an image: an earlier recording is worth more than none
+        self._schema: Any = None
 
     def __enter__(self) -> Self:
         return self
@@ -120,6 +116,10 @@ class PoseRecording:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         """Close the recording, which is readable even after an early stop."""
         with self._file:
+            if self._writer is None:
+                if self._is_new:
+                    self._path.unlink()
+                return
             try:
                 self._writer.finish()
                 self._file.flush()
@@ -127,8 +127,16 @@ class PoseRecording:
                 raise OutputError(self._not_written(exc)) from exc
 
     def unanswered(self, images: Iterator[NamedT]) -> Iterator[NamedT]:
-        """All of the images."""
-        return images
+        """All of the images; what was in the file is gone once there is a first one."""
+        from mcap_ros2.writer import Writer
+
+        first = next(images, None)
+        if first is None:
+            return images
+        self._file.truncate(0)
+        self._writer = Writer(self._file)
+        self._schema = self._writer.register_msgdef(_TYPE, SCHEMA)
+        return chain((first,), images)
 
     def write(self, lines: ImageLines) -> None:
         """Append the message of one image.

@@ -69,7 +69,7 @@ class ResultFile:
         self._form = form
         self._models = tuple(models)
         self._camera_of = camera_of
-        self._descriptor = os.dup(1) if path is None else _open_locked(path)
+        self._descriptor = os.dup(1) if path is None else open_locked(path)
         self._is_regular = path is not None and stat.S_ISREG(os.fstat(self._descriptor).st_mode)
         self._overwrites = self._is_regular and overwrite
 
@@ -169,7 +169,7 @@ class ResultFile:
     def _parse(self, line: bytes, number: int) -> Line:
         try:
             record = self._form.parse(line)
-        except (ValueError, StopIteration) as exc:
+        except (ValueError, StopIteration, RecursionError) as exc:
             raise self._mismatch(number, f"what this format does not write ({exc})") from exc
         if record.model is not None and record.model not in self._models:
             raise self._mismatch(number, f"results of model {_label([record.model])}; this is {_label(self._models)}")
@@ -245,8 +245,12 @@ def _label(models: Sequence[tuple[str, int]]) -> str:
     return ", ".join(f"{name} version {version}" for name, version in models)
 
 
-def _open_locked(path: Path) -> int:
-    """Open a file for reading and appending, and lock it against our other processes."""
+def open_locked(path: Path) -> int:
+    """Open a file for reading and appending, and lock it against our other processes.
+
+    Raises:
+        OutputError: It cannot be opened, or another process writes it.
+    """
     try:
         path = direct(path)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -75,11 +75,11 @@ def build_tabletop(options: CaptureOptions) -> TabletopWorld:
     _refuse_invisible(setup, max(part.kind.diameter_m for part in parts), options.plane)
     highest_m = max(part.radius_m for part in parts) if options.lying else 0.0
     photographs = _photographs(options, options.background, cameras, intrinsics, setup, highest_m)
-    _refuse_crowded(parts, photographs.position, options)
+    _refuse_crowded(parts, photographs.position)
     return TabletopWorld(parts, setup, photographs, lying=options.lying, blur_px=options.blur_px)
 
 
-def _refuse_crowded(parts: Sequence[Part], position: Field, options: CaptureOptions) -> None:
+def _refuse_crowded(parts: Sequence[Part], position: Field) -> None:
     """So many that each scene takes long to draw, and no photograph shows them."""
     radii = np.repeat([part.radius_m for part in parts], [part.max_count for part in parts])
     sides = (np.asarray(position.upper) - np.asarray(position.lower))[[0, 2]] + 2 * radii.mean()
