@@ -1,8 +1,11 @@
 """Messages are counted before they are parsed: a few bytes on the wire may unfold to gigabytes."""
 
+import tracemalloc
+
 import pytest
 from curio_proto.inference.inference_pb2 import ModelInferRequest
 from curio_proto.v1.detector_pb2 import Camera, DetectRequest, ModelSelector, Region
+from curio_serve.api.messages import camera_from_message
 from curio_serve.api.wire_limits import MAX_FIELDS, MAX_NUMBERS, check_counts
 from curio_serve.errors import ArgumentError
 from google.protobuf.message import Message
@@ -51,3 +54,16 @@ def test_what_clients_send_passes() -> None:
 @pytest.mark.parametrize("data", [b"\xff" * 50, b"\x0a\xff\xff\xff\xff\x0f", b"\x12", b"\x07\x07", b"\x12\x05\x0a"])
 def test_what_is_no_message_is_left_to_the_parser(data: bytes) -> None:
     check_counts(DetectRequest.DESCRIPTOR, data)
+
+
+def test_what_a_message_holds_beside_a_camera_is_not_kept() -> None:
+    """Cameras of requests are remembered; fields of later versions may be of any size."""
+    camera = Camera(camera_matrix=[500, 0, 320, 0, 500, 240, 0, 0, 1], width=640, height=480).SerializeToString()
+    tracemalloc.start()
+    for number in range(20):
+        unknown = b"\x82\x7d" + b"\x80\x80\x40" + bytes([number]) * (1 << 20)  # field 2000, 1 MiB
+        camera_from_message(Camera.FromString(camera + unknown))
+        del unknown
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert kept < 1 << 20

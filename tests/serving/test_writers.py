@@ -13,6 +13,8 @@ from curio_serve.batch.results.formats import Bop, Csv, ImageResult, JsonLines
 from curio_serve.batch.results.recorded_poses import Detection3DArrays, PoseRecording
 from curio_serve.bop import bop_object_ids
 from curio_serve.errors import OutputError, UsageError
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 QUARTER_TURN = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 
@@ -201,15 +203,21 @@ def test_a_recording_keeps_what_one_model_found_where_another_fails() -> None:
 
 def test_an_earlier_recording_stays_until_there_is_an_image(tmp_path: Path) -> None:
     earlier, new = tmp_path / "earlier.mcap", tmp_path / "new.mcap"
-    earlier.write_bytes(b"of an earlier run")
+    earlier.write_bytes(content := b"of an earlier run" * 1000)
     for path in (earlier, new):
         with PoseRecording(path, overwrite=True) as first:
             with pytest.raises(OutputError, match="another process is writing it"):
                 PoseRecording(path, overwrite=True)
             assert list(first.unanswered(iter(()))) == []
-    assert earlier.read_bytes() == b"of an earlier run"
+    assert earlier.read_bytes() == content
     assert not new.exists()
+    at = RecordedAt("/arm/image_raw", 10**9, 10**9, "arm_optical")
     with PoseRecording(earlier, overwrite=True) as second:
-        (image,) = second.unanswered(iter([SourceImage("a", "a")]))
-    assert image.name == "a"
-    assert earlier.read_bytes().startswith(b"\x89MCAP")
+        (image,) = second.unanswered(iter([SourceImage("a", "a", recorded=at)]))
+        second.write(Detection3DArrays([ObjectModel(name="ape")]).lines([answer(image.name, detection(), recorded=at)]))
+    with earlier.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        assert reader.get_summary().statistics.message_count == 1
+        ((_, channel, _, message),) = reader.iter_decoded_messages()
+    assert channel.topic == "/arm/detections"
+    assert message.detections[0].results[0].hypothesis.class_id == "ape"

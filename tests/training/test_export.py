@@ -293,6 +293,14 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert folder.versions() == [1]
     assert {path: path.read_bytes() for path in folder.files()} == before
+    (folder.path / "CARD.md").unlink()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(ExportError, match="File too large"):
+            folder.add(2, {"model.onnx": b"small"}, "config", "card\n" * 300_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "CARD.md" not in [path.name for path in folder.files()]
 
 
 class _Everything(Circles):

@@ -74,7 +74,7 @@ class InferenceService(GRPCInferenceServiceServicer):
 
     def _metadata(self, request: messages.ModelMetadataRequest) -> messages.ModelMetadataResponse:
         model = self._repository.get(request.name, _version(request.version))
-        loaded = next(loaded for name, loaded in self._repository if name == model.name)
+        loaded = dict(self._repository).get(model.name, {model.version: model})  # which may just have been removed
         answer = messages.ModelMetadataResponse(
             name=model.name, versions=[str(v) for v in sorted(loaded)], platform="onnxruntime_onnx"
         )

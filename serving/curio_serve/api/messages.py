@@ -1,5 +1,6 @@
 """Translates protobuf messages into the detector's arguments."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -23,20 +24,18 @@ def camera_from_message(message: CameraMessage) -> PinholeCamera:
     Raises:
         CameraError: Not nine values, one side of the frame's size without the other, or an impossible camera.
     """
-    return _camera(message.SerializeToString())
-
-
-@lru_cache(256)
-def _camera(data: bytes) -> PinholeCamera:
-    """One camera sends many frames, so its intrinsics are read and checked once."""
-    message = CameraMessage.FromString(data)
-    values = message.camera_matrix
-    if len(values) != 9:
-        raise CameraError(f"camera.camera_matrix has {len(values)} values; expected 9: K row after row")
+    if len(message.camera_matrix) != 9:
+        raise CameraError(f"camera.camera_matrix has {len(message.camera_matrix)} values; expected 9: K row after row")
     size = message.width, message.height
     if any(size) and not all(size):
         raise CameraError(f"camera.width and camera.height are {size[0]} and {size[1]}; expected both, or neither")
-    return PinholeCamera(np.reshape(values, (3, 3)), tuple(message.distortion), size if all(size) else None)
+    return _camera(tuple(message.camera_matrix), tuple(message.distortion), size if all(size) else None)
+
+
+@lru_cache(256)
+def _camera(matrix: Sequence[float], distortion: tuple[float, ...], size: tuple[int, int] | None) -> PinholeCamera:
+    """One camera sends many frames, so its intrinsics are checked once."""
+    return PinholeCamera(np.reshape(matrix, (3, 3)), distortion, size)
 
 
 def plane_from_message(message: PlaneMessage) -> AnyPlane:

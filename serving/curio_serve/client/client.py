@@ -101,7 +101,6 @@ class _Client:
             raise UsageError("the client is closed; make a new one")
 
     def _attempts(self, timeout_s: float | None) -> Attempts:
-        self._refuse_closed()
         return Attempts(self.address, self._timeout_s if timeout_s is None else timeout_s, self._max_attempts)
 
 
@@ -208,6 +207,7 @@ class PoseClient(_Client):
     def _call(self, method: Any, request: Any, timeout_s: float | None) -> Any:
         attempts = self._attempts(timeout_s)
         while True:
+            self._refuse_closed()
             try:
                 return method(request, timeout=attempts.remaining_s, metadata=self._metadata)
             except grpc.RpcError as exc:
@@ -286,6 +286,7 @@ class AsyncPoseClient(_Client):
     async def _call(self, method: Any, request: Any, timeout_s: float | None) -> Any:
         attempts = self._attempts(timeout_s)
         while True:
+            self._refuse_closed()
             try:
                 return await method(request, timeout=attempts.remaining_s, metadata=self._metadata)
             except grpc.RpcError as exc:

@@ -128,9 +128,14 @@ def views_request(
         request_id=request_id,
     )
     request.ClearField("encoded")
-    for image, camera, cam_from_rig in views:
+    for number, of_camera in enumerate(views):
+        try:
+            image, camera, cam_from_rig = of_camera
+            rows = np.asarray(cam_from_rig, float).ravel()
+        except (TypeError, ValueError) as exc:
+            raise ArgumentError(f"views[{number}]: expected (image, camera, cam_from_rig as [4, 4]); {exc}") from exc
         one = detect_request(model, image, camera, color=color)
-        view = request.views.add(cam_from_rig=np.asarray(cam_from_rig, float).ravel())
+        view = request.views.add(cam_from_rig=rows)
         if one.HasField("raw"):
             view.raw.CopyFrom(one.raw)
         else:
@@ -151,7 +156,10 @@ def selector(model: str) -> messages.ModelSelector:
     name, slash, version = model.partition("/")
     if slash and not _VERSION.fullmatch(version):
         raise ArgumentError(f"model {model!r}: expected name or name/version with a version from 1 to 999999999")
-    return messages.ModelSelector(name=name, version=int(version or 0))
+    try:
+        return messages.ModelSelector(name=name, version=int(version or 0))
+    except ValueError as exc:  # of a file's name that is no UTF-8
+        raise ArgumentError(f"model {model!r}: expected a name in UTF-8") from exc
 
 
 def _plane(plane: AnyPlane | None) -> messages.Plane | None:

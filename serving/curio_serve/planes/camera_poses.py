@@ -5,7 +5,7 @@ The world's frame: y up, the plane at y = 0, metres.
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeAlias
 
@@ -35,17 +35,21 @@ class CameraPoseFile:
 
     file: Path
     """Path of the file, as it was given."""
-    folder: Path
-    """The file's folder, absolute: another process may have another working folder."""
     entries: Mapping[str, Any]
     """What the file says of each photograph, by its name."""
     flag: str = "--plane"
     """The flag that named the file."""
     of_all: Mapping[str, Any] | None = None
     """What it says of all photographs; None: of each that it names."""
+    folder: Path = field(init=False)
+    """The file's folder, absolute: another process may have another working folder."""
 
     error: ClassVar[type[Exception]] = CameraError
     """What is raised."""
+
+    def __post_init__(self) -> None:
+        """Remember where the file is."""
+        object.__setattr__(self, "folder", self.file.parent.absolute())
 
     @classmethod
     def read(cls, file: Path, flag: str = "--plane") -> Self:
@@ -61,10 +65,10 @@ class CameraPoseFile:
         except ValueError as exc:
             raise cls.error(f"{flag} {file}: not JSON ({exc})") from exc
         if isinstance(entries, dict) and _POSE in entries:
-            return cls(file, file.parent.absolute(), {}, flag, entries)
+            return cls(file, {}, flag, entries)
         if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
             raise cls.error(f"{flag} {file}: expected an object of photographs, each with its cam_from_world")
-        return cls(file, file.parent.absolute(), entries, flag)
+        return cls(file, entries, flag)
 
     @classmethod
     def named(cls, given: str | None) -> "GivenPlane":

@@ -182,7 +182,10 @@ class ModelFolder:
         except OSError:
             if has_sums:
                 write_whole(self.path / SUMS_FILE, "".join(f"{line}\n" for line in before))
-            write_whole(self.path / _CARD, card_before)
+            if card_before:
+                write_whole(self.path / _CARD, card_before)
+            else:
+                (self.path / _CARD).unlink(missing_ok=True)
             raise
 
 

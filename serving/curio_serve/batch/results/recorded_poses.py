@@ -115,11 +115,12 @@ class PoseRecording:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         """Close the recording, which is readable even after an early stop."""
+        if self._writer is None:
+            self._file.close()
+            if self._is_new:
+                self._path.unlink()
+            return
         with self._file:
-            if self._writer is None:
-                if self._is_new:
-                    self._path.unlink()
-                return
             try:
                 self._writer.finish()
                 self._file.flush()
@@ -134,6 +135,7 @@ class PoseRecording:
         if first is None:
             return images
         self._file.truncate(0)
+        self._file.seek(0)  # from where the writer counts
         self._writer = Writer(self._file)
         self._schema = self._writer.register_msgdef(_TYPE, SCHEMA)
         return chain((first,), images)
