@@ -4,7 +4,7 @@
 
 Every second frame of the data set's scene is learned from and the others are scored, then the halves are swapped. Both
 runs begin with a network that has seen no frame (a run of `curio-train linemod --class all`, or models/lmo/2 of commit
-10c6bff; models/lmo/7 has seen them), and no label of a frame is opened in training. A call goes on with what is there.
+10c6bff; models/lmo/8 has seen them), and no label of a frame is opened in training. A call goes on with what is there.
 The last line, also in OUT/halves.json, is the mean of both halves: by one read and by nine, of the runs and of what
 ``curio-export --fast --int8`` makes of them; as served, after render-and-compare, and with ``--plane objects``.
 """

@@ -1,6 +1,12 @@
 import numpy as np
 import pytest
-from curio_train.metrics.calibration import auroc, calibration_error, fit_calibration, reliability_bins
+from curio_train.metrics.calibration import (
+    auroc,
+    calibration_error,
+    fit_calibration,
+    fit_calibration_below_ceiling,
+    reliability_bins,
+)
 
 
 def test_a_confidence_that_is_right_as_often_as_it_says_has_no_error() -> None:
@@ -70,3 +76,23 @@ def test_reliability_counts_every_prediction_once() -> None:
     assert [(b["from"], b["to"], b["count"]) for b in bins] == [(0.0, 0.1, 2), (0.5, 0.6, 2), (0.9, 1.0, 1)]
     assert [b["correct"] for b in bins] == [0.5, 1.0, 1.0]
     assert [b["confidence"] for b in bins] == pytest.approx([0.025, 0.55, 1.0])
+
+
+def test_the_surest_predictions_can_be_right_in_a_part_of_the_cases() -> None:
+    random = np.random.default_rng(3)
+    logit = random.normal(size=3000) * 3
+    probability = 0.6 / (1 + np.exp(-2 * logit - 1))
+    right = random.random(3000) < probability
+    (slope, offset), ceiling = fit_calibration_below_ceiling(logit[:, None], right.tolist())
+    assert ceiling == pytest.approx(0.6, abs=0.05)
+    assert (slope, offset) == pytest.approx((2, 1), abs=0.5)
+    found = ceiling / (1 + np.exp(-slope * logit - offset))
+    slope, offset = fit_calibration(logit[:, None], right.tolist())
+    assert calibration_error(found.tolist(), right.tolist()) < 0.03
+    assert calibration_error((1 / (1 + np.exp(-slope * logit - offset))).tolist(), right.tolist()) > 0.05
+
+
+def test_few_predictions_tell_no_ceiling() -> None:
+    weights, ceiling = fit_calibration_below_ceiling([[0.0], [0.4], [13.0]], [True] * 3)
+    assert np.isfinite(weights).all()
+    assert ceiling > 0.9

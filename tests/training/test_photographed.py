@@ -215,8 +215,12 @@ def test_confidence_is_calibrated_by_photographs_that_agree_and_templates_stay(w
     calibrate_by(network, Evidence(features, right & shown, shown))
     weights = network.reader.pose_correct.numpy()
     logits = (features * weights[:, :3]).sum(axis=2) + weights[:, 3]
-    assert ((logits > 0) == right).mean() > 0.85
-    assert abs((1 / (1 + np.exp(-logits))).mean() - right.mean()) < 0.05, "what is not known is not taken as wrong"
+    probability = network.reader.ceiling.numpy() / (1 + np.exp(-logits))
+    assert ((probability > 0.5) == right).mean() > 0.85
+    assert abs(probability.mean() - right.mean()) < 0.05, "what is not known is not taken as wrong"
+    right[:45], features[:45] = random.random((45, 2)) < 0.6, features[:45] + 5
+    calibrate_by(network, Evidence(features, right & shown, shown))
+    assert network.reader.ceiling.numpy() == pytest.approx(0.7, abs=0.15), "not all poses that look best are right"
 
 
 @pytest.mark.parametrize("by_heat_map", [False, True])

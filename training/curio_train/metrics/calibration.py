@@ -8,6 +8,7 @@ from scipy.optimize import minimize
 
 NUM_BINS = 10
 _REGULARISATION = 1e-4
+_CEILING_LOGIT, _HIGHEST_CEILING_LOGIT = 3.0, 8.0  # where nothing tells one: 0.95; and one that is none
 _PAIR_REGULARISATION = 1e-3  # towards the confidence as it is: pairs say less than truth does
 _LEAST_WEIGHT = 0.1  # surer answers stay surer
 
@@ -81,6 +82,36 @@ def fit_calibration(features: ArrayLike, correct: Sequence[bool]) -> list[float]
     bounds = [(0.0, None)] * (len(start) - 1) + [(None, None)]
     weights: list[float] = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x.tolist()
     return weights
+
+
+def fit_calibration_below_ceiling(features: ArrayLike, correct: Sequence[bool]) -> tuple[list[float], float]:
+    """Logistic regression whose probability ends below 1 (Barton and Lord 1981, upper asymptote).
+
+    Some predictions are wrong for reasons that no feature shows, so that the surest are right in a part of the cases
+    alone. Of a mere logistic regression they would get 1.
+
+    Args:
+        features: As of :func:`fit_calibration`.
+        correct: Whether each prediction was.
+
+    Returns:
+        The weights as of :func:`fit_calibration`, and the ceiling by which the sigmoid is multiplied.
+    """
+    found, hits = np.asarray(features, dtype=np.float64), np.asarray(correct, dtype=np.float64)
+    start = np.array([*fit_calibration(found, correct), _CEILING_LOGIT])
+    usual = np.zeros(len(start))
+    usual[0], usual[-1] = 1, _CEILING_LOGIT
+    found = np.concatenate([found, np.ones((len(found), 1))], axis=1)
+
+    def loss(weights: np.ndarray) -> float:
+        right = -np.logaddexp(0, -found @ weights[:-1]) - np.logaddexp(0, -weights[-1])  # log of the probability
+        right = np.minimum(right, -1e-9)
+        likelihood = hits * right + (1 - hits) * np.log(-np.expm1(right))
+        return float(_REGULARISATION * np.square(weights - usual).sum() - likelihood.mean())
+
+    bounds = [(0.0, None)] * (len(start) - 2) + [(None, None), (None, _HIGHEST_CEILING_LOGIT)]
+    *weights, ceiling = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x.tolist()
+    return weights, float(1 / (1 + np.exp(-ceiling)))
 
 
 def fit_pair_calibration(logits: ArrayLike, agree: Sequence[bool]) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from curio_train.counting import counted
 from curio_train.data.photographs import read_frames, spread
 from curio_train.geometry import Pose
-from curio_train.metrics.calibration import fit_calibration
+from curio_train.metrics.calibration import fit_calibration, fit_calibration_below_ceiling
 from curio_train.metrics.poses import ADD_THRESHOLD, add_or_add_s_m
 from curio_train.networks.several_objects.network import ObjectsNetwork
 from curio_train.networks.two_stage.network import TwoStageNetwork
@@ -74,7 +74,8 @@ def calibrate_by(network: ObjectsNetwork, evidence: Evidence) -> None:
 
     All objects are calibrated together: some dozens of reads of each, some of whose labels are wrong, tell less about
     an object than the others do (docs/experiments/real_photographs.md). Objects that are not known to be
-    there are left out: that is what presence tells.
+    there are left out: that is what presence tells. Poses that look as good as any can be at a wrong distance, which
+    no feature shows: so confidence has a ceiling.
 
     Args:
         network: Calibrated on renderings.
@@ -82,8 +83,9 @@ def calibrate_by(network: ObjectsNetwork, evidence: Evidence) -> None:
     """
     hits = evidence.correct[evidence.shown]
     if min(hits.sum(), (~hits).sum()) >= _FEWEST:
-        weights = fit_calibration(evidence.features[evidence.shown], hits.tolist())
+        weights, ceiling = fit_calibration_below_ceiling(evidence.features[evidence.shown], hits.tolist())
         network.reader.pose_correct[:] = torch.tensor(weights).float()
+        network.reader.ceiling.fill_(ceiling)
 
 
 @torch.no_grad()

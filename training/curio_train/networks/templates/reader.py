@@ -109,6 +109,8 @@ class PoseReader(nn.Module):
     """May be changed at any time; the confidence is calibrated for what it was then."""
     pose_correct: Tensor
     """Weights of the pose-correct logit's features and its offset, [objects, 4]; calibrated on renderings."""
+    ceiling: Tensor
+    """How often the poses that look best are correct, [objects]; 1 unless photographs tell."""
     presence: Tensor
     """Weights of the presence logit's features and its offset, [objects, 3]; calibrated on renderings."""
     presence_power: Tensor
@@ -119,16 +121,13 @@ class PoseReader(nn.Module):
     _lamp: Tensor
 
     def __init__(self, geometries: Sequence[Geometry]) -> None:
-        """Build for objects in frames of one camera; all templates are still empty.
-
-        Args:
-            geometries: One an object.
-        """
+        """Build for objects of these geometries in frames of one camera; all templates are still empty."""
         super().__init__()
         num, self.effort = len(geometries), Effort()
         self._any_side = geometries[0].any_side
         self.banks = Banks(num, self._any_side)
         self.register_buffer("pose_correct", torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1))
+        self.register_buffer("ceiling", torch.ones(num))
         self.register_buffer("presence", torch.tensor([1.0, 0.0, 0.0]).repeat(num, 1))
         self.register_buffer("presence_power", torch.ones(num))
         for name, values in {
@@ -142,10 +141,10 @@ class PoseReader(nn.Module):
     def forward(self, trunk: Trunk, images: Float[Tensor, "batch 3 height width"], places: Places) -> dict[str, Tensor]:
         """In the frame's camera: metres, 6D rotation, confidence, presence [batch, objects, …]; light [batch, 3]."""
         code, features = self.read(trunk, images, places)
-        calibration = (self.pose_correct, self.presence, self.presence_power)
-        right, there, power = (of_all.index_select(0, places.slots) for of_all in calibration)
+        calibration = (self.pose_correct, self.ceiling, self.presence, self.presence_power)
+        right, ceiling, there, power = (of_all.index_select(0, places.slots) for of_all in calibration)
         presence = _probability(features.there, there)
-        confidence = presence**power * _probability(features.right, right)
+        confidence = presence**power * ceiling * _probability(features.right, right)
         return code | {CONFIDENCE: confidence[..., None], PRESENCE: presence[..., None]}
 
     def read(

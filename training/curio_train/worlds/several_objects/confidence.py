@@ -54,6 +54,7 @@ def calibrate(network: ObjectsNetwork, world: ObjectScenes, cache: Path, *, by_h
         correct.append(_correct(world, code, batch.code))
     right, there = (torch.cat(parts).numpy() for parts in zip(*features, strict=True))
     shown, hit = torch.cat(present).numpy(), np.concatenate(correct)
+    network.reader.ceiling.fill_(1)
     for number in range(len(world.members)):
         seen = shown[:, number]
         network.reader.pose_correct[number] = _fit(right[seen, number], hit[seen, number])
