@@ -255,10 +255,8 @@ def test_cameras_that_never_agree_are_told(
         folder.mkdir()
         for frame in range(10):
             cv2.imwrite(str(folder / f"{frame}.png"), _image(spot_image, pose)[..., ::-1])
-    rig, out = (
-        _write_rig(tmp_path / "rig.json", [side if is_right else np.linalg.inv(side), np.eye(4)]),
-        tmp_path / "out",
-    )
+    out, first = tmp_path / "out", side if is_right else np.linalg.inv(side)
+    rig = _write_rig(tmp_path / "rig.json", [first, np.eye(4)])
     call = DetectArguments(str(models_dir / "pinhole"), tuple(map(str, folders)), rig=rig, out=str(out))
     run(call)
     told = "in none of 10 instants do two cameras agree on a pose: are their cam_from_rig"

@@ -1,6 +1,9 @@
 """Run folders for what comes after training, and a two-stage network at a brick."""
 
+import resource
+import signal
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import cv2
@@ -90,6 +93,25 @@ def circles_models(tmp_path_factory: pytest.TempPathFactory, circles_run: Path) 
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Image sets that many tests read and none changes; the first draws them, which takes ten seconds."""
     return tmp_path_factory.mktemp("cache")
+
+
+@contextmanager
+def _largest_file(num_bytes: int) -> Iterator[None]:
+    """A disk with room for so much: beyond it every write fails, as on a full one."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+
+
+@pytest.fixture
+def largest_file() -> Callable[[int], AbstractContextManager[None]]:
+    """``with largest_file(num_bytes):`` a disk with room for so much in a file."""
+    return _largest_file
 
 
 @pytest.fixture

@@ -2,11 +2,10 @@
 
 import json
 import os
-import resource
 import shutil
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +26,8 @@ from curio_train.worlds.options import CirclesOptions, LinemodOptions
 from torch import Tensor
 
 pytestmark = pytest.mark.usefixtures("one_thread", "small_image_sets")
+
+LargestFile = Callable[[int], AbstractContextManager[None]]
 
 CONFIG = RunConfig(
     CirclesOptions(),
@@ -112,20 +113,7 @@ def test_two_checkpoints_are_kept(tmp_path: Path, cache: Path) -> None:
     assert kept == ["00000005", "00000006"]
 
 
-@contextmanager
-def largest_file(num_bytes: int) -> Iterator[None]:
-    """A disk with room for so much: beyond it every write fails, as on a full one."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        signal.signal(signal.SIGXFSZ, before)
-
-
-def test_a_full_disk_costs_no_earlier_checkpoint(run: Path) -> None:
+def test_a_full_disk_costs_no_earlier_checkpoint(run: Path, largest_file: LargestFile) -> None:
     before, folder = last_tensors(run), RunFolder.open(run)
     state = folder.trained(Circles())
     state.progress.step += 1
@@ -135,7 +123,7 @@ def test_a_full_disk_costs_no_earlier_checkpoint(run: Path) -> None:
     assert_same(before, last_tensors(run))
 
 
-def test_a_full_disk_ends_training_with_that_error(tmp_path: Path, cache: Path) -> None:
+def test_a_full_disk_ends_training_with_that_error(tmp_path: Path, cache: Path, largest_file: LargestFile) -> None:
     Circles().source("train", 0, with_code=False, cache=cache)
     with largest_file(100_000), pytest.raises(CheckpointError, match="there is no earlier one"):
         train(tmp_path / "run", cache)

@@ -2,9 +2,9 @@
 
 import hashlib
 import json
-import resource
 import shlex
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -273,33 +273,27 @@ def test_a_place_that_cannot_be_written_is_told(run: Path, tmp_path: Path, capsy
     assert "--out" in said
 
 
-def test_a_full_disk_leaves_nothing_behind(tmp_path: Path) -> None:
-    folder = ModelFolder.named(tmp_path / "models", "circles")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, limits[1]))
-    try:
-        with pytest.raises(ExportError, match="File too large; name another folder: --out"):
-            folder.add(1, {"golden.npz": b"small", "model.onnx": bytes(2_000_000)}, "config", "card")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+def test_a_full_disk_leaves_nothing_behind(
+    tmp_path: Path, largest_file: Callable[[int], AbstractContextManager[None]]
+) -> None:
+    folder, small, large = (
+        ModelFolder.named(tmp_path / "models", "circles"),
+        {"model.onnx": b"small"},
+        "card\n" * 300_000,
+    )
+    told = "File too large; name another folder: --out"
+    with largest_file(1_000_000), pytest.raises(ExportError, match=told):
+        folder.add(1, {"golden.npz": b"small", "model.onnx": bytes(2_000_000)}, "config", "card")
     assert files(tmp_path) == ["models"]
-    folder.add(1, {"model.onnx": b"small"}, "config", "card\n" * 300_000)
+    folder.add(1, small, "config", large)
     before = {path: path.read_bytes() for path in folder.files()}
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, limits[1]))
-    try:
-        with pytest.raises(ExportError, match="File too large; name another folder: --out"):
-            folder.add(2, {"model.onnx": b"small"}, "config", "card")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with largest_file(1_000_000), pytest.raises(ExportError, match=told):
+        folder.add(2, small, "config", "card")
     assert folder.versions() == [1]
     assert {path: path.read_bytes() for path in folder.files()} == before
     (folder.path / "CARD.md").unlink()
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-    try:
-        with pytest.raises(ExportError, match="File too large"):
-            folder.add(2, {"model.onnx": b"small"}, "config", "card\n" * 300_000)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with largest_file(10_000), pytest.raises(ExportError, match=told):
+        folder.add(2, small, "config", large)
     assert "CARD.md" not in [path.name for path in folder.files()]
 
 
